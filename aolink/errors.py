@@ -1,0 +1,47 @@
+"""The errors that aolink raises on purpose, one class a kind.
+
+Every message says what was found, what was expected and what to do; the command line prints it as
+one line and exits with the class's ``exit_code``.
+"""
+
+
+class AolinkError(Exception):
+    """Base of every error that aolink raises on purpose."""
+
+    exit_code = 1
+
+
+class RigError(AolinkError):
+    """A rig file that cannot be read, or that describes something that cannot work."""
+
+    exit_code = 2
+
+
+class PortError(AolinkError):
+    """A port that cannot be opened, or that was lost while it was in use."""
+
+    exit_code = 3
+
+
+class DeviceError(AolinkError):
+    """A device that does not answer, is another one than expected, or refuses a request."""
+
+    exit_code = 4
+
+
+class RecordingError(AolinkError):
+    """A recording that cannot be written or read."""
+
+    exit_code = 5
+
+
+class EstimatorError(AolinkError):
+    """An estimator that does not exist or cannot work on this rig."""
+
+    exit_code = 6
+
+
+class ViewerError(AolinkError):
+    """A viewer or a picture of it that this machine cannot give."""
+
+    exit_code = 7

@@ -1,0 +1,67 @@
+"""`Estimate`: what an estimator says about one exposure, as plain data."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+class Status(enum.IntEnum):
+    """What became of the measurement in an estimate. The numbers are those of the recording's schema."""
+
+    OK = 0
+    """The measurement was used."""
+    GATED = 1
+    """The measurement was too far from its prediction and was not used."""
+    DIVERGED = 2
+    """Several measurements in a row were gated: the filter no longer trusts its own covariance."""
+    REINITIALISED = 3
+    """The filter started again from the plant's prior."""
+    INPUT_INVALID = 4
+    """The exposure could not be used; the reason says why. The estimate is a prediction."""
+    PREDICTED = 5
+    """The estimator does not look at the camera (`open-loop`)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Estimate:
+    """Start state, end state and path of one exposure, with their covariances.
+
+    The three are jointly Gaussian. The path is kept as coefficients of the exposure basis
+    (`aolink.estimation.ExposureModel.basis`): path = basis @ coefficients + response to the inputs.
+    """
+
+    estimator: str
+    frame_id: int
+    first_step: int
+    n_steps: int
+    status: Status
+    reason: str
+    """Why the status is not OK; empty otherwise."""
+    start_state: FloatArray
+    """State at the exposure's first fast step, (axes, n_states)."""
+    start_covariance: FloatArray
+    """(axes, n_states, n_states)"""
+    end_state: FloatArray
+    """State one fast step after the exposure's last: where control goes on, (axes, n_states)."""
+    end_covariance: FloatArray
+    """(axes, n_states, n_states)"""
+    coefficients: FloatArray
+    """Of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
+    coefficient_covariance: FloatArray
+    """(axes, n_coefficients, n_coefficients)"""
+    path: FloatArray
+    """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
+    path_sd: FloatArray
+    """Standard deviation of the path, slope units, (n_outputs, n_steps)."""
+    innovation: FloatArray
+    """Measurement minus its prediction, (axes, n_measurements)."""
+    innovation_covariance: FloatArray
+    """(axes, n_measurements, n_measurements)"""
+    nis: FloatArray
+    """Normalised innovation squared, chi-square with n_measurements degrees of freedom if all is well, (axes,)."""

@@ -1,0 +1,69 @@
+"""`Exposure`: everything that is known about one camera integration, as plain data.
+
+It is the hinge of aolink. The live session and the reader of recordings both make exposures (through
+`aolink.assembly`), the in-memory simulator makes them directly, and everything after them cannot
+tell which.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Truth:
+    """What really happened in one exposure; only simulated rigs know it, and no estimator reads it."""
+
+    start_state: NDArray[np.float64]
+    """State at the exposure's first fast step, (axes, n_states)."""
+    end_state: NDArray[np.float64]
+    """State one fast step after the exposure's last one, (axes, n_states)."""
+    path: NDArray[np.float64]
+    """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Exposure:
+    """One camera integration."""
+
+    frame_id: int
+    """The camera's own count of its frames; a gap is a lost frame."""
+    first_step: int
+    """Fast step at which the exposure starts."""
+    n_steps: int
+    """Fast steps in the exposure."""
+    pixels: NDArray[np.uint16]
+    """Counts, (rows, columns)."""
+    mask: NDArray[np.bool_]
+    """True where the pixel arrived, (rows, columns)."""
+    inputs: NDArray[np.float64]
+    """Input that the mirror applied at each fast step of the exposure, (n_steps, n_inputs)."""
+    lead_inputs: NDArray[np.float64]
+    """Inputs from the end of the exposure before this one to its start, (k, n_inputs).
+
+    Empty where exposures follow each other without a gap; a lost frame or dead time makes it longer.
+    """
+    inputs_assumed: int = 0
+    """How many of the steps in ``inputs`` and ``lead_inputs`` the device's report is missing for; they hold what was commanded."""
+    chunks_lost: int = 0
+    """Chunks of the frame that never arrived; their pixels are masked."""
+    device_start_ns: int = 0
+    """Start of the exposure on the camera's clock, ns."""
+    device_end_ns: int = 0
+    """End of the exposure on the camera's clock, ns."""
+    host_start_ns: int = 0
+    """The same start on the host's clock, as estimated when the frame came, ns."""
+    host_receive_ns: int = 0
+    """When the host had the last chunk, host clock, ns."""
+    clock_sigma_ns: float = float("nan")
+    """Standard deviation of ``host_start_ns`` by the clock regression, ns; NaN where there is none."""
+    truth: Truth | None = None
+    """What really happened, where it is known."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether every pixel arrived."""
+        return bool(self.mask.all())

@@ -1,0 +1,162 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class ExposureInfo(_message.Message):
+    __slots__ = ("frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "missing_offset", "missing_length", "frames_lost_before")
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
+    LAST_STEP_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_START_NS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_END_NS_FIELD_NUMBER: _ClassVar[int]
+    HOST_START_NS_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_SIGMA_NS_FIELD_NUMBER: _ClassVar[int]
+    HOST_FIRST_BYTE_NS_FIELD_NUMBER: _ClassVar[int]
+    HOST_RECEIVE_NS_FIELD_NUMBER: _ClassVar[int]
+    CHUNKS_LOST_FIELD_NUMBER: _ClassVar[int]
+    MISSING_OFFSET_FIELD_NUMBER: _ClassVar[int]
+    MISSING_LENGTH_FIELD_NUMBER: _ClassVar[int]
+    FRAMES_LOST_BEFORE_FIELD_NUMBER: _ClassVar[int]
+    frame_id: int
+    first_step: int
+    last_step: int
+    device_start_ns: int
+    device_end_ns: int
+    host_start_ns: int
+    clock_sigma_ns: float
+    host_first_byte_ns: int
+    host_receive_ns: int
+    chunks_lost: int
+    missing_offset: _containers.RepeatedScalarFieldContainer[int]
+    missing_length: _containers.RepeatedScalarFieldContainer[int]
+    frames_lost_before: int
+    def __init__(self, frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., last_step: _Optional[int] = ..., device_start_ns: _Optional[int] = ..., device_end_ns: _Optional[int] = ..., host_start_ns: _Optional[int] = ..., clock_sigma_ns: _Optional[float] = ..., host_first_byte_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., chunks_lost: _Optional[int] = ..., missing_offset: _Optional[_Iterable[int]] = ..., missing_length: _Optional[_Iterable[int]] = ..., frames_lost_before: _Optional[int] = ...) -> None: ...
+
+class ClockSample(_message.Message):
+    __slots__ = ("device", "host_send_ns", "device_receive_ns", "device_send_ns", "host_receive_ns", "round_trip_ns", "accepted", "offset_ns", "frequency_ppm", "sigma_ns")
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    HOST_SEND_NS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_RECEIVE_NS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_SEND_NS_FIELD_NUMBER: _ClassVar[int]
+    HOST_RECEIVE_NS_FIELD_NUMBER: _ClassVar[int]
+    ROUND_TRIP_NS_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTED_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_PPM_FIELD_NUMBER: _ClassVar[int]
+    SIGMA_NS_FIELD_NUMBER: _ClassVar[int]
+    device: str
+    host_send_ns: int
+    device_receive_ns: int
+    device_send_ns: int
+    host_receive_ns: int
+    round_trip_ns: int
+    accepted: bool
+    offset_ns: float
+    frequency_ppm: float
+    sigma_ns: float
+    def __init__(self, device: _Optional[str] = ..., host_send_ns: _Optional[int] = ..., device_receive_ns: _Optional[int] = ..., device_send_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., round_trip_ns: _Optional[int] = ..., accepted: _Optional[bool] = ..., offset_ns: _Optional[float] = ..., frequency_ppm: _Optional[float] = ..., sigma_ns: _Optional[float] = ...) -> None: ...
+
+class LinkStatistics(_message.Message):
+    __slots__ = ("device", "packets_received", "bytes_received", "packets_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s")
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    PACKETS_RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    BYTES_RECEIVED_FIELD_NUMBER: _ClassVar[int]
+    PACKETS_SENT_FIELD_NUMBER: _ClassVar[int]
+    BYTES_SENT_FIELD_NUMBER: _ClassVar[int]
+    BAD_CRC_FIELD_NUMBER: _ClassVar[int]
+    BAD_FRAMING_FIELD_NUMBER: _ClassVar[int]
+    BAD_PAYLOAD_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_GAPS_FIELD_NUMBER: _ClassVar[int]
+    DUPLICATES_FIELD_NUMBER: _ClassVar[int]
+    RETRANSMITS_FIELD_NUMBER: _ClassVar[int]
+    COMMANDS_IN_FLIGHT_FIELD_NUMBER: _ClassVar[int]
+    ROUND_TRIP_S_FIELD_NUMBER: _ClassVar[int]
+    device: str
+    packets_received: int
+    bytes_received: int
+    packets_sent: int
+    bytes_sent: int
+    bad_crc: int
+    bad_framing: int
+    bad_payload: int
+    sequence_gaps: int
+    duplicates: int
+    retransmits: int
+    commands_in_flight: int
+    round_trip_s: float
+    def __init__(self, device: _Optional[str] = ..., packets_received: _Optional[int] = ..., bytes_received: _Optional[int] = ..., packets_sent: _Optional[int] = ..., bytes_sent: _Optional[int] = ..., bad_crc: _Optional[int] = ..., bad_framing: _Optional[int] = ..., bad_payload: _Optional[int] = ..., sequence_gaps: _Optional[int] = ..., duplicates: _Optional[int] = ..., retransmits: _Optional[int] = ..., commands_in_flight: _Optional[int] = ..., round_trip_s: _Optional[float] = ...) -> None: ...
+
+class Latency(_message.Message):
+    __slots__ = ("frame_id", "exposure_end_ns", "first_byte_ns", "complete_ns", "estimated_ns", "command_sent_ns", "command_acknowledged_ns")
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    EXPOSURE_END_NS_FIELD_NUMBER: _ClassVar[int]
+    FIRST_BYTE_NS_FIELD_NUMBER: _ClassVar[int]
+    COMPLETE_NS_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATED_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_SENT_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_ACKNOWLEDGED_NS_FIELD_NUMBER: _ClassVar[int]
+    frame_id: int
+    exposure_end_ns: int
+    first_byte_ns: int
+    complete_ns: int
+    estimated_ns: int
+    command_sent_ns: int
+    command_acknowledged_ns: int
+    def __init__(self, frame_id: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., first_byte_ns: _Optional[int] = ..., complete_ns: _Optional[int] = ..., estimated_ns: _Optional[int] = ..., command_sent_ns: _Optional[int] = ..., command_acknowledged_ns: _Optional[int] = ...) -> None: ...
+
+class Estimate(_message.Message):
+    __slots__ = ("estimator", "frame_id", "first_step", "n_steps", "status", "reason", "axes", "n_states", "n_coefficients", "n_measurements", "end_state", "end_covariance", "coefficients", "coefficient_covariance", "innovation", "innovation_covariance", "nis")
+    class Status(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        OK: _ClassVar[Estimate.Status]
+        GATED: _ClassVar[Estimate.Status]
+        DIVERGED: _ClassVar[Estimate.Status]
+        REINITIALISED: _ClassVar[Estimate.Status]
+        INPUT_INVALID: _ClassVar[Estimate.Status]
+        PREDICTED: _ClassVar[Estimate.Status]
+    OK: Estimate.Status
+    GATED: Estimate.Status
+    DIVERGED: Estimate.Status
+    REINITIALISED: Estimate.Status
+    INPUT_INVALID: Estimate.Status
+    PREDICTED: Estimate.Status
+    ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
+    N_STEPS_FIELD_NUMBER: _ClassVar[int]
+    STATUS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    AXES_FIELD_NUMBER: _ClassVar[int]
+    N_STATES_FIELD_NUMBER: _ClassVar[int]
+    N_COEFFICIENTS_FIELD_NUMBER: _ClassVar[int]
+    N_MEASUREMENTS_FIELD_NUMBER: _ClassVar[int]
+    END_STATE_FIELD_NUMBER: _ClassVar[int]
+    END_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    COEFFICIENTS_FIELD_NUMBER: _ClassVar[int]
+    COEFFICIENT_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    INNOVATION_FIELD_NUMBER: _ClassVar[int]
+    INNOVATION_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
+    NIS_FIELD_NUMBER: _ClassVar[int]
+    estimator: str
+    frame_id: int
+    first_step: int
+    n_steps: int
+    status: Estimate.Status
+    reason: str
+    axes: int
+    n_states: int
+    n_coefficients: int
+    n_measurements: int
+    end_state: _containers.RepeatedScalarFieldContainer[float]
+    end_covariance: _containers.RepeatedScalarFieldContainer[float]
+    coefficients: _containers.RepeatedScalarFieldContainer[float]
+    coefficient_covariance: _containers.RepeatedScalarFieldContainer[float]
+    innovation: _containers.RepeatedScalarFieldContainer[float]
+    innovation_covariance: _containers.RepeatedScalarFieldContainer[float]
+    nis: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ...) -> None: ...

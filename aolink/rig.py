@@ -1,0 +1,540 @@
+"""What a rig is: a TOML file, and the frozen dataclasses that it becomes.
+
+`load_rig` reads and validates the whole file; what is wrong is one `RigError` that names the key.
+Quantities are SI (seconds) where the key ends in a unit, and otherwise in the rig's own slope unit:
+the unit of ``sensor.field``, of the plant's output and of the kernel's width.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from aolink.errors import RigError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plant:
+    """The fast-rate plant, x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x(k)  (Mishra & Wen (1)).
+
+    ``axes`` independent copies of it make the rig; each has its own state, output and inputs.
+    """
+
+    A: FloatArray
+    """State transition over one fast step, (n_states, n_states)."""
+    B: FloatArray
+    """Input matrix, (n_states, n_inputs)."""
+    B_w: FloatArray
+    """Process-noise input matrix, (n_states, n_noises)."""
+    C: FloatArray
+    """Output matrix, (n_outputs, n_states); the outputs are spot positions in slope units."""
+    process_noise: FloatArray
+    """W_f, covariance of w(k) per fast step, (n_noises, n_noises)."""
+    initial_mean: FloatArray
+    """Mean of x(0), (n_states,)."""
+    initial_covariance: FloatArray
+    """Covariance of x(0), (n_states, n_states)."""
+    axes: int
+    """Number of independent copies."""
+
+    @property
+    def n_states(self) -> int:
+        return self.A.shape[0]
+
+    @property
+    def n_inputs(self) -> int:
+        """Inputs of one copy."""
+        return self.B.shape[1]
+
+    @property
+    def n_outputs(self) -> int:
+        """Outputs of one copy."""
+        return self.C.shape[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j * ``frame_period_steps``."""
+
+    fast_step_s: float
+    """T_f, s."""
+    exposure_steps: int
+    """N, fast steps in one exposure."""
+    frame_period_steps: int
+    """Fast steps from the start of one exposure to the start of the next; at least N."""
+
+    @property
+    def fast_step_ns(self) -> int:
+        return round(self.fast_step_s * 1e9)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernel:
+    """Image kernel Psi, the spot that a resting beam makes; of unit mass."""
+
+    shape: Literal["gaussian"]
+    sigma: float
+    """Width in slope units in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2."""
+
+    @property
+    def variance(self) -> float:
+        """Variance of the kernel, slope units squared."""
+        return self.sigma**2 / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """A line sensor: equal pixels on ``field``, an integer read-out."""
+
+    kind: Literal["line"]
+    pixels: int
+    field: tuple[float, float]
+    """Outer edges of the first and the last pixel, slope units."""
+    noise_density: float
+    """V: a pixel of width D that holds the mean density has noise variance V/D (Mishra & Wen, section V)."""
+    kernel: Kernel
+    bit_depth: int
+    black_level: float
+    """Counts of a pixel that sees nothing."""
+    counts_per_density: float
+    """Counts for a density of one (one over the slope unit)."""
+
+    @property
+    def pixel_width(self) -> float:
+        """D, slope units."""
+        return (self.field[1] - self.field[0]) / self.pixels
+
+    @property
+    def edges(self) -> FloatArray:
+        """Pixel edges, slope units, (pixels + 1,)."""
+        return np.linspace(self.field[0], self.field[1], self.pixels + 1)
+
+    @property
+    def centres(self) -> FloatArray:
+        """Pixel centres, slope units, (pixels,)."""
+        edges = self.edges
+        return (edges[:-1] + edges[1:]) / 2
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return (1, self.pixels)
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return (1 << self.bit_depth) - 1
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MirrorDriver:
+    """The mirror driver: limits, resolution, queue."""
+
+    input_min: FloatArray
+    """(axes * n_inputs,)"""
+    input_max: FloatArray
+    """(axes * n_inputs,)"""
+    park: FloatArray
+    """Declared safe input, (axes * n_inputs,)."""
+    dac_bits: int
+    """Commands are rounded to 2^dac_bits levels between the limits; 0 means not rounded."""
+    block_steps: int
+    """Fast steps in one command block."""
+    queue_steps: int
+    """Fast steps that the device can hold."""
+    watchdog_s: float
+    """The mirror parks itself when no valid packet has come for so long, s."""
+
+    def quantise(self, u: FloatArray) -> FloatArray:
+        """The input that the converter puts out for ``u``, (..., axes * n_inputs)."""
+        if not self.dac_bits:
+            return u.copy()
+        step = (self.input_max - self.input_min) / ((1 << self.dac_bits) - 1)
+        return self.input_min + np.round((u - self.input_min) / step) * step
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drive:
+    """The known input that a session plays when nothing closes the loop."""
+
+    kind: Literal["none", "sine"]
+    amplitude: FloatArray
+    """(axes * n_inputs,)"""
+    period_s: float
+    offset: FloatArray
+    """(axes * n_inputs,)"""
+
+    def inputs(self, first_step: int, n_steps: int, fast_step_s: float) -> FloatArray:
+        """Inputs for ``n_steps`` fast steps from ``first_step``, (n_steps, axes * n_inputs)."""
+        u = np.tile(self.offset, (n_steps, 1))
+        if self.kind == "sine":
+            t = np.arange(first_step, first_step + n_steps) * fast_step_s
+            u += np.sin(2 * np.pi * t / self.period_s)[:, None] * self.amplitude
+        return u
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """Faults that the simulated rig injects, by rate and by seed; all zero means a perfect link."""
+
+    bit_flip_rate: float = 0.0
+    """Probability that a packet from the device has one bit flipped."""
+    packet_loss_rate: float = 0.0
+    """Probability that a packet from the device is lost."""
+    command_loss_rate: float = 0.0
+    """Probability that a packet to the device is lost."""
+    duplicate_rate: float = 0.0
+    """Probability that a packet from the device is sent twice."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """What only the simulated rig needs to know."""
+
+    seed: int = 1
+    clock_offset_s: float = 0.0
+    """Device clock minus host clock at the start, s."""
+    clock_drift_ppm: float = 0.0
+    """How much faster the device clock runs than the host's, parts per million."""
+    latency_s: float = 100e-6
+    """Median one-way latency of the link on virtual time, s."""
+    faults: Faults = Faults()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rig:
+    """A whole rig, validated."""
+
+    name: str
+    summary: str
+    plant: Plant
+    timing: Timing
+    sensor: Sensor
+    mirror: MirrorDriver
+    drive: Drive
+    simulation: Simulation
+    toml: str
+    """The file's text, as read."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the file's text: the rig's identity in a recording."""
+        return hashlib.sha256(self.toml.encode()).hexdigest()
+
+    @property
+    def n_inputs(self) -> int:
+        """Inputs of the whole rig: a row of a command."""
+        return self.plant.axes * self.plant.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """Outputs of the whole rig: rows of a path."""
+        return self.plant.axes * self.plant.n_outputs
+
+
+class _Table:
+    """One TOML table while it is read: every key must be asked for, and those that were not are errors."""
+
+    def __init__(self, values: Any, path: str) -> None:
+        if not isinstance(values, dict):
+            raise RigError(f"{path}: expected a table, found {_shown(values)}")
+        self._values, self._path, self._asked = values, path, set[str]()
+
+    def key(self, name: str) -> str:
+        return f"{self._path}.{name}" if self._path else name
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self._asked.add(name)
+        if name not in self._values:
+            if default is None:
+                raise RigError(f"{self.key(name)} is missing: the rig file must give it")
+            return default
+        return self._values[name]
+
+    def table(self, name: str, *, optional: bool = False) -> _Table:
+        return _Table(self.get(name, {} if optional else None), self.key(name))
+
+    def text(self, name: str, default: str | None = None) -> str:
+        value = self.get(name, default)
+        if not isinstance(value, str):
+            raise RigError(f"{self.key(name)}: expected text, found {_shown(value)}")
+        return value
+
+    def choice(self, name: str, choices: tuple[str, ...], default: str | None = None) -> Any:
+        value = self.text(name, default)
+        if value not in choices:
+            raise RigError(f"{self.key(name)} = {value!r} is not known: use one of {', '.join(choices)}")
+        return value
+
+    def number(self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf) -> float:
+        value = self.get(name, default)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise RigError(f"{self.key(name)}: expected a finite number, found {_shown(value)}")
+        if value < low or value <= above:
+            bound = f"at least {low:g}" if value < low else f"above {above:g}"
+            raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
+        return float(value)
+
+    def rate(self, name: str) -> float:
+        value = self.number(name, 0.0, low=0.0)
+        if value > 1:
+            raise RigError(f"{self.key(name)} = {value:g} is a probability: it must be at most 1")
+        return value
+
+    def integer(self, name: str, default: int | None = None, *, low: int, high: int = 2**31) -> int:
+        value = self.get(name, default)
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise RigError(f"{self.key(name)}: expected a whole number from {low} to {high}, found {_shown(value)}")
+        return value
+
+    def matrix(self, name: str, shape: tuple[int | None, int | None], why: str) -> FloatArray:
+        """A matrix; a number stands for a 1x1 one. None in ``shape`` takes any size."""
+        array = self._array(name, self.get(name))
+        if array.ndim == 0:
+            array = array.reshape(1, 1)
+        if array.ndim != 2 or 0 in array.shape or any(s is not None and s != a for s, a in zip(shape, array.shape, strict=True)):
+            wanted = " x ".join("any" if s is None else str(s) for s in shape)
+            raise RigError(f"{self.key(name)} has shape {_shape(array)}, expected {wanted} ({why})")
+        return array
+
+    def vector(self, name: str, size: int, why: str, default: float | None = None) -> FloatArray:
+        """A vector; a number is repeated."""
+        array = self._array(name, self.get(name, default))
+        if array.ndim == 0:
+            return np.full(size, float(array))
+        if array.shape != (size,):
+            raise RigError(f"{self.key(name)} has shape {_shape(array)}, expected {size} ({why})")
+        return array
+
+    def _array(self, name: str, value: Any) -> FloatArray:
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise RigError(f"{self.key(name)}: expected numbers in rows of equal length, found {_shown(value)}") from None
+        if not np.isfinite(array).all():
+            raise RigError(f"{self.key(name)} holds a number that is not finite")
+        return array
+
+    def finish(self) -> None:
+        for name in self._values:
+            if name not in self._asked:
+                known = ", ".join(sorted(self._asked))
+                raise RigError(f"{self.key(name)} is not a key that aolink knows; known here: {known}")
+
+
+def load_rig(path_or_name: str | Path) -> Rig:
+    """Read and validate a rig file.
+
+    Parameters
+    ----------
+    path_or_name:
+        A TOML file, or the name of a rig that comes with aolink (see `builtin_rigs`).
+
+    Raises
+    ------
+    RigError
+        The file cannot be read, or what it says cannot work; the message names the key.
+    """
+    path = Path(path_or_name)
+    if path.suffix != ".toml" and str(path_or_name) in builtin_rigs():
+        text = (resources.files("aolink") / "rigs" / f"{path_or_name}.toml").read_text()
+    else:
+        try:
+            text = path.read_text()
+        except OSError as error:
+            if path.name.removesuffix(".toml") in builtin_rigs() and path.parent == Path():
+                return load_rig(path.name.removesuffix(".toml"))
+            raise RigError(
+                f"cannot read the rig file {path}: {error.strerror}; give a TOML file or one of: {', '.join(builtin_rigs())}"
+            ) from None
+        except UnicodeDecodeError:
+            raise RigError(f"{path} is not a rig file: it is not text") from None
+    try:
+        return parse_rig(text)
+    except RigError as error:
+        raise RigError(f"{path_or_name}: {error}") from None
+
+
+def builtin_rigs() -> list[str]:
+    """Names of the rigs that come with aolink."""
+    files = (resources.files("aolink") / "rigs").iterdir()
+    return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
+
+
+def parse_rig(text: str) -> Rig:
+    """Validate the text of a rig file. Raises `RigError`, naming the key."""
+    try:
+        root = _Table(tomllib.loads(text), "")
+    except tomllib.TOMLDecodeError as error:
+        raise RigError(f"not valid TOML: {error}") from None
+    name, summary = root.text("name"), root.text("summary", "")
+    plant = _plant(root.table("plant"))
+    timing = _timing(root.table("timing"))
+    sensor = _sensor(root.table("sensor"), plant)
+    n_inputs = plant.axes * plant.n_inputs
+    mirror = _mirror(root.table("mirror"), n_inputs, timing)
+    drive = _drive(root.table("drive", optional=True), n_inputs, mirror)
+    simulation = _simulation(root.table("simulation", optional=True))
+    root.finish()
+    return Rig(
+        name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
+        mirror=mirror, drive=drive, simulation=simulation, toml=text,
+    )  # fmt: skip
+
+
+def _plant(table: _Table) -> Plant:
+    A = table.matrix("A", (None, None), "states x states")
+    n = A.shape[0]
+    if A.shape != (n, n):
+        raise RigError(f"plant.A has shape {_shape(A)}, expected a square matrix (states x states)")
+    radius = float(np.abs(np.linalg.eigvals(A)).max())
+    if radius > 1 + 1e-9:
+        raise RigError(f"plant.A is unstable: its largest eigenvalue has modulus {radius:.6g}, it must be at most 1")
+    B = table.matrix("B", (n, None), "states x inputs")
+    B_w = table.matrix("B_w", (n, None), "states x process noises")
+    C = table.matrix("C", (None, n), "outputs x states")
+    if not C.any():
+        raise RigError("plant.C is zero: the camera sees nothing of the plant, nothing is observable")
+    W = _covariance(table, "process_noise", B_w.shape[1], "noises x noises")
+    mean = table.vector("initial_mean", n, "states", 0.0)
+    if table.get("initial_covariance", "stationary") == "stationary":
+        if radius > 1 - 1e-9:
+            raise RigError(
+                f"plant.initial_covariance is missing: plant.A has an eigenvalue of modulus {radius:.6g},"
+                " so there is no stationary covariance; give a matrix"
+            )
+        covariance = linalg.solve_discrete_lyapunov(A, B_w @ W @ B_w.T)
+    else:
+        covariance = _covariance(table, "initial_covariance", n, "states x states")
+    axes = table.integer("axes", 1, low=1, high=10_000)
+    table.finish()
+    return Plant(
+        A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes
+    )  # fmt: skip
+
+
+def _covariance(table: _Table, name: str, size: int, why: str) -> FloatArray:
+    matrix = table.matrix(name, (size, size), why)
+    if not np.allclose(matrix, matrix.T):
+        raise RigError(f"{table.key(name)} is not symmetric, a covariance must be")
+    lowest = float(np.linalg.eigvalsh(matrix).min())
+    if lowest < -1e-12 * max(1.0, float(np.abs(matrix).max())):
+        raise RigError(f"{table.key(name)} has the negative eigenvalue {lowest:.3g}, a covariance has none")
+    return matrix
+
+
+def _timing(table: _Table) -> Timing:
+    fast_step_s = table.number("fast_step_s", above=0.0)
+    steps = table.integer("exposure_steps", low=1, high=1_000_000)
+    period = table.integer("frame_period_steps", steps, low=1, high=10_000_000)
+    if period < steps:
+        raise RigError(f"timing.frame_period_steps = {period} is shorter than timing.exposure_steps = {steps}")
+    if abs(fast_step_s * 1e9 - round(fast_step_s * 1e9)) > 1e-6:
+        raise RigError(f"timing.fast_step_s = {fast_step_s!r} is not a whole number of nanoseconds")
+    table.finish()
+    return Timing(fast_step_s=fast_step_s, exposure_steps=steps, frame_period_steps=period)
+
+
+def _sensor(table: _Table, plant: Plant) -> Sensor:
+    kind = table.choice("kind", ("line",))
+    if plant.axes * plant.n_outputs != 1:
+        raise RigError(
+            f"sensor.kind = 'line' sees one slope, but the plant has {plant.axes * plant.n_outputs}"
+            " (plant.axes times the rows of plant.C)"
+        )
+    field = table.vector("field", 2, "lower and upper edge")
+    if field[0] >= field[1]:
+        raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
+    kernel_table = table.table("kernel")
+    kernel = Kernel(shape=kernel_table.choice("shape", ("gaussian",)), sigma=kernel_table.number("sigma", above=0.0))
+    kernel_table.finish()
+    sensor = Sensor(
+        kind=kind,
+        pixels=table.integer("pixels", low=2, high=65_536),
+        field=(float(field[0]), float(field[1])),
+        noise_density=table.number("noise_density", low=0.0),
+        kernel=kernel,
+        bit_depth=table.integer("bit_depth", 16, low=1, high=16),
+        black_level=table.number("black_level", 0.0, low=0.0),
+        counts_per_density=table.number("counts_per_density", above=0.0),
+    )
+    if sensor.black_level >= sensor.full_scale:
+        raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
+    table.finish()
+    return sensor
+
+
+def _mirror(table: _Table, n_inputs: int, timing: Timing) -> MirrorDriver:
+    low = table.vector("input_min", n_inputs, "inputs")
+    high = table.vector("input_max", n_inputs, "inputs")
+    if (low >= high).any():
+        raise RigError("mirror.input_min must be below mirror.input_max for every input")
+    park = table.vector("park", n_inputs, "inputs", 0.0)
+    if (park < low).any() or (park > high).any():
+        raise RigError("mirror.park is outside mirror.input_min .. mirror.input_max: the safe input must be allowed")
+    # A block is one packet: 4 KiB of 8-byte numbers.
+    most = max(1, 4096 // (8 * n_inputs))
+    block = table.integer("block_steps", min(50, most), low=1)
+    if block > most:
+        raise RigError(f"mirror.block_steps = {block} does not fit into one packet: at most {most} for {n_inputs} inputs")
+    queue = table.integer("queue_steps", 8 * block, low=1)
+    if queue < 2 * block:
+        raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")
+    driver = MirrorDriver(
+        input_min=low,
+        input_max=high,
+        park=park,
+        dac_bits=table.integer("dac_bits", 16, low=0, high=32),
+        block_steps=block,
+        queue_steps=queue,
+        watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
+    )
+    table.finish()
+    return driver
+
+
+def _drive(table: _Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
+    kind = table.choice("kind", ("none", "sine"), "none")
+    offset = table.vector("offset", n_inputs, "inputs", 0.0)
+    amplitude = table.vector("amplitude", n_inputs, "inputs", None if kind == "sine" else 0.0)
+    period = table.number("period_s", None if kind == "sine" else 1.0, above=0.0)
+    for name, reach in (("input_min", offset - np.abs(amplitude)), ("input_max", offset + np.abs(amplitude))):
+        if (reach < mirror.input_min).any() or (reach > mirror.input_max).any():
+            raise RigError(f"drive.amplitude and drive.offset reach beyond mirror.{name}: the mirror would refuse it")
+    table.finish()
+    return Drive(kind=kind, amplitude=amplitude, period_s=period, offset=offset)
+
+
+def _simulation(table: _Table) -> Simulation:
+    faults_table = table.table("faults", optional=True)
+    faults = Faults(**{name: faults_table.rate(name) for name in Faults.__dataclass_fields__})
+    faults_table.finish()
+    simulation = Simulation(
+        seed=table.integer("seed", 1, low=0),
+        clock_offset_s=table.number("clock_offset_s", 0.0),
+        clock_drift_ppm=table.number("clock_drift_ppm", 0.0),
+        latency_s=table.number("latency_s", 100e-6, low=0.0),
+        faults=faults,
+    )
+    table.finish()
+    return simulation
+
+
+def _shape(array: FloatArray) -> str:
+    return " x ".join(map(str, array.shape)) or "number"
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
