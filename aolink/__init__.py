@@ -1,0 +1,87 @@
+"""aolink: a logged hardware-in-the-loop pipeline for adaptive optics and any loop closed through a slow camera.
+
+>>> import aolink
+>>> exposures = aolink.simulate("section-vi", n_exposures=3, seed=1)
+>>> estimates = aolink.estimate(exposures, "o3")
+>>> estimates[0].path.shape
+(1, 200)
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aolink.errors import AolinkError
+from aolink.rig import Rig, load_rig
+
+if TYPE_CHECKING:
+    from aolink.estimation import Estimate
+    from aolink.exposure import Exposures
+    from aolink.recording.reader import Recording
+
+__version__ = version("aolink")
+__all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate"]
+
+
+def read(path: str | Path) -> Recording:
+    """Open a recording.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or is not a recording of aolink.
+    """
+    from aolink.recording.reader import Recording
+
+    return Recording(path)
+
+
+def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Exposures:
+    """Exposures of a simulated rig with their truth, in memory: the model behind `aolink rig`, without a wire.
+
+    Parameters
+    ----------
+    rig:
+        A rig, a rig file, or the name of one that comes with aolink.
+    n_exposures:
+        How many.
+    seed:
+        Instead of the rig file's own.
+
+    Raises
+    ------
+    RigError
+        The rig file cannot be read or cannot work.
+    """
+    from aolink.exposure import Exposures
+    from aolink.simulation.model import simulate as simulate_exposures
+
+    rig = rig if isinstance(rig, Rig) else load_rig(rig)
+    return Exposures(rig, tuple(simulate_exposures(rig, n_exposures, seed)))
+
+
+def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> list[Estimate]:
+    """Estimates of the motion inside each exposure.
+
+    Parameters
+    ----------
+    exposures:
+        What `simulate` gave, or a recording or its path.
+    estimator:
+        One of `aolink.estimation.ESTIMATOR_NAMES`.
+
+    Raises
+    ------
+    EstimatorError
+        There is no such estimator.
+    """
+    from aolink.estimation import Driver
+    from aolink.exposure import Exposures
+
+    if isinstance(exposures, str | Path):
+        exposures = read(exposures)
+    series = exposures if isinstance(exposures, Exposures) else exposures.exposures()
+    driver = Driver(exposures.rig, [estimator])
+    return [result for exposure in series for result in driver.step(exposure)]

@@ -7,10 +7,14 @@ tell which.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
+
+from aolink.rig import Rig
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,7 +51,7 @@ class Exposure:
     Empty where exposures follow each other without a gap; a lost frame or dead time makes it longer.
     """
     inputs_assumed: int = 0
-    """How many of the steps in ``inputs`` and ``lead_inputs`` the device's report is missing for; they hold what was commanded."""
+    """Steps of ``inputs`` and ``lead_inputs`` that the device's report is missing for: they hold what was commanded."""
     chunks_lost: int = 0
     """Chunks of the frame that never arrived; their pixels are masked."""
     device_start_ns: int = 0
@@ -67,3 +71,21 @@ class Exposure:
     def complete(self) -> bool:
         """Whether every pixel arrived."""
         return bool(self.mask.all())
+
+
+@dataclass(frozen=True, eq=False)
+class Exposures(Sequence[Exposure]):
+    """A series of exposures of one rig, in order."""
+
+    rig: Rig
+    items: tuple[Exposure, ...]
+
+    @overload
+    def __getitem__(self, index: int) -> Exposure: ...
+    @overload
+    def __getitem__(self, index: slice) -> Exposures: ...
+    def __getitem__(self, index: int | slice) -> Exposure | Exposures:
+        return Exposures(self.rig, self.items[index]) if isinstance(index, slice) else self.items[index]
+
+    def __len__(self) -> int:
+        return len(self.items)

@@ -85,7 +85,7 @@ class Kernel:
 
     shape: Literal["gaussian"]
     sigma: float
-    """Width in slope units in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2."""
+    """Width, slope units, in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2."""
 
     @property
     def variance(self) -> float:
@@ -277,7 +277,9 @@ class _Table:
             raise RigError(f"{self.key(name)} = {value!r} is not known: use one of {', '.join(choices)}")
         return value
 
-    def number(self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf) -> float:
+    def number(
+        self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf
+    ) -> float:
         value = self.get(name, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise RigError(f"{self.key(name)}: expected a finite number, found {_shown(value)}")
@@ -303,7 +305,11 @@ class _Table:
         array = self._array(name, self.get(name))
         if array.ndim == 0:
             array = array.reshape(1, 1)
-        if array.ndim != 2 or 0 in array.shape or any(s is not None and s != a for s, a in zip(shape, array.shape, strict=True)):
+        if (
+            array.ndim != 2
+            or 0 in array.shape
+            or any(s is not None and s != a for s, a in zip(shape, array.shape, strict=True))
+        ):
             wanted = " x ".join("any" if s is None else str(s) for s in shape)
             raise RigError(f"{self.key(name)} has shape {_shape(array)}, expected {wanted} ({why})")
         return array
@@ -321,7 +327,9 @@ class _Table:
         try:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError):
-            raise RigError(f"{self.key(name)}: expected numbers in rows of equal length, found {_shown(value)}") from None
+            raise RigError(
+                f"{self.key(name)}: expected numbers in rows of equal length, found {_shown(value)}"
+            ) from None
         if not np.isfinite(array).all():
             raise RigError(f"{self.key(name)} holds a number that is not finite")
         return array
@@ -356,7 +364,8 @@ def load_rig(path_or_name: str | Path) -> Rig:
             if path.name.removesuffix(".toml") in builtin_rigs() and path.parent == Path():
                 return load_rig(path.name.removesuffix(".toml"))
             raise RigError(
-                f"cannot read the rig file {path}: {error.strerror}; give a TOML file or one of: {', '.join(builtin_rigs())}"
+                f"cannot read the rig file {path}: {error.strerror};"
+                f" give a TOML file or one of: {', '.join(builtin_rigs())}"
             ) from None
         except UnicodeDecodeError:
             raise RigError(f"{path} is not a rig file: it is not text") from None
@@ -487,7 +496,9 @@ def _mirror(table: _Table, n_inputs: int, timing: Timing) -> MirrorDriver:
     most = max(1, 4096 // (8 * n_inputs))
     block = table.integer("block_steps", min(50, most), low=1)
     if block > most:
-        raise RigError(f"mirror.block_steps = {block} does not fit into one packet: at most {most} for {n_inputs} inputs")
+        raise RigError(
+            f"mirror.block_steps = {block} does not fit into one packet: at most {most} for {n_inputs} inputs"
+        )
     queue = table.integer("queue_steps", 8 * block, low=1)
     if queue < 2 * block:
         raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")

@@ -135,11 +135,9 @@ class Applied(_message.Message):
     class Source(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         COMMAND: _ClassVar[Applied.Source]
-        HELD: _ClassVar[Applied.Source]
         PARKED: _ClassVar[Applied.Source]
         CLIPPED: _ClassVar[Applied.Source]
     COMMAND: Applied.Source
-    HELD: Applied.Source
     PARKED: Applied.Source
     CLIPPED: Applied.Source
     BLOCK_ID_FIELD_NUMBER: _ClassVar[int]

@@ -1,0 +1,3 @@
+from aolink.cli import main
+
+main()

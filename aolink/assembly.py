@@ -1,0 +1,223 @@
+"""Frames, commands and the mirror's reports become exposures.
+
+The live session and the reader of recordings feed the same `Assembler` with the same messages in the
+same order, so both get the same exposures. It has no clock and needs no time-out: a device sends in
+order, so what is missing shows as soon as something later has come.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.exposure import Exposure
+from aolink.rig import Rig
+from aolink.wire import messages_pb2 as pb
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """A frame as a camera delivered it."""
+
+    frame_id: int
+    first_step: int
+    last_step: int
+    """Inclusive."""
+    pixels: NDArray[np.uint16]
+    """Counts, zero where nothing arrived, (rows, columns)."""
+    mask: NDArray[np.bool_]
+    """True where the pixel arrived, (rows, columns)."""
+    chunks_lost: int
+    frames_lost_before: int
+    """Frames between the one before and this that never came."""
+    device_start_ns: int
+    device_end_ns: int
+    host_first_byte_ns: int
+    host_receive_ns: int
+    host_start_ns: int = 0
+    """Start of the exposure on the host's clock, as estimated; 0 where there is no estimate."""
+    clock_sigma_ns: float = float("nan")
+
+
+class FrameReassembly:
+    """Chunks of frames of ``shape`` (rows, columns) become frames. Lost chunks leave masked pixels."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._shape = shape
+        self._parts: list[pb.FrameChunk] = []
+        self._first_byte_ns = self._last_byte_ns = 0
+        self._last_id: int | None = None
+        self.refused = 0
+        """Chunks that made no sense: beyond their frame, of a frame that is over, of another size."""
+
+    def add(self, chunk: pb.FrameChunk, receive_ns: int) -> list[Frame]:
+        """Take a chunk; gives the frames that are over with it, at most two."""
+        frames = []
+        if self._parts and chunk.frame_id != self._parts[0].frame_id:
+            frames.append(self._close())
+        stale = self._last_id is not None and chunk.frame_id <= self._last_id
+        if stale or not self._is_sound(chunk):
+            self.refused += 1
+            return frames
+        if not self._parts:
+            self._first_byte_ns = receive_ns
+        self._parts.append(chunk)
+        self._last_byte_ns = receive_ns
+        if chunk.offset + len(chunk.data) == chunk.total:
+            frames.append(self._close())
+        return frames
+
+    def flush(self) -> list[Frame]:
+        """The frame that is in progress, as it is."""
+        return [self._close()] if self._parts else []
+
+    def _is_sound(self, chunk: pb.FrameChunk) -> bool:
+        first = self._parts[0] if self._parts else chunk
+        return (
+            0 < len(chunk.data) <= chunk.total - chunk.offset
+            and chunk.total == 2 * chunk.width * chunk.height
+            and (chunk.height, chunk.width) == self._shape
+            and chunk.first_step == first.first_step
+            and chunk.last_step >= chunk.first_step
+        )
+
+    def _close(self) -> Frame:
+        parts, self._parts = self._parts, []
+        first = parts[0]
+        data, arrived = bytearray(first.total), np.zeros(first.total, dtype=bool)
+        for part in parts:
+            end = part.offset + len(part.data)
+            data[part.offset : end] = part.data
+            arrived[part.offset : end] = True
+        size = max(len(part.data) for part in parts)
+        lost_before = 0 if self._last_id is None else first.frame_id - self._last_id - 1
+        self._last_id = first.frame_id
+        return Frame(
+            frame_id=first.frame_id,
+            first_step=first.first_step,
+            last_step=first.last_step,
+            pixels=np.frombuffer(bytes(data), dtype="<u2").astype(np.uint16).reshape(self._shape),
+            mask=arrived.reshape(-1, 2).all(axis=1).reshape(self._shape),
+            chunks_lost=-(-int((~arrived).sum()) // size),
+            frames_lost_before=lost_before,
+            device_start_ns=first.exposure_start_ns,
+            device_end_ns=first.exposure_end_ns,
+            host_first_byte_ns=self._first_byte_ns,
+            host_receive_ns=self._last_byte_ns,
+        )
+
+
+class TruthReassembly:
+    """Chunks of truths become truths; one with a missing chunk is dropped."""
+
+    def __init__(self) -> None:
+        self._frame_id = 0
+        self._data = b""
+
+    def add(self, chunk: pb.TruthChunk) -> pb.Truth | None:
+        """Take a chunk; gives the truth that it completes."""
+        if chunk.offset == 0:
+            self._frame_id, self._data = chunk.frame_id, b""
+        if chunk.frame_id != self._frame_id or chunk.offset != len(self._data):
+            self._frame_id = 0
+            return None
+        self._data += chunk.data
+        return pb.Truth.FromString(self._data) if len(self._data) == chunk.total else None
+
+
+class _InputHistory:
+    """What the mirror held, and what it was told, for every fast step not yet used."""
+
+    def __init__(self, n_inputs: int, park: NDArray[np.float64]) -> None:
+        self._n_inputs = n_inputs
+        self._applied: dict[int, NDArray[np.float64]] = {}
+        self._commanded: dict[int, NDArray[np.float64]] = {}
+        self._last = park
+        self.reported_until = 0
+        """First step that no report covers yet."""
+
+    def add_applied(self, message: pb.Applied) -> None:
+        self._add(self._applied, message)
+        self.reported_until = max(self.reported_until, message.first_step + message.n_steps)
+
+    def add_command(self, message: pb.CommandBlock) -> None:
+        self._add(self._commanded, message)
+
+    def _add(self, steps: dict[int, NDArray[np.float64]], message: pb.Applied | pb.CommandBlock) -> None:
+        if len(message.u) == message.n_steps * self._n_inputs:
+            rows = np.array(message.u, dtype=np.float64).reshape(message.n_steps, self._n_inputs)
+            steps.update(zip(range(message.first_step, message.first_step + message.n_steps), rows, strict=True))
+
+    def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
+        """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``."""
+        rows, assumed = np.empty((max(0, end - first), self._n_inputs)), 0
+        for k in range(first, end):
+            row = self._applied.get(k)
+            if row is None:
+                assumed += 1
+                row = self._commanded.get(k, self._last)
+            rows[k - first] = self._last = row
+        for steps in (self._applied, self._commanded):
+            for k in [k for k in steps if k < end]:
+                del steps[k]
+        return rows, assumed
+
+
+class Assembler:
+    """Frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._history = _InputHistory(rig.n_inputs, rig.mirror.park)
+        self._frames: deque[Frame] = deque()
+        self._end: int | None = None
+
+    def add_applied(self, message: pb.Applied) -> list[Exposure]:
+        """Take a report of the mirror; gives the exposures that are complete with it."""
+        self._history.add_applied(message)
+        return self._ready()
+
+    def add_command(self, message: pb.CommandBlock) -> None:
+        """Take a command: it stands in where the mirror's report is lost."""
+        self._history.add_command(message)
+
+    def add_frame(self, frame: Frame) -> list[Exposure]:
+        """Take a frame; gives the exposures that are complete with it."""
+        self._frames.append(frame)
+        return self._ready()
+
+    def flush(self) -> list[Exposure]:
+        """The frames that still wait, with the commands for the reports that never came."""
+        exposures = [self._expose(frame) for frame in self._frames]
+        self._frames.clear()
+        return exposures
+
+    def _ready(self) -> list[Exposure]:
+        exposures = []
+        while self._frames and self._frames[0].last_step < self._history.reported_until:
+            exposures.append(self._expose(self._frames.popleft()))
+        return exposures
+
+    def _expose(self, frame: Frame) -> Exposure:
+        lead_start = frame.first_step if self._end is None else min(self._end, frame.first_step)
+        lead, lead_assumed = self._history.take(lead_start, frame.first_step)
+        inputs, assumed = self._history.take(frame.first_step, frame.last_step + 1)
+        self._end = frame.last_step + 1
+        return Exposure(
+            frame_id=frame.frame_id,
+            first_step=frame.first_step,
+            n_steps=frame.last_step + 1 - frame.first_step,
+            pixels=frame.pixels,
+            mask=frame.mask,
+            inputs=inputs,
+            lead_inputs=lead,
+            inputs_assumed=assumed + lead_assumed,
+            chunks_lost=frame.chunks_lost,
+            device_start_ns=frame.device_start_ns,
+            device_end_ns=frame.device_end_ns,
+            host_start_ns=frame.host_start_ns,
+            host_receive_ns=frame.host_receive_ns,
+            clock_sigma_ns=frame.clock_sigma_ns,
+        )

@@ -1,0 +1,350 @@
+"""The command line: parse, call, print; nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from aolink.errors import AolinkError, RigError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="A logged hardware-in-the-loop pipeline for adaptive optics and any loop closed through a slow camera.",
+)
+_out = Console(highlight=False, soft_wrap=True)
+_err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
+FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
+EstimatorOption = Annotated[
+    list[str] | None, typer.Option("--estimator", "-e", help="Estimator to run; may be given several times.")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+
+def main() -> None:
+    """Entry point of the command ``aolink``."""
+    try:
+        app()
+    except AolinkError as error:
+        _err.print(f"aolink: {escape(str(error))}")
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # the reader of a pipe has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+
+
+class _StopRequest:
+    """Ctrl-C and SIGTERM end a session in good order; a second one ends it at once."""
+
+    def __init__(self) -> None:
+        self.signal = 0
+
+    def __call__(self) -> bool:
+        return self.signal != 0
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.signal:
+            raise KeyboardInterrupt
+        self.signal = number
+
+    @contextmanager
+    def installed(self) -> Iterator[_StopRequest]:
+        before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def exit_if_asked(self) -> None:
+        """Exit as a command does that a signal ended."""
+        if self.signal:
+            raise typer.Exit(128 + self.signal)
+
+
+@contextmanager
+def _progress(total: int | None) -> Iterator[Callable[[str, int], None]]:
+    """A progress bar on a terminal; gives ``tell(what, done)``."""
+    columns = (TextColumn("{task.description:>14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=_err, transient=not _err.is_terminal, disable=not _err.is_terminal) as bar:
+        tasks: dict[str, Any] = {}
+
+        def tell(what: str, done: int) -> None:
+            if what not in tasks:
+                for task in bar.tasks:
+                    bar.update(task.id, completed=task.total or task.completed)
+                tasks[what] = bar.add_task(what, total=total)
+            bar.update(tasks[what], completed=done)
+
+        yield tell
+        for task in bar.tasks:
+            if task.total is None or not task.completed:
+                bar.update(task.id, total=task.completed or 1, completed=task.completed or 1)
+
+
+@app.command(epilog="Example: aolink rig section-vi --check")
+def rig(
+    rig: RigArgument,
+    check: Annotated[bool, typer.Option("--check", help="Check the rig file, say what was found, and end.")] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not as the host commands.")] = False,
+    seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
+    listen: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="TCP ports instead of pseudo terminals.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
+    from aolink.rig import load_rig
+
+    loaded = load_rig(rig)
+    if check:
+        _check_rig(loaded, as_json)
+        return
+    from aolink.simulation.server import RigServer, open_streams
+
+    streams = open_streams(listen)
+    with _StopRequest().installed() as stop:
+        server = RigServer(loaded, streams, seed=seed, real_time=real_time)
+        ports = {line: stream.name for line, stream in streams.items()}
+        if as_json:
+            print(json.dumps(ports), flush=True)
+        else:
+            for line, name in ports.items():
+                print(f"{line}  {name}")
+            print(
+                f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
+                f"  aolink record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig} --estimator o3"
+                " --exposures 100 -o session.mcap\nCtrl-C stops it.",
+                flush=True,
+            )
+        server.run(stop)
+        for stream in streams.values():
+            stream.close()
+
+
+def _check_rig(loaded: Any, as_json: bool) -> None:
+    from aolink.plant import check_rig
+
+    findings = check_rig(loaded)
+    if as_json:
+        print(json.dumps([vars(finding) for finding in findings]))
+    else:
+        for finding in findings:
+            _out.print(f"{finding.severity:>7}  {escape(finding.key)}: {escape(finding.message)}")
+        errors = sum(finding.severity == "error" for finding in findings)
+        _out.print(f"{loaded.name}: {'the rig file is good' if not errors else f'{errors} error(s)'}")
+    if any(finding.severity == "error" for finding in findings):
+        raise typer.Exit(RigError.exit_code)
+
+
+@app.command(epilog="Example: aolink devices /dev/ttyACM0 socket://192.168.1.5:5000")
+def devices(
+    ports: Annotated[list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to ask who is there.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the serial ports of this machine, or identify what is behind the given ones."""
+    from aolink.devices.discovery import Found, identify_port, list_ports
+
+    if not ports:
+        listed = list_ports()
+        if as_json:
+            print(json.dumps([{"port": name, "description": text} for name, text in listed]))
+        for name, text in [] if as_json else listed:
+            _out.print(f"{name}  {escape(text)}")
+        if not listed and not as_json:
+            _out.print("no serial ports on this machine; `aolink rig section-vi` makes a simulated pair")
+        return
+    found: list[Found] = []
+    failed: AolinkError | None = None
+    for port in ports:
+        try:
+            found.append(identify_port(port))
+        except AolinkError as error:
+            failed = error
+            _err.print(f"{port}: {escape(str(error))}")
+            continue
+        if not as_json:
+            _out.print(f"{port}: {escape(found[-1].text())}")
+    if as_json:
+        print(json.dumps([vars(each) for each in found]))
+    if failed:
+        raise typer.Exit(failed.exit_code)
+
+
+@app.command(
+    epilog="Example: aolink record --camera /dev/pts/3 --mirror /dev/pts/4 --rig section-vi -e o3 --exposures 100 -o a.mcap"
+)
+def record(
+    camera: Annotated[str, typer.Option(metavar="PORT", help="Port of the camera: a device path or socket://host:port.")],
+    mirror: Annotated[str, typer.Option(metavar="PORT", help="Port of the mirror driver.")],
+    rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What the devices are: a rig file or the name of one.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    estimator: EstimatorOption = None,
+    exposures: Annotated[int | None, typer.Option(min=1, help="How many exposures.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="How long, in seconds of device time.")] = None,
+    note: Annotated[str, typer.Option(metavar="TEXT", help="Goes into the recording.")] = "",
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Record a session: play the rig's drive, record everything, estimate on the way.
+
+    Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
+    """
+    from aolink import session
+    from aolink.rig import load_rig
+
+    loaded = load_rig(rig)
+    if exposures is not None and duration is not None:
+        raise typer.BadParameter("give --exposures or --duration, not both")
+    if duration is not None:
+        if not duration > 0:
+            raise typer.BadParameter("--duration must be above zero")
+        exposures = max(1, math.ceil(duration / (loaded.timing.frame_period_steps * loaded.timing.fast_step_s)))
+    with _StopRequest().installed() as stop, _progress(exposures) as tell:
+        report = session.record(
+            loaded,
+            camera,
+            mirror,
+            output,
+            estimators=estimator or [],
+            exposures=exposures or 0,
+            note=note,
+            overwrite=overwrite,
+            stop=stop,
+            progress=lambda done: tell("exposures", done),
+        )
+    from aolink import tables
+
+    _out.print(tables.session(report))
+    _out.print(f"{output}: {report.exposures} exposures, {report.ended}; look at it: aolink view {output}")
+    stop.exit_if_asked()
+
+
+@app.command(epilog="Example: aolink info session.mcap --json")
+def info(file: FileArgument, as_json: JsonOption = False) -> None:
+    """Say what a recording holds."""
+    from aolink import tables
+    from aolink.recording.reader import Recording
+
+    recording = Recording(file)
+    facts = tables.recording_facts(recording)
+    if as_json:
+        print(json.dumps(facts))
+    else:
+        _out.print(tables.facts(facts))
+
+
+@app.command(epilog="Example: aolink estimate session.mcap --estimator o1 --estimator o3 -o again.mcap")
+def estimate(
+    file: FileArgument,
+    estimator: EstimatorOption = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", help="A copy with the new estimates.")] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate the motion inside each exposure of a recording, again or for the first time."""
+    from aolink import tables
+    from aolink.recording.reader import Recording
+    from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
+
+    recording = Recording(file)
+    names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
+    total = recording.counts.get("/camera/image", 0)
+    if output is not None:
+        with _progress(total) as tell:
+            write_reestimated(recording, names, output, overwrite=overwrite, progress=lambda n: tell("estimate", n))
+        recording = Recording(output)
+        estimates = {name: recording.estimates(name) for name in names}
+    else:
+        with _progress(total) as tell:
+            estimates = reestimate(recording, names, lambda n: tell("estimate", n))
+    scores = tables.score_all(recording, estimates)
+    if as_json:
+        print(json.dumps(tables.scores_as_json(scores)))
+        return
+    _out.print(tables.scores(scores))
+    online = Recording(file)
+    for name in names:
+        if name in online.estimators:
+            difference = first_difference(online.estimates(name), estimates[name])
+            _out.print(f"{name}: {difference or 'the same as recorded, bit for bit'}")
+    if output is not None:
+        _out.print(f"written: {output}")
+
+
+@app.command(epilog="Example: aolink view session.mcap --screenshot session.png")
+def view(
+    file: FileArgument,
+    save: Annotated[Path | None, typer.Option(metavar="X.rrd", help="Write a Rerun file instead of opening the viewer.")] = None,
+    screenshot: Annotated[Path | None, typer.Option(metavar="X.png", help="Write a picture of the viewer; needs no screen.")] = None,
+    web: Annotated[bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")] = False,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Look at a recording in Rerun."""
+    import tempfile
+
+    from aolink import viewing
+    from aolink.recording.reader import Recording
+
+    for target in (save, screenshot):
+        if target is not None and target.exists() and not overwrite:
+            raise AolinkError(f"{target} exists and is not overwritten: give another name, or --overwrite to replace it")
+    recording = Recording(file)
+    with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
+        rrd = save or Path(folder) / f"{file.stem}.rrd"
+        viewing.save_rrd(recording, rrd)
+        if save is not None:
+            _out.print(f"written: {save}")
+        if screenshot is not None:
+            viewing.screenshot(rrd, screenshot)
+            _out.print(f"written: {screenshot}")
+        if web:
+            viewing.serve_web(rrd)
+        elif save is None and screenshot is None:
+            viewing.open_viewer(rrd)
+
+
+@app.command(epilog="Example: aolink demo --rig section-vi-lively --out /tmp")
+def demo(
+    rig: Annotated[str, typer.Option(help="Rig file or name.")] = "section-vi",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to make the new dated folder.")] = Path(),
+    exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
+    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock and measure latencies.")] = False,
+) -> None:
+    """Do the main job with a simulated rig: record, estimate, estimate again, compare, draw."""
+    from aolink import tables
+    from aolink.demo import new_folder, run_demo
+    from aolink.recording.reader import Recording
+
+    folder = new_folder(out)
+    with _StopRequest().installed() as stop, _progress(exposures) as tell:
+        result = run_demo(
+            rig, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
+        )  # fmt: skip
+    recording = Recording(result.recording)
+    estimates = {name: recording.estimates(name) for name in recording.estimators}
+    _out.print(tables.scores(tables.score_all(recording, estimates)))
+    _out.print(tables.session(result.report))
+    for line in tables.demo_summary(result):
+        _out.print(line)
+    stop.exit_if_asked()
+    if result.differences:
+        raise typer.Exit(1)

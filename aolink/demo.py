@@ -1,0 +1,142 @@
+"""The main job from end to end: a rig, a session, the estimates again, the pictures, the table."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from aolink.errors import AolinkError, DeviceError, ViewerError
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, reestimate
+from aolink.rig import load_rig
+from aolink.session import Report, record
+
+ESTIMATORS = ("open-loop", "o1", "o2", "o3")
+_RIG_START_S = 20.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoResult:
+    """What the demo made."""
+
+    recording: Path
+    rrd: Path
+    picture: Path | None
+    no_picture: str
+    """Why there is no picture; empty where there is one."""
+    report: Report
+    differences: dict[str, str]
+    """Where online and offline estimates differ, by estimator; empty if nowhere."""
+    seconds: dict[str, float]
+    """Wall time of each part."""
+
+
+@contextlib.contextmanager
+def simulated_rig(rig: str | Path, *, seed: int | None = None, real_time: bool = False) -> Iterator[tuple[str, str]]:
+    """A simulated rig as a process of its own; gives the ports of camera and mirror.
+
+    Raises
+    ------
+    DeviceError
+        The process does not start.
+    """
+    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json"]
+    command += ["--real-time"] if real_time else []
+    command += ["--seed", str(seed)] if seed is not None else []
+    # A group of its own: Ctrl-C is for the session, which still has to park the mirror.
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, start_new_session=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        if not line:
+            raise DeviceError(f"the simulated rig did not start: {' '.join(command)} ended with {process.wait()}")
+        ports = json.loads(line)
+        yield ports["camera"], ports["mirror"]
+    finally:
+        process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(5)
+        process.kill()
+        process.wait()
+        if process.stdout:
+            process.stdout.close()
+
+
+def new_folder(parent: Path) -> Path:
+    """A dated folder that did not exist before."""
+    name = time.strftime("demo-%Y%m%d-%H%M%S")
+    for suffix in ("", *(f"-{n}" for n in range(2, 1000))):
+        folder = parent / (name + suffix)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise AolinkError(f"cannot create {folder}: {error.strerror}; give another --out") from None
+        return folder
+    raise AolinkError(f"{parent} is full of folders named {name}: give another --out")
+
+
+def run_demo(
+    rig_name: str,
+    folder: Path,
+    *,
+    exposures: int,
+    seed: int | None,
+    real_time: bool,
+    stop: Callable[[], bool],
+    progress: Callable[[str, int], None],
+) -> DemoResult:
+    """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays."""
+    from aolink import viewing
+
+    rig = load_rig(rig_name)
+    path, rrd, picture = folder / "session.mcap", folder / "session.rrd", folder / "session.png"
+    seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def part(name: str) -> Iterator[Callable[[int], None]]:
+        start = time.monotonic()
+        progress(name, 0)
+        yield lambda done: progress(name, done)
+        seconds[name] = time.monotonic() - start
+
+    with (
+        part("record") as tell,
+        simulated_rig(rig_name, seed=seed, real_time=real_time) as (camera, mirror),
+    ):
+        report = record(
+            rig, camera, mirror, path, estimators=ESTIMATORS, exposures=exposures, note="aolink demo", stop=stop,
+            progress=tell,
+        )  # fmt: skip
+    with part("estimate again") as tell:
+        recording = Recording(path)
+        offline = reestimate(recording, ESTIMATORS, tell)
+        differences = {
+            name: difference
+            for name, again in offline.items()
+            if (difference := first_difference(recording.estimates(name), again))
+        }
+    with part("write .rrd"):
+        viewing.save_rrd(recording, rrd)
+    no_picture = ""
+    with part("draw"):
+        try:
+            viewing.screenshot(rrd, picture)
+        except ViewerError as error:
+            no_picture = str(error)
+    return DemoResult(
+        recording=path,
+        rrd=rrd,
+        picture=None if no_picture else picture,
+        no_picture=no_picture,
+        report=report,
+        differences=differences,
+        seconds=seconds,
+    )

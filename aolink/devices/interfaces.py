@@ -1,0 +1,92 @@
+"""What a session asks of a camera and of a mirror, whatever protocol they speak.
+
+Devices never wait: the session hands them what came over their line (`handle`) and they say what it
+means, as events.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.assembly import Frame
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.clock import ClockExchange, ClockRegression
+from aolink.wire.link import Link, Received
+
+
+@dataclass(frozen=True, slots=True)
+class ClockSampled:
+    """A clock query was answered."""
+
+    exchange: ClockExchange
+    accepted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAnswered:
+    """A command block was acknowledged or refused."""
+
+    ack: pb.CommandAck
+    block: pb.CommandBlock
+
+
+Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswered
+"""What a device may report."""
+
+
+class Device(Protocol):
+    """What camera and mirror have in common."""
+
+    link: Link
+    identity: pb.Identity
+    clock: ClockRegression
+
+    def handle(self, received: Received) -> list[Event]:
+        """What a message from the device means."""
+
+    def query_clock(self, now_ns: int) -> None:
+        """Ask the device for its time."""
+
+
+class Camera(Device, Protocol):
+    """Takes frames, each integrated over a run of fast steps."""
+
+    def start(self, first_step: int, exposures: int) -> None:
+        """Take ``exposures`` frames (0: until stopped), the first from ``first_step``. Raises DeviceError."""
+
+    def stop(self) -> None:
+        """Take no more frames. Raises DeviceError."""
+
+    def flush(self) -> list[Frame]:
+        """The frame that is still incomplete, as it is."""
+
+
+class Mirror(Device, Protocol):
+    """Applies inputs at fast steps."""
+
+    @property
+    def in_flight(self) -> int:
+        """Blocks sent and not yet answered."""
+
+    retransmits: int
+    round_trip_s: float
+    """Of commands, smoothed; NaN before the first."""
+
+    def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
+        """Send inputs (n_steps, n_inputs) for the fast steps from ``first_step``; gives the block as sent.
+
+        Raises DeviceError for an input beyond the limits: it is refused, never clamped.
+        """
+
+    def next_timeout_ns(self) -> int | None:
+        """When the oldest unanswered block is to be sent again, host clock; None if nothing is in flight."""
+
+    def retransmit(self, now_ns: int) -> None:
+        """Send again what has timed out. Raises DeviceError after too many tries."""
+
+    def park(self) -> None:
+        """Put the mirror into its safe state and empty its queue. Raises DeviceError."""

@@ -1,0 +1,272 @@
+"""Camera and mirror that speak aolink's own packet protocol."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.assembly import Frame, FrameReassembly, TruthReassembly
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
+from aolink.errors import DeviceError
+from aolink.rig import Rig
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.clock import ClockExchange, ClockRegression
+from aolink.wire.hub import Hub
+from aolink.wire.link import Link, Received
+from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
+
+_FIRST_TIMEOUT_S = 0.1
+_MIN_TIMEOUT_S = 0.02
+_MAX_TIMEOUT_S = 0.5
+_MAX_TRIES = 8
+_MAX_QUERIES = 32
+
+
+class _NativeDevice:
+    """What the native camera and mirror share: identity, clock, simple requests."""
+
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
+        self.link, self.identity = link, identity
+        self.clock = ClockRegression()
+        self._hub = hub
+        self._query_ids = count(1)
+        self._queries: dict[int, int] = {}
+
+    def query_clock(self, now_ns: int) -> None:
+        query_id = next(self._query_ids)
+        self._queries[query_id] = now_ns
+        while len(self._queries) > _MAX_QUERIES:  # answers that never came
+            del self._queries[next(iter(self._queries))]
+        self.link.send(pb.ClockQuery(query_id=query_id, host_send_ns=now_ns))
+
+    def _sample_clock(self, reply: pb.ClockReply, receive_ns: int, *, usable: bool = True) -> list[Event]:
+        sent_ns = self._queries.pop(reply.query_id, None)
+        if sent_ns is None or sent_ns != reply.host_send_ns:
+            return []
+        exchange = ClockExchange(sent_ns, reply.device_receive_ns, reply.device_send_ns, receive_ns)
+        return [ClockSampled(exchange, usable and self.clock.add(exchange))]
+
+    def _request(self, message: pb.CameraControl | pb.Park, what: str) -> None:
+        ack = self._hub.request(self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence)
+        if ack is None:
+            raise DeviceError(f"the {self.link.name} did not answer when told to {what}: is it still connected?")
+        if ack.code != pb.OK:
+            raise DeviceError(f"the {self.link.name} refused to {what}: {ack.text or pb.Code.Name(ack.code)}")
+
+
+class NativeCamera(_NativeDevice):
+    """A camera on the packet protocol."""
+
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
+        super().__init__(hub, link, identity)
+        self._frames = FrameReassembly((identity.camera.height, identity.camera.width))
+        self._truths = TruthReassembly()
+
+    def start(self, first_step: int, exposures: int) -> None:
+        self._request(pb.CameraControl(run=True, first_step=first_step, exposures=exposures), "start")
+
+    def stop(self) -> None:
+        self._request(pb.CameraControl(run=False), "stop")
+
+    def flush(self) -> list[Frame]:
+        return self._frames.flush()
+
+    def handle(self, received: Received) -> list[Event]:
+        message = received.message
+        if isinstance(message, pb.FrameChunk):
+            return list(self._frames.add(message, received.receive_ns))
+        if isinstance(message, pb.TruthChunk):
+            truth = self._truths.add(message)
+            return [truth] if truth else []
+        if isinstance(message, pb.ClockReply):
+            return self._sample_clock(message, received.receive_ns)
+        return [message] if isinstance(message, pb.Event) else []
+
+
+@dataclass(slots=True)
+class _Flight:
+    """A block that was sent and is not answered yet."""
+
+    block: pb.CommandBlock
+    first_sent_ns: int
+    deadline_ns: int
+    tries: int = 1
+
+
+class NativeMirror(_NativeDevice):
+    """A mirror driver on the packet protocol: blocks are acknowledged, and sent again on time-out."""
+
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
+        super().__init__(hub, link, identity)
+        self.retransmits = 0
+        self._block_ids = count(1)
+        self._flights: dict[int, _Flight] = {}
+        # Smoothed round trip and its mean deviation, as TCP has them (RFC 6298).
+        self.round_trip_s = math.nan
+        self._deviation_s = math.nan
+
+    @property
+    def in_flight(self) -> int:
+        return len(self._flights)
+
+    def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
+        limits = self.identity.mirror
+        if u.ndim != 2 or u.shape[1] != limits.n_inputs:
+            raise DeviceError(
+                f"a command of shape {u.shape} for a mirror of {limits.n_inputs} inputs: give (steps, inputs)"
+            )
+        inside = (u >= np.array(limits.input_min)) & (u <= np.array(limits.input_max))
+        if not inside.all():  # NaN fails as well
+            step, channel = np.argwhere(~inside)[0]
+            raise DeviceError(
+                f"input {channel} at fast step {first_step + step} is {u[step, channel]:g}, beyond the mirror's limits"
+                f" {limits.input_min[channel]:g} .. {limits.input_max[channel]:g}: it was not sent"
+            )
+        block = pb.CommandBlock(
+            block_id=next(self._block_ids),
+            first_step=first_step,
+            n_steps=len(u),
+            u=u.ravel(),
+            cause_frame_id=cause_frame_id,
+        )
+        self._flights[block.block_id] = _Flight(block, now_ns, now_ns + self._timeout_ns())
+        self.link.send(block)
+        return block
+
+    def next_timeout_ns(self) -> int | None:
+        return min((flight.deadline_ns for flight in self._flights.values()), default=None)
+
+    def retransmit(self, now_ns: int) -> None:
+        for flight in self._flights.values():
+            if flight.deadline_ns > now_ns:
+                continue
+            if flight.tries >= _MAX_TRIES:
+                raise DeviceError(
+                    f"the mirror has not acknowledged a command that was sent {flight.tries} times:"
+                    " is it still connected?"
+                )
+            flight.tries += 1
+            flight.deadline_ns = now_ns + self._timeout_ns() * (1 << min(flight.tries, 4))
+            self.retransmits += 1
+            self.link.send(flight.block)
+
+    def park(self) -> None:
+        self._flights.clear()
+        self._request(pb.Park(), "park")
+
+    def handle(self, received: Received) -> list[Event]:
+        message = received.message
+        if isinstance(message, pb.CommandAck):
+            return self._take_ack(message, received.receive_ns)
+        if isinstance(message, pb.ClockReply):
+            # While something is sent again the line is busy in one direction: such a sample is worth nothing.
+            clean = all(flight.tries == 1 for flight in self._flights.values())
+            return self._sample_clock(message, received.receive_ns, usable=clean)
+        return [message] if isinstance(message, pb.Applied | pb.Event) else []
+
+    def _take_ack(self, ack: pb.CommandAck, receive_ns: int) -> list[Event]:
+        flight = self._flights.get(ack.block_id)
+        if flight is None:
+            return []
+        if ack.code == pb.QUEUE_FULL:  # not an answer to keep: it is sent again when its time-out comes
+            return []
+        del self._flights[ack.block_id]
+        if flight.tries == 1:  # otherwise nobody knows which of them was answered (Karn)
+            self._measure(max(0, receive_ns - flight.first_sent_ns) / 1e9)
+        if ack.code in (pb.OUT_OF_RANGE, pb.WRONG_SHAPE, pb.NOT_SUPPORTED):
+            raise DeviceError(
+                f"the mirror refused command block {ack.block_id} from fast step {flight.block.first_step}:"
+                f" {ack.text or pb.Code.Name(ack.code)}"
+            )
+        return [CommandAnswered(ack, flight.block)]
+
+    def _measure(self, round_trip_s: float) -> None:
+        if math.isnan(self.round_trip_s):
+            self.round_trip_s, self._deviation_s = round_trip_s, round_trip_s / 2
+        else:
+            self._deviation_s += (abs(round_trip_s - self.round_trip_s) - self._deviation_s) / 4
+            self.round_trip_s += (round_trip_s - self.round_trip_s) / 8
+
+    def _timeout_ns(self) -> int:
+        timeout = self.round_trip_s + 4 * self._deviation_s
+        if math.isnan(timeout):
+            timeout = _FIRST_TIMEOUT_S
+        return round(min(max(timeout, _MIN_TIMEOUT_S), _MAX_TIMEOUT_S) * 1e9)
+
+
+def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
+    """Ask the device on a line who it is.
+
+    Raises
+    ------
+    DeviceError
+        It does not answer, or speaks another version of the protocol.
+    """
+    identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
+    if identity is None and link.foreign_version is not None:
+        found = link.foreign_version
+    elif identity is None:
+        heard = link.counts.bytes_received
+        what = f"{heard} bytes came that are not aolink packets" if heard else "nothing came"
+        raise DeviceError(
+            f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on?"
+        )
+    else:
+        found = identity.protocol_version
+    if identity is None or found != PROTOCOL_VERSION:
+        raise DeviceError(
+            f"the device on the {link.name} port speaks protocol version {found},"
+            f" this aolink speaks {PROTOCOL_VERSION}: update the {'device' if found < PROTOCOL_VERSION else 'host'}"
+        )
+    if identity.schema_hash != schema_hash():
+        raise DeviceError(
+            f"the device on the {link.name} port was built with another messages.proto"
+            f" ({identity.schema_hash.hex()}, here {schema_hash().hex()}): update the older of the two"
+        )
+    return identity
+
+
+def check_kind(link: Link, identity: pb.Identity, kind: pb.Identity.Kind) -> None:
+    """Refuse a device of another kind. Raises DeviceError."""
+    if identity.kind != kind:
+        found = pb.Identity.Kind.Name(identity.kind).lower()
+        wanted = pb.Identity.Kind.Name(kind).lower()
+        raise DeviceError(
+            f"the device on the {link.name} port is a {found} ({identity.model}), expected a {wanted}:"
+            " are the two ports swapped?"
+        )
+
+
+def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> None:
+    """Refuse devices that are not what the rig file says. Raises DeviceError naming the first difference."""
+    if camera.virtual_time != mirror.virtual_time or (
+        camera.virtual_time and camera.serial_number != mirror.serial_number
+    ):
+        raise DeviceError(
+            f"camera {camera.serial_number} and mirror {mirror.serial_number} do not belong to the same rig:"
+            " a rig on virtual time needs both of its ports"
+        )
+    limits = mirror.mirror
+    pairs = [
+        ("timing.fast_step_s (camera, ns)", camera.fast_step_ns, rig.timing.fast_step_ns),
+        ("timing.fast_step_s (mirror, ns)", mirror.fast_step_ns, rig.timing.fast_step_ns),
+        ("sensor shape (rows, columns)", (camera.camera.height, camera.camera.width), rig.sensor.shape),
+        ("sensor.bit_depth", camera.camera.bit_depth, rig.sensor.bit_depth),
+        ("timing.exposure_steps", camera.camera.exposure_steps, rig.timing.exposure_steps),
+        ("timing.frame_period_steps", camera.camera.frame_period_steps, rig.timing.frame_period_steps),
+        ("number of inputs", limits.n_inputs, rig.n_inputs),
+        ("mirror.input_min", list(limits.input_min), rig.mirror.input_min.tolist()),
+        ("mirror.input_max", list(limits.input_max), rig.mirror.input_max.tolist()),
+        ("mirror.park", list(limits.park), rig.mirror.park.tolist()),
+        ("mirror.dac_bits", limits.dac_bits, rig.mirror.dac_bits),
+    ]
+    for name, found, expected in pairs:
+        if found != expected:
+            raise DeviceError(
+                f"the rig file {rig.name} does not match the device: {name} is {expected} in the file,"
+                f" {found} on the device; give the rig file of this device (--rig)"
+            )

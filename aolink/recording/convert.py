@@ -1,0 +1,142 @@
+"""Plain data <-> the messages of a recording. Lossless: what is read back is what was written, bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from numpy.typing import NDArray
+
+from aolink.assembly import Frame
+from aolink.errors import RecordingError
+from aolink.estimation import ExposureModel, path_from_coefficients
+from aolink.estimation.estimate import Estimate, Status
+from aolink.exposure import Exposure, Truth
+from aolink.recording import schemas_pb2 as pb
+from aolink.wire import messages_pb2 as wire
+
+
+def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
+    """A frame as it is recorded: what is known about it, and its picture."""
+    height, width = frame.pixels.shape
+    offsets, lengths = _runs(~frame.mask.ravel())
+    info = pb.ExposureInfo(
+        frame_id=frame.frame_id,
+        first_step=frame.first_step,
+        last_step=frame.last_step,
+        device_start_ns=frame.device_start_ns,
+        device_end_ns=frame.device_end_ns,
+        host_start_ns=frame.host_start_ns,
+        clock_sigma_ns=frame.clock_sigma_ns,
+        host_first_byte_ns=frame.host_first_byte_ns,
+        host_receive_ns=frame.host_receive_ns,
+        chunks_lost=frame.chunks_lost,
+        missing_offset=2 * offsets,
+        missing_length=2 * lengths,
+        frames_lost_before=frame.frames_lost_before,
+    )
+    image = RawImage(frame_id="camera", width=width, height=height, encoding="mono16", step=2 * width)
+    image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
+    image.data = frame.pixels.astype("<u2").tobytes()
+    return info, image
+
+
+def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
+    """Inverse of `frame_messages`. Raises RecordingError for a picture that is not what it says."""
+    size = image.width * image.height
+    if image.encoding != "mono16" or len(image.data) != 2 * size or info.last_step < info.first_step:
+        raise RecordingError(
+            f"the picture of frame {info.frame_id} is damaged or not mono16: run `aolink info` on the file"
+        )
+    mask = np.ones(size, dtype=bool)
+    for offset, length in zip(info.missing_offset, info.missing_length, strict=True):
+        mask[offset // 2 : (offset + length + 1) // 2] = False
+    shape = (image.height, image.width)
+    return Frame(
+        frame_id=info.frame_id,
+        first_step=info.first_step,
+        last_step=info.last_step,
+        pixels=np.frombuffer(image.data, dtype="<u2").astype(np.uint16).reshape(shape),
+        mask=mask.reshape(shape),
+        chunks_lost=info.chunks_lost,
+        frames_lost_before=info.frames_lost_before,
+        device_start_ns=info.device_start_ns,
+        device_end_ns=info.device_end_ns,
+        host_first_byte_ns=info.host_first_byte_ns,
+        host_receive_ns=info.host_receive_ns,
+        host_start_ns=info.host_start_ns,
+        clock_sigma_ns=info.clock_sigma_ns,
+    )
+
+
+def estimate_message(estimate: Estimate) -> pb.Estimate:
+    """An estimate as it is recorded: the path as coefficients of the exposure basis."""
+    axes, n_states = estimate.end_state.shape
+    return pb.Estimate(
+        estimator=estimate.estimator,
+        frame_id=estimate.frame_id,
+        first_step=estimate.first_step,
+        n_steps=estimate.n_steps,
+        status=pb.Estimate.Status.ValueType(estimate.status),
+        reason=estimate.reason,
+        axes=axes,
+        n_states=n_states,
+        n_coefficients=estimate.coefficients.shape[1],
+        n_measurements=estimate.innovation.shape[1],
+        end_state=estimate.end_state.ravel(),
+        end_covariance=estimate.end_covariance.ravel(),
+        coefficients=estimate.coefficients.ravel(),
+        coefficient_covariance=estimate.coefficient_covariance.ravel(),
+        innovation=estimate.innovation.ravel(),
+        innovation_covariance=estimate.innovation_covariance.ravel(),
+        nis=estimate.nis,
+    )
+
+
+def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: Exposure) -> Estimate:
+    """Inverse of `estimate_message`; the path is expanded with the inputs of its exposure."""
+    axes, n, c, m = message.axes, message.n_states, message.n_coefficients, message.n_measurements
+    coefficients = _array(message.coefficients, axes, c)
+    covariance = _array(message.coefficient_covariance, axes, c, c)
+    path, path_sd = path_from_coefficients(model, coefficients, covariance, exposure.inputs)
+    return Estimate(
+        estimator=message.estimator,
+        frame_id=message.frame_id,
+        first_step=message.first_step,
+        n_steps=message.n_steps,
+        status=Status(message.status),
+        reason=message.reason,
+        start_state=coefficients[:, :n].copy(),
+        start_covariance=covariance[:, :n, :n].copy(),
+        end_state=_array(message.end_state, axes, n),
+        end_covariance=_array(message.end_covariance, axes, n, n),
+        coefficients=coefficients,
+        coefficient_covariance=covariance,
+        path=path,
+        path_sd=path_sd,
+        innovation=_array(message.innovation, axes, m),
+        innovation_covariance=_array(message.innovation_covariance, axes, m, m),
+        nis=_array(message.nis, axes),
+    )
+
+
+def truth_from_message(message: wire.Truth) -> Truth:
+    """What the simulated rig said about an exposure."""
+    axes, outputs = message.axes, message.n_outputs
+    return Truth(
+        start_state=_array(message.start_state, axes, -1),
+        end_state=_array(message.end_state, axes, -1),
+        path=_array(message.path, outputs, -1),
+    )
+
+
+def _array(values: object, *shape: int) -> NDArray[np.float64]:
+    try:
+        return np.array(values, dtype=np.float64).reshape(shape)
+    except ValueError:
+        raise RecordingError("an estimate or a truth in the file has the wrong size: the file is damaged") from None
+
+
+def _runs(flags: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Starts and lengths of the runs of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return edges[::2], edges[1::2] - edges[::2]

@@ -1,0 +1,51 @@
+"""The topics of a recording, and the schema of each."""
+
+from __future__ import annotations
+
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message
+
+from aolink.recording import schemas_pb2
+from aolink.wire import messages_pb2
+
+IMAGE = "/camera/image"
+EXPOSURE = "/camera/exposure"
+COMMAND = "/mirror/command"
+APPLIED = "/mirror/applied"
+CLOCK = "/clock"
+LINK = "/link"
+TRUTH = "/truth"
+LATENCY = "/latency"
+LOG = "/log"
+ESTIMATE = "/estimate/"
+"""Prefix; the estimator's name follows."""
+
+SCHEMAS: dict[str, type[Message]] = {
+    message.DESCRIPTOR.full_name: message
+    for message in (
+        RawImage,
+        Log,
+        schemas_pb2.ExposureInfo,
+        schemas_pb2.ClockSample,
+        schemas_pb2.LinkStatistics,
+        schemas_pb2.Latency,
+        schemas_pb2.Estimate,
+        messages_pb2.CommandBlock,
+        messages_pb2.Applied,
+        messages_pb2.Truth,
+    )
+}
+"""Message class by the full name of its schema."""
+
+RIG_ATTACHMENT = "rig.toml"
+BASIS_ATTACHMENT = "exposure_basis.npy"
+SESSION_METADATA = "aolink"
+"""Written at the start: versions, rig, devices, note."""
+END_METADATA = "aolink/end"
+"""Written at the end: how the session ended, and its counts."""
+
+
+def estimate_topic(name: str) -> str:
+    """Topic of an estimator."""
+    return ESTIMATE + name

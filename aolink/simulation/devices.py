@@ -1,0 +1,292 @@
+"""The simulated camera and mirror driver as a host meets them: messages in, messages out.
+
+State only: no ports and no time of its own. `aolink.simulation.server` puts it behind ports. It is the
+device's side of protocol version 1; a host never imports it, it meets it on the wire.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
+from aolink.exposure import Truth
+from aolink.rig import Rig
+from aolink.simulation.model import CameraFrame, RigModel
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import MAX_CHUNK, PROTOCOL_VERSION, schema_hash
+
+Line = Literal["camera", "mirror"]
+FIRMWARE = "aolink simulated rig 1"
+_REMEMBERED_BLOCKS = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Outgoing:
+    """A message for the host, and the fast step at whose end it leaves (None: at once)."""
+
+    line: Line
+    message: Message
+    after_step: int | None = None
+
+
+class SimulatedDevices:
+    """Camera and mirror driver that share one plant and one count of fast steps."""
+
+    def __init__(self, rig: Rig, seed: int | None = None, *, virtual_time: bool, step_zero_ns: int) -> None:
+        self.rig = rig
+        self.outbox: list[Outgoing] = []
+        self._model = RigModel(rig, seed)
+        self._virtual_time = virtual_time
+        self._step_zero_ns = step_zero_ns
+        self._serial_number = f"{rig.digest[:8]}-{rig.simulation.seed if seed is None else seed}"
+        self._queue: dict[int, tuple[int, NDArray[np.float64]]] = {}
+        self._acks: OrderedDict[int, pb.CommandAck] = OrderedDict()
+        self._reporting = False
+        self._camera_start: int | None = None
+        self.parked = True
+
+    @property
+    def step(self) -> int:
+        """The next fast step."""
+        return self._model.step
+
+    @property
+    def queue_end(self) -> int:
+        """The first fast step that nothing is queued for."""
+        return max(self._queue, default=self.step - 1) + 1
+
+    @property
+    def ready_end(self) -> int:
+        """The first fast step without a command: how far virtual time may run."""
+        end = self.step
+        while end in self._queue:
+            end += 1
+        return end
+
+    def device_ns(self, step: int) -> int:
+        """Device time at which a fast step begins."""
+        return self._step_zero_ns + step * self.rig.timing.fast_step_ns
+
+    def next_report_step(self) -> int:
+        """The step before which the next report is due: the end of a block or of an exposure.
+
+        Without either, one report length ahead.
+        """
+        block_id = self._queue.get(self.step, (0, None))[0]
+        end = self.step + 1
+        while end < self.step + self.rig.mirror.block_steps and self._queue.get(end, (0, None))[0] == block_id:
+            end += 1
+        if self._camera_start is not None:
+            timing = self.rig.timing
+            # First exposure that ends after this step.
+            number = max(0, (self.step - self._camera_start - timing.exposure_steps) // timing.frame_period_steps + 1)
+            frame_end = self._camera_start + number * timing.frame_period_steps + timing.exposure_steps
+            end = min(end, frame_end) if frame_end > self.step else end
+        return end
+
+    def handle(self, line: Line, message: Message, sequence: int) -> None:
+        """Act on a message from the host; the answers are in the outbox."""
+        if isinstance(message, pb.Identify):
+            self.outbox = [o for o in self.outbox if o.line != line]
+            if line == "mirror":
+                self._acks.clear()
+            self._say(line, self._identity(line, message.nonce))
+        elif isinstance(message, pb.CommandBlock) and line == "mirror":
+            self._say(line, self._take_block(message))
+        elif isinstance(message, pb.Park) and line == "mirror":
+            self.park()
+            self._reporting = False
+            self._say(line, pb.Ack(sequence=sequence))
+        elif isinstance(message, pb.CameraControl) and line == "camera":
+            self._say(line, self._control_camera(message, sequence))
+        else:
+            name = type(message).__name__
+            self._say(line, pb.Ack(sequence=sequence, code=pb.NOT_SUPPORTED, text=f"a {line} does not take {name}"))
+
+    def park(self, why: str = "") -> None:
+        """Put the mirror into its safe state and empty the queue."""
+        self._queue.clear()
+        if why and not self.parked:
+            event = pb.Event(level=pb.Event.WARNING, device_ns=self.device_ns(self.step), text=f"mirror parked: {why}")
+            self._say("mirror", event)
+        self.parked = True
+
+    def advance_to(self, step: int) -> None:
+        """Let the plant run until ``step`` is the next one; reports and frames are in the outbox."""
+        first = self.step
+        if step <= first:
+            return
+        park = self.rig.mirror.park
+        sources, rows = [], np.empty((step - first, self.rig.n_inputs))
+        for k in range(first, step):
+            block_id, rows[k - first] = self._queue.pop(k, (0, park))
+            sources.append(block_id)
+            if not block_id and not self.parked:
+                self.park("its queue ran empty")
+            self.parked = not block_id
+        frames = self._model.advance(rows)
+        if self._reporting:
+            self._report(first, sources, rows)
+        for frame in frames:
+            self._send_frame(frame)
+        self.outbox.sort(key=lambda o: -1 if o.after_step is None else o.after_step)
+
+    def _say(self, line: Line, message: Message, after_step: int | None = None) -> None:
+        self.outbox.append(Outgoing(line, message, after_step))
+
+    def _identity(self, line: Line, nonce: int) -> pb.Identity:
+        rig = self.rig
+        identity = pb.Identity(
+            nonce=nonce,
+            model=rig.name,
+            serial_number=self._serial_number,
+            firmware=FIRMWARE,
+            protocol_version=PROTOCOL_VERSION,
+            schema_hash=schema_hash(),
+            fast_step_ns=rig.timing.fast_step_ns,
+            next_step=self.queue_end,
+            step_zero_ns=self._step_zero_ns,
+            virtual_time=self._virtual_time,
+        )
+        if line == "camera":
+            identity.kind = pb.Identity.CAMERA
+            height, width = rig.sensor.shape
+            identity.camera.CopyFrom(
+                pb.CameraGeometry(
+                    width=width,
+                    height=height,
+                    bit_depth=rig.sensor.bit_depth,
+                    exposure_steps=rig.timing.exposure_steps,
+                    frame_period_steps=rig.timing.frame_period_steps,
+                )
+            )
+        else:
+            identity.kind = pb.Identity.MIRROR
+            mirror = rig.mirror
+            identity.mirror.CopyFrom(
+                pb.MirrorLimits(
+                    n_inputs=rig.n_inputs,
+                    input_min=mirror.input_min,
+                    input_max=mirror.input_max,
+                    park=mirror.park,
+                    dac_bits=mirror.dac_bits,
+                    queue_steps=mirror.queue_steps,
+                    watchdog_s=mirror.watchdog_s,
+                    parked=self.parked,
+                )
+            )
+        return identity
+
+    def _take_block(self, block: pb.CommandBlock) -> pb.CommandAck:
+        if block.block_id in self._acks:  # a retransmission: the first answer was lost
+            return self._acks[block.block_id]
+        ack = self._check_block(block)
+        if ack.code == pb.QUEUE_FULL:  # may be sent again, so it is not remembered
+            return ack
+        self._acks[block.block_id] = ack
+        if len(self._acks) > _REMEMBERED_BLOCKS:
+            self._acks.popitem(last=False)
+        return ack
+
+    def _check_block(self, block: pb.CommandBlock) -> pb.CommandAck:
+        ack = pb.CommandAck(block_id=block.block_id, queue_end_step=self.queue_end)
+        mirror, n_inputs = self.rig.mirror, self.rig.n_inputs
+        end = block.first_step + block.n_steps
+        if not block.block_id or not block.n_steps or len(block.u) != block.n_steps * n_inputs:
+            ack.code = pb.WRONG_SHAPE
+            ack.text = f"{len(block.u)} numbers for {block.n_steps} steps of {n_inputs} inputs"
+            return ack
+        u = np.array(block.u).reshape(block.n_steps, n_inputs)
+        if not ((u >= mirror.input_min) & (u <= mirror.input_max)).all():  # NaN fails as well
+            ack.code = pb.OUT_OF_RANGE
+            ack.text = "an input is beyond the limits"
+        elif end > self.step + mirror.queue_steps:
+            ack.code = pb.QUEUE_FULL
+            ack.text = f"the queue holds {mirror.queue_steps} steps"
+        elif end <= self.step:
+            ack.code = pb.TOO_LATE
+            ack.late_steps = block.n_steps
+        if ack.code != pb.OK:
+            return ack
+        applied = mirror.quantise(u)
+        for k in range(block.first_step, end):
+            if k < self.step:
+                ack.late_steps += 1
+            else:
+                ack.superseded_steps += k in self._queue
+                self._queue[k] = (block.block_id, applied[k - block.first_step])
+        ack.queue_end_step = self.queue_end
+        self._reporting = True
+        return ack
+
+    def _control_camera(self, control: pb.CameraControl, sequence: int) -> pb.Ack:
+        if not control.run:
+            self._model.stop_camera()
+            self._camera_start = None
+        elif control.first_step < self.step:
+            text = f"fast step {control.first_step} has gone by, the next is {self.step}"
+            return pb.Ack(sequence=sequence, code=pb.TOO_LATE, text=text)
+        else:
+            self._model.start_camera(control.first_step, control.exposures)
+            self._camera_start = control.first_step
+        return pb.Ack(sequence=sequence)
+
+    def _report(self, first: int, sources: list[int], rows: NDArray[np.float64]) -> None:
+        """`Applied` for every run of steps of one source."""
+        most = self.rig.mirror.block_steps
+        start = 0
+        for k in range(1, len(sources) + 1):
+            if k < len(sources) and sources[k] == sources[start] and k - start < most:
+                continue
+            applied = pb.Applied(
+                block_id=sources[start],
+                first_step=first + start,
+                n_steps=k - start,
+                u=rows[start:k].ravel(),
+                source=pb.Applied.COMMAND if sources[start] else pb.Applied.PARKED,
+                device_ns=self.device_ns(first + k),
+            )
+            self._say("mirror", applied, first + k - 1)
+            start = k
+
+    def _send_frame(self, frame: CameraFrame) -> None:
+        height, width = frame.pixels.shape
+        last_step = frame.first_step + frame.n_steps - 1
+        data = frame.pixels.astype("<u2").tobytes()
+        for offset in range(0, len(data), MAX_CHUNK):
+            picture = pb.FrameChunk(
+                frame_id=frame.frame_id,
+                offset=offset,
+                total=len(data),
+                width=width,
+                height=height,
+                first_step=frame.first_step,
+                last_step=last_step,
+                exposure_start_ns=self.device_ns(frame.first_step),
+                exposure_end_ns=self.device_ns(last_step + 1),
+                data=data[offset : offset + MAX_CHUNK],
+            )
+            self._say("camera", picture, last_step)
+        data = truth_message(frame.frame_id, frame.truth).SerializeToString()
+        for offset in range(0, len(data), MAX_CHUNK):
+            piece = data[offset : offset + MAX_CHUNK]
+            self._say(
+                "camera", pb.TruthChunk(frame_id=frame.frame_id, offset=offset, total=len(data), data=piece), last_step
+            )
+
+
+def truth_message(frame_id: int, truth: Truth) -> pb.Truth:
+    """The wire's form of a `Truth`."""
+    return pb.Truth(
+        frame_id=frame_id,
+        axes=truth.start_state.shape[0],
+        n_outputs=truth.path.shape[0],
+        start_state=truth.start_state.ravel(),
+        end_state=truth.end_state.ravel(),
+        path=truth.path.ravel(),
+    )

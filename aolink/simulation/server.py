@@ -1,0 +1,374 @@
+"""The simulated rig as a process: two lines (camera, mirror) on pseudo terminals or TCP ports.
+
+In real time the plant runs with the clock. On virtual time it runs to the end of the last queued
+command block and waits there; every line is told the host's time with `VirtualTime` packets, so
+commands drive time, and the same seed gives the same bytes however fast the host is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+import os
+import pty
+import selectors
+import socket
+import time
+import tty
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from google.protobuf.message import DecodeError, Message
+
+from aolink.errors import PortError
+from aolink.rig import Faults, Rig
+from aolink.simulation.devices import Line, Outgoing, SimulatedDevices
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import DELIMITER, MESSAGE_OF_TYPE, PROTOCOL_VERSION, Packet, PacketDecoder, encode_message
+
+VIRTUAL_EPOCH_NS = 1_767_225_600_000_000_000
+"""Host time at which a virtual session begins: 2026-01-01 00:00 UTC, always the same."""
+_TURNAROUND_NS = 5_000
+"""Between a clock query and its reply."""
+_IDLE_S = 0.5
+"""Longest sleep in real time: the plant is never further behind than this."""
+_UNREAD_LIMIT = 16 << 20
+"""Bytes that wait for a host that does not read; in real time, frames beyond it are dropped."""
+
+
+class Stream(Protocol):
+    """The device's end of a port."""
+
+    name: str
+
+    def fileno(self) -> int: ...
+    def read(self) -> bytes: ...
+    def write(self, data: bytes) -> int: ...
+    def close(self) -> None: ...
+
+
+class PtyStream:
+    """A pseudo terminal; ``name`` is the path that the host opens."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = pty.openpty()  # the slave is kept open: hosts may come and go
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.name = os.ttyname(self._slave)
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes:
+        with contextlib.suppress(BlockingIOError):
+            return os.read(self._master, 65_536)
+        return b""
+
+    def write(self, data: bytes) -> int:
+        with contextlib.suppress(BlockingIOError):
+            return os.write(self._master, data)
+        return 0
+
+    def close(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+
+
+class TcpStream:
+    """A TCP port that serves one host at a time; ``name`` is the address for pyserial."""
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            self._listener = socket.create_server((host, port))
+        except OSError as error:
+            raise PortError(f"cannot listen on {host}:{port}: {error.strerror}; give another --listen") from None
+        self._listener.setblocking(False)
+        self._peer: socket.socket | None = None
+        self.name = f"socket://{host}:{self._listener.getsockname()[1]}"
+
+    def fileno(self) -> int:
+        return (self._peer or self._listener).fileno()
+
+    def read(self) -> bytes:
+        if self._peer is None:
+            with contextlib.suppress(BlockingIOError):
+                self._peer, _ = self._listener.accept()
+                self._peer.setblocking(False)
+                self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            return b""
+        with contextlib.suppress(BlockingIOError):
+            try:
+                data = self._peer.recv(65_536)
+            except ConnectionError:
+                data = b""
+            if not data:
+                self._hang_up()
+            return data
+        return b""
+
+    def write(self, data: bytes) -> int:
+        if self._peer is None:
+            return len(data)  # nobody there to read it
+        try:
+            return self._peer.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.ECONNRESET):
+                raise
+            self._hang_up()
+            return len(data)
+
+    def _hang_up(self) -> None:
+        if self._peer is not None:
+            self._peer.close()
+            self._peer = None
+
+    def close(self) -> None:
+        self._hang_up()
+        self._listener.close()
+
+
+class FaultInjector:
+    """Damages packets by rate and by seed."""
+
+    def __init__(self, faults: Faults, seed: np.random.SeedSequence) -> None:
+        self._faults = faults
+        self._rng = np.random.default_rng(seed)
+
+    def loses_command(self) -> bool:
+        """Whether a packet from the host is lost."""
+        return self._hits(self._faults.command_loss_rate)
+
+    def damage(self, packet: bytes) -> bytes:
+        """What is left of a packet to the host: nothing, twice it, one with a bit flipped, or itself."""
+        if self._hits(self._faults.packet_loss_rate):
+            return b""
+        if self._hits(self._faults.bit_flip_rate):
+            bit = int(self._rng.integers(8 * (len(packet) - 1)))
+            damaged = bytearray(packet)
+            damaged[bit // 8] ^= 1 << bit % 8
+            packet = bytes(damaged)
+        if self._hits(self._faults.duplicate_rate):
+            packet *= 2
+        return packet
+
+    def _hits(self, rate: float) -> bool:
+        return rate > 0 and float(self._rng.random()) < rate
+
+
+class LineEnd:
+    """The device's end of one line: bytes in and out, packets, counts."""
+
+    def __init__(self, line: Line, stream: Stream, faults: FaultInjector) -> None:
+        self.line, self.stream = line, stream
+        self.taken = 0
+        """Packets of this session that have been dealt with, lost and damaged ones included."""
+        self.unsent = bytearray()
+        self._faults = faults
+        self._decoder = PacketDecoder()
+        self._sequence = 0
+
+    def receive(self) -> list[tuple[Message | None, int]]:
+        """(message, sequence) of every packet that came; the message is None for a lost or damaged one."""
+        received: list[tuple[Message | None, int]] = []
+        # Piece by piece, so that every packet, damaged or not, is counted in its place.
+        for piece in _pieces(self.stream.read()):
+            before = self._decoder.seen
+            packets = self._decoder.feed(piece)
+            for packet in packets:
+                message = None if self._faults.loses_command() else _parse(packet)
+                received.append((message, packet.sequence))
+            received.extend([(None, 0)] * (self._decoder.seen - before - len(packets)))
+        return received
+
+    def begin_session(self) -> None:
+        """On Identify: what was not sent yet is for a host that is gone."""
+        self.unsent.clear()
+        self._sequence, self.taken = 0, 0
+
+    def put(self, message: Message) -> None:
+        """Queue a message for sending; `VirtualTime` is a side channel and is never damaged."""
+        packet = encode_message(message, self._sequence)
+        self._sequence = (self._sequence + 1) & 0xFFFF
+        if isinstance(message, pb.VirtualTime):
+            packet = DELIMITER + packet  # ends whatever damage is before it
+        else:
+            packet = self._faults.damage(packet)
+        self.unsent += packet
+
+    def flush(self) -> None:
+        """Send what the port takes now."""
+        while self.unsent:
+            sent = self.stream.write(bytes(self.unsent[:65_536]))
+            if not sent:
+                return
+            del self.unsent[:sent]
+
+
+class RigServer:
+    """Runs the simulated devices behind two lines until told to stop."""
+
+    def __init__(
+        self, rig: Rig, streams: dict[Line, Stream], *, seed: int | None = None, real_time: bool = False
+    ) -> None:
+        simulation = rig.simulation
+        seeds = np.random.SeedSequence(simulation.seed if seed is None else seed).spawn(8)[5:]
+        self._lines: dict[Line, LineEnd] = {
+            line: LineEnd(line, stream, FaultInjector(simulation.faults, seeds[i]))
+            for i, (line, stream) in enumerate(streams.items())
+        }
+        self._latency_rng = np.random.default_rng(seeds[2])
+        self._real_time = real_time
+        self._latency_ns = round(simulation.latency_s * 1e9)
+        self._clock_rate = 1 + simulation.clock_drift_ppm * 1e-6
+        self._start_ns = time.monotonic_ns() if real_time else VIRTUAL_EPOCH_NS
+        self._step_zero_ns = self._start_ns + round(simulation.clock_offset_s * 1e9)
+        self._now_ns = self._start_ns  # virtual time
+        self._last_valid_ns = self._start_ns
+        self._told: dict[Line, int] = {}
+        self._watchdog_ns = round(rig.mirror.watchdog_s * 1e9)
+        self._step_ns = rig.timing.fast_step_ns
+        self._devices = SimulatedDevices(rig, seed, virtual_time=not real_time, step_zero_ns=self._step_zero_ns)
+
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Serve until ``stop()``; it is asked at least twice a second."""
+        while not stop():
+            self._wait()
+            if self._real_time:
+                self._catch_up(whole_reports=True)
+            for line in self._lines.values():
+                for message, sequence in line.receive():
+                    self._deal_with(line, message, sequence)
+            if self._real_time:
+                self._watch()
+                self._post(self._devices.outbox)
+            for line in self._lines.values():
+                line.flush()
+
+    def _wait(self) -> None:
+        timeout = _IDLE_S
+        if self._real_time:
+            due_ns = self._devices.device_ns(self._devices.next_report_step()) - self._device_ns()
+            timeout = min(max(due_ns / 1e9, 0.0), _IDLE_S)
+        with selectors.DefaultSelector() as selector:
+            for line in self._lines.values():
+                events = selectors.EVENT_READ | (selectors.EVENT_WRITE if line.unsent else 0)
+                selector.register(line.stream.fileno(), events)
+            selector.select(timeout)
+
+    def _host_ns(self) -> int:
+        return time.monotonic_ns() if self._real_time else self._now_ns
+
+    def _device_ns(self) -> int:
+        return self._step_zero_ns + math.floor((self._host_ns() - self._start_ns) * self._clock_rate)
+
+    def _deal_with(self, line: LineEnd, message: Message | None, sequence: int) -> None:
+        if isinstance(message, pb.Identify):
+            line.begin_session()
+            self._told.pop(line.line, None)
+        if message is not None:
+            self._last_valid_ns = self._host_ns()
+            if isinstance(message, pb.ClockQuery):
+                self._answer_clock(line, message)
+            else:
+                if self._real_time:  # what is late is judged by the clock, not by the last report
+                    self._catch_up(whole_reports=False)
+                self._devices.handle(line.line, message, sequence)
+        if not self._real_time:
+            self._post(self._devices.outbox)
+            self._devices.advance_to(self._devices.ready_end)
+            self._post(self._devices.outbox)
+        line.taken += 1
+        if not self._real_time:
+            for each in self._lines.values():
+                self._tell_time(each, done=True)
+
+    def _answer_clock(self, line: LineEnd, query: pb.ClockQuery) -> None:
+        if not self._real_time:
+            self._now_ns = max(self._now_ns, query.host_send_ns) + self._draw_latency()
+        received = self._device_ns()
+        if not self._real_time:
+            self._now_ns += _TURNAROUND_NS
+        sent = self._device_ns()
+        if not self._real_time:
+            self._now_ns += self._draw_latency()
+            self._tell_time(line)
+        line.put(
+            pb.ClockReply(
+                query_id=query.query_id,
+                host_send_ns=query.host_send_ns,
+                device_receive_ns=received,
+                device_send_ns=sent,
+            )
+        )
+
+    def _draw_latency(self) -> int:
+        """One way: never under 80 % of the median, with a tail."""
+        return round(self._latency_ns * (0.8 + 0.29 * float(self._latency_rng.standard_exponential())))
+
+    def _post(self, outbox: list[Outgoing]) -> None:
+        for out in outbox:
+            line = self._lines[out.line]
+            if not self._real_time:
+                left = self._now_ns
+                if out.after_step is not None:
+                    elapsed = (out.after_step + 1) * self._step_ns
+                    left = max(left, self._start_ns + math.ceil(elapsed / self._clock_rate))
+                self._now_ns = max(self._now_ns, left + self._latency_ns)
+                self._tell_time(line)
+            elif len(line.unsent) > _UNREAD_LIMIT and isinstance(out.message, pb.FrameChunk | pb.TruthChunk):
+                continue
+            line.put(out.message)
+        outbox.clear()
+
+    def _tell_time(self, line: LineEnd, *, done: bool = False) -> None:
+        """Hand the clock down if it moved, or if a packet has been dealt with."""
+        if done or self._told.get(line.line) != self._now_ns:
+            self._told[line.line] = self._now_ns
+            taken = {name: end.taken for name, end in self._lines.items()}
+            line.put(
+                pb.VirtualTime(host_ns=self._now_ns, camera_packets=taken["camera"], mirror_packets=taken["mirror"])
+            )
+
+    def _catch_up(self, *, whole_reports: bool) -> None:
+        """Real time: let the plant run to now; with ``whole_reports``, only to the end of a report."""
+        now_step = (self._device_ns() - self._step_zero_ns) // self._step_ns
+        while (step := self._devices.next_report_step()) <= now_step:
+            self._devices.advance_to(step)
+        if not whole_reports:
+            self._devices.advance_to(now_step)
+
+    def _watch(self) -> None:
+        silent_ns = time.monotonic_ns() - self._last_valid_ns
+        if silent_ns > self._watchdog_ns:
+            self._devices.park(f"no valid packet for {self._watchdog_ns / 1e9:g} s")
+
+
+def open_streams(listen: str | None) -> dict[Line, Stream]:
+    """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any)."""
+    if listen is None:
+        return {"camera": PtyStream(), "mirror": PtyStream()}
+    host, _, port = listen.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65_534:
+        raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")
+    number = int(port)
+    return {"camera": TcpStream(host, number), "mirror": TcpStream(host, number + 1 if number else 0)}
+
+
+def _pieces(data: bytes) -> list[bytes]:
+    """Cut after every delimiter."""
+    *whole, rest = data.split(DELIMITER)
+    return [piece + DELIMITER for piece in whole] + ([rest] if rest else [])
+
+
+def _parse(packet: Packet) -> Message | None:
+    kind = MESSAGE_OF_TYPE.get(packet.type)
+    if kind is None or packet.version != PROTOCOL_VERSION:
+        return None
+    try:
+        return kind.FromString(packet.payload)
+    except DecodeError:
+        return None

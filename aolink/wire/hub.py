@@ -1,0 +1,134 @@
+"""Both lines of a rig as one stream of messages in order of the host's time.
+
+In real time the hub waits on the ports. On virtual time it waits until the rig has dealt with
+everything that was sent and has said so on every line; what came by then does not depend on the
+speed of either side, so neither does anything that follows from it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+from google.protobuf.message import Message
+
+from aolink.errors import DeviceError
+from aolink.wire.link import Link, Received
+from aolink.wire.port import Transport, wait_readable
+
+ANSWER_S = 1.0
+"""How long an answer may take before a request is sent again."""
+TRIES = 3
+_VIRTUAL_SILENCE_S = 20.0
+"""A rig on virtual time that says nothing for so long is gone."""
+_SLICE_S = 0.1
+"""Longest sleep: a request to stop is seen that soon."""
+
+AnyMessage = TypeVar("AnyMessage", bound=Message)
+
+
+class Hub:
+    """The host's clock and the links of one session."""
+
+    def __init__(self) -> None:
+        self.links: list[Link] = []
+        self.virtual = False
+        self._epoch_ns = time.time_ns() - time.monotonic_ns()
+        self._virtual_ns = 0
+        self._pending: list[tuple[Link, Received]] = []
+
+    def now_ns(self) -> int:
+        """Host time, ns since 1970: steady within a session, handed down by the rig on virtual time."""
+        return self._virtual_ns if self.virtual else self._epoch_ns + time.monotonic_ns()
+
+    def connect(self, name: str, transport: Transport) -> Link:
+        """Add a line."""
+        link = Link(name, transport, self.now_ns)
+        self.links.append(link)
+        return link
+
+    def go_virtual(self) -> None:
+        """From now on time is what the rig says."""
+        self.virtual = True
+        self._virtual_ns = max(link.handed.host_ns for link in self.links if link.handed)
+
+    def elapse_until(self, host_ns: int) -> None:
+        """Virtual time: let a time-out pass in which nothing can come."""
+        if self.virtual:
+            self._virtual_ns = max(self._virtual_ns, host_ns)
+
+    def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
+        """The messages that came, in order of time; in real time, wait for them for up to ``timeout_s``."""
+        if self._pending:
+            pending, self._pending = self._pending, []
+            return pending
+        if self.virtual:
+            return self._wait_until_dealt_with()
+        wait_readable([link.transport for link in self.links], min(timeout_s, _SLICE_S))
+        return self._receive()
+
+    def request(
+        self, link: Link, request: Message, answers: type[AnyMessage], is_it: Callable[[AnyMessage, int], bool]
+    ) -> AnyMessage | None:
+        """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
+
+        ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number.
+        """
+        for _ in range(TRIES):
+            sequence = link.send(request)
+            deadline = time.monotonic() + ANSWER_S
+            while True:
+                kept = self._pending
+                self._pending = []
+                answer = None
+                for source, received in self.wait(deadline - time.monotonic()):
+                    message = received.message
+                    if answer is None and source is link and isinstance(message, answers) and is_it(message, sequence):
+                        answer = message
+                    else:
+                        kept.append((source, received))
+                self._pending = kept
+                if answer is not None:
+                    return answer
+                if self.virtual or time.monotonic() >= deadline:
+                    break
+        return None
+
+    def close(self) -> None:
+        for link in self.links:
+            link.transport.close()
+
+    def _receive(self) -> list[tuple[Link, Received]]:
+        received = [(link, r) for link in self.links for r in link.receive()]
+        received.sort(key=lambda pair: pair[1].receive_ns)  # stable: order of the lines, then of arrival
+        return received
+
+    def _wait_until_dealt_with(self) -> list[tuple[Link, Received]]:
+        received: list[tuple[Link, Received]] = []
+        heard, last_heard = -1, time.monotonic()
+        while True:
+            received.extend((link, r) for link in self.links for r in link.receive())
+            waiting = [link.transport for link in self.links if not self._is_up_to_date(link)]
+            if not waiting:
+                break
+            total = sum(link.counts.bytes_received for link in self.links)
+            if total != heard:
+                heard, last_heard = total, time.monotonic()
+            elif time.monotonic() - last_heard > _VIRTUAL_SILENCE_S:
+                raise DeviceError(
+                    f"the rig on virtual time has said nothing for {_VIRTUAL_SILENCE_S:g} s: is it stopped?"
+                )
+            wait_readable(waiting, _SLICE_S)
+        order = {link: i for i, link in enumerate(self.links)}
+        received.sort(key=lambda pair: (pair[1].receive_ns, order[pair[0]]))
+        handed = [link.handed.host_ns for link in self.links if link.handed]
+        self._virtual_ns = max(self._virtual_ns, *handed)
+        return received
+
+    def _is_up_to_date(self, link: Link) -> bool:
+        handed = link.handed
+        if handed is None:
+            return False
+        taken = {"camera": handed.camera_packets, "mirror": handed.mirror_packets}
+        return all(taken[each.name] >= each.sent_packets for each in self.links)

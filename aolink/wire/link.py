@@ -1,0 +1,129 @@
+"""A link: messages over one port, in and out, with their statistics."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from google.protobuf.message import DecodeError, Message
+
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import MESSAGE_OF_TYPE, PROTOCOL_VERSION, PacketDecoder, encode_message
+from aolink.wire.port import Transport
+
+_REMEMBERED = 64
+"""Sequence numbers that are known for duplicates."""
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A message and when it came."""
+
+    message: Message
+    receive_ns: int
+    """Host clock."""
+
+
+@dataclass(slots=True)
+class LinkCounts:
+    """What went over a link since the counts were reset."""
+
+    packets_received: int = 0
+    bytes_received: int = 0
+    packets_sent: int = 0
+    bytes_sent: int = 0
+    bad_crc: int = 0
+    bad_framing: int = 0
+    bad_payload: int = 0
+    sequence_gaps: int = 0
+    duplicates: int = 0
+
+
+class Link:
+    """Messages over one port.
+
+    On virtual time the device hands the host's clock down with `VirtualTime` packets: what comes
+    behind one of them came at that time.
+    """
+
+    def __init__(self, name: str, transport: Transport, now_ns: Callable[[], int]) -> None:
+        self.name = name
+        self.transport = transport
+        self.counts = LinkCounts()
+        self.foreign_version: int | None = None
+        """Protocol version of the last packet of another version, if one came."""
+        self.handed: pb.VirtualTime | None = None
+        """The last `VirtualTime` that came."""
+        self.sent_packets = 0
+        """Since the last Identify, which is packet 1."""
+        self._now_ns = now_ns
+        self._decoder = PacketDecoder()
+        self._next_sequence = 0
+        self._last_sequence: int | None = None
+        self._recent: deque[int] = deque(maxlen=_REMEMBERED)
+
+    def reset_counts(self) -> None:
+        """Begin the statistics anew."""
+        self.counts = LinkCounts()
+        self._decoder.bad_crc = self._decoder.bad_framing = 0
+
+    def send(self, message: Message) -> int:
+        """Send a message; gives the sequence number of its packet. Raises PortError."""
+        if isinstance(message, pb.Identify):
+            self._next_sequence, self.sent_packets = 0, 0
+        sequence = self._next_sequence
+        data = encode_message(message, sequence)
+        self.transport.write(data)
+        self._next_sequence = (sequence + 1) & 0xFFFF
+        self.sent_packets += 1
+        self.counts.packets_sent += 1
+        self.counts.bytes_sent += len(data)
+        return sequence
+
+    def receive(self) -> list[Received]:
+        """The messages that have come, without waiting, in order. Raises PortError."""
+        data = self.transport.read_some()
+        if not data:
+            return []
+        now = self._now_ns()
+        received = []
+        self.counts.bytes_received += len(data)
+        for packet in self._decoder.feed(data):
+            if packet.version != PROTOCOL_VERSION:
+                self.foreign_version = packet.version
+                self.counts.bad_payload += 1
+                continue
+            if self._is_duplicate(packet.sequence):
+                self.counts.duplicates += 1
+                continue
+            kind = MESSAGE_OF_TYPE.get(packet.type)
+            try:
+                message = kind.FromString(packet.payload) if kind else None
+            except DecodeError:
+                message = None
+            if message is None:
+                self.counts.bad_payload += 1
+                continue
+            self.counts.packets_received += 1
+            if isinstance(message, pb.VirtualTime):
+                self.handed = message
+                continue
+            if isinstance(message, pb.Identity):
+                self._recent.clear()
+            received.append(Received(message, self.handed.host_ns if self.handed else now))
+        self.counts.bad_crc = self._decoder.bad_crc
+        self.counts.bad_framing = self._decoder.bad_framing
+        return received
+
+    def _is_duplicate(self, sequence: int) -> bool:
+        """Whether a packet came before; counts those that should have come between."""
+        if sequence in self._recent:
+            return True
+        self._recent.append(sequence)
+        if self._last_sequence is not None:
+            gap = (sequence - self._last_sequence - 1) & 0xFFFF
+            if gap < 0x8000:
+                self.counts.sequence_gaps += gap
+        self._last_sequence = sequence
+        return False

@@ -1,0 +1,149 @@
+"""Packets of protocol version 1: bytes <-> (version, type, sequence, payload).
+
+A packet is COBS([version u8 | type u8 | sequence u16 | payload | CRC-32 u32]) 0x00, little-endian, the
+CRC zlib's over everything before it. CRC-32 finds every burst of up to 32 bits and all but 2^-32 of
+other damage.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import struct
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cache
+from importlib import resources
+
+from cobs import cobs
+from google.protobuf.message import Message
+
+from aolink.wire import messages_pb2 as pb
+
+PROTOCOL_VERSION = 1
+MAX_PAYLOAD = 4608
+"""Bytes; 4 KiB of data and the fields around it."""
+MAX_CHUNK = 4096
+"""Bytes of data in one chunk of a frame."""
+_HEADER = struct.Struct("<BBH")
+_CRC = struct.Struct("<I")
+_MIN_DECODED = _HEADER.size + _CRC.size
+_MAX_DECODED = _MIN_DECODED + MAX_PAYLOAD
+_MAX_ENCODED = _MAX_DECODED + _MAX_DECODED // 254 + 1
+DELIMITER = b"\0"
+
+
+class PacketType(IntEnum):
+    """The type byte; the numbers of messages.proto."""
+
+    IDENTIFY = 1
+    IDENTITY = 2
+    COMMAND_BLOCK = 3
+    COMMAND_ACK = 4
+    APPLIED = 5
+    CAMERA_CONTROL = 6
+    PARK = 7
+    ACK = 8
+    FRAME_CHUNK = 9
+    CLOCK_QUERY = 10
+    CLOCK_REPLY = 11
+    EVENT = 12
+    TRUTH_CHUNK = 120
+    VIRTUAL_TIME = 121
+
+
+MESSAGE_OF_TYPE: dict[int, type[Message]] = {
+    PacketType.IDENTIFY: pb.Identify,
+    PacketType.IDENTITY: pb.Identity,
+    PacketType.COMMAND_BLOCK: pb.CommandBlock,
+    PacketType.COMMAND_ACK: pb.CommandAck,
+    PacketType.APPLIED: pb.Applied,
+    PacketType.CAMERA_CONTROL: pb.CameraControl,
+    PacketType.PARK: pb.Park,
+    PacketType.ACK: pb.Ack,
+    PacketType.FRAME_CHUNK: pb.FrameChunk,
+    PacketType.CLOCK_QUERY: pb.ClockQuery,
+    PacketType.CLOCK_REPLY: pb.ClockReply,
+    PacketType.EVENT: pb.Event,
+    PacketType.TRUTH_CHUNK: pb.TruthChunk,
+    PacketType.VIRTUAL_TIME: pb.VirtualTime,
+}
+TYPE_OF_MESSAGE: dict[type[Message], int] = {message: type_ for type_, message in MESSAGE_OF_TYPE.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Packet:
+    """A packet whose checksum was right."""
+
+    version: int
+    type: int
+    sequence: int
+    payload: bytes
+
+
+def encode_packet(packet: Packet) -> bytes:
+    """The bytes of a packet, delimiter included. Raises ValueError if the payload is too long."""
+    if len(packet.payload) > MAX_PAYLOAD:
+        raise ValueError(f"a payload of {len(packet.payload)} bytes does not fit into a packet, at most {MAX_PAYLOAD}")
+    body = _HEADER.pack(packet.version, packet.type, packet.sequence) + packet.payload
+    encoded: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
+    return encoded + DELIMITER
+
+
+def encode_message(message: Message, sequence: int) -> bytes:
+    """The bytes of a packet of this protocol version that carries ``message``."""
+    payload = message.SerializeToString()
+    return encode_packet(Packet(PROTOCOL_VERSION, TYPE_OF_MESSAGE[type(message)], sequence, payload))
+
+
+class PacketDecoder:
+    """Cuts a stream of bytes into packets; after damage it goes on at the next delimiter.
+
+    It never holds more than one packet's worth of bytes, whatever comes.
+    """
+
+    def __init__(self) -> None:
+        self.seen = 0
+        """Pieces between delimiters so far, whole or damaged; empty ones are not counted."""
+        self.bad_crc = 0
+        self.bad_framing = 0
+        self._rest = b""
+        self._overlong = False
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """Take bytes as they came, give the packets that they complete, in order."""
+        *pieces, rest = (self._rest + data).split(DELIMITER)
+        packets = []
+        for piece in pieces:
+            if piece or self._overlong:
+                packet = self._decode(piece)
+                if packet is not None:
+                    packets.append(packet)
+        if len(rest) > _MAX_ENCODED:
+            self._overlong, rest = True, b""
+        self._rest = rest
+        return packets
+
+    def _decode(self, piece: bytes) -> Packet | None:
+        self.seen += 1
+        overlong, self._overlong = self._overlong or len(piece) > _MAX_ENCODED, False
+        try:
+            decoded = b"" if overlong else cobs.decode(piece)
+        except cobs.DecodeError:
+            decoded = b""
+        if not _MIN_DECODED <= len(decoded) <= _MAX_DECODED:
+            self.bad_framing += 1
+            return None
+        if zlib.crc32(decoded[: -_CRC.size]) != _CRC.unpack(decoded[-_CRC.size :])[0]:
+            self.bad_crc += 1
+            return None
+        version, type_, sequence = _HEADER.unpack_from(decoded)
+        return Packet(version, type_, sequence, decoded[_HEADER.size : -_CRC.size])
+
+
+@cache
+def schema_hash() -> bytes:
+    """First 8 bytes of the SHA-256 of messages.proto without comments and white space."""
+    text = (resources.files("aolink.wire") / "messages.proto").read_text()
+    return hashlib.sha256(re.sub(r"//[^\n]*|\s+", "", text).encode()).digest()[:8]

@@ -1,0 +1,107 @@
+"""Ports: whatever pyserial opens, behind four methods. The one place that knows pyserial."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import select
+from collections.abc import Sequence
+from typing import Protocol
+
+import serial
+
+from aolink.errors import PortError
+
+BAUD_RATE = 921_600
+"""For ports that have one; USB and pseudo terminals ignore it."""
+_WRITE_TIMEOUT_S = 5.0
+_SOCKET_READ = 65_536
+
+
+class Transport(Protocol):
+    """A byte stream to a device."""
+
+    def read_some(self) -> bytes:
+        """What has come, without waiting; empty if nothing. Raises PortError when the port is lost."""
+
+    def write(self, data: bytes) -> None:
+        """Hand over all of ``data``. Raises PortError when the port is lost or takes nothing for 5 s."""
+
+    def fileno(self) -> int:
+        """For `wait_readable`."""
+
+    def close(self) -> None:
+        """Give the port back. Closing twice does nothing."""
+
+
+class SerialPort:
+    """A `Transport` over pyserial."""
+
+    def __init__(self, url: str, baud_rate: int = BAUD_RATE) -> None:
+        self.url = url
+        try:
+            self._serial = serial.serial_for_url(
+                url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
+            )
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise _open_error(url, error) from None
+        # in_waiting of a socket is only ever 0 or 1: read those with a size.
+        self._is_device = type(self._serial) is serial.Serial
+        if self._is_device:
+            # Only some drivers know it; USB adapters otherwise hold bytes back for 16 ms.
+            with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
+                self._serial.set_low_latency_mode(True)
+
+    def read_some(self) -> bytes:
+        try:
+            size = max(1, self._serial.in_waiting) if self._is_device else _SOCKET_READ
+            data: bytes = self._serial.read(size)
+        except (OSError, TypeError) as error:  # TypeError: pyserial's port closed under it
+            raise PortError(f"lost {self.url}: {_plain(error)}; is the device still there?") from None
+        return data
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._serial.write(data)
+        except serial.SerialTimeoutException:
+            raise PortError(f"{self.url} took no data for {_WRITE_TIMEOUT_S:g} s; is the device running?") from None
+        except (OSError, TypeError) as error:
+            raise PortError(f"lost {self.url}: {_plain(error)}; is the device still there?") from None
+
+    def fileno(self) -> int:
+        return self._serial.fileno()
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._serial.close()
+
+
+def wait_readable(transports: Sequence[Transport], timeout_s: float) -> None:
+    """Wait until one of the transports has something, or for ``timeout_s``."""
+    select.select([t.fileno() for t in transports], [], [], max(0.0, timeout_s))
+
+
+def _open_error(url: str, error: Exception) -> PortError:
+    number = getattr(error, "errno", None)
+    if number is None and isinstance(error.__context__, OSError):
+        number = error.__context__.errno
+    if "exclusively lock" in str(error) or number in (errno.EBUSY, errno.EWOULDBLOCK):
+        return PortError(f"port {url} is in use by another program: close that one, or give another port")
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV) or isinstance(error, ValueError):
+        return PortError(
+            f"there is no port {url}: `aolink devices` lists those of this machine;"
+            " a port is a device path or an address such as socket://host:port"
+        )
+    if number in (errno.EACCES, errno.EPERM):
+        return PortError(f"no permission to open {url}: on Debian, add yourself to the group dialout and log in again")
+    if number == errno.ECONNREFUSED or "refused" in str(error):
+        return PortError(f"nothing listens at {url}: start the device or its server first")
+    return PortError(f"cannot open {url}: {_plain(error)}")
+
+
+def _plain(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno).lower()
+    text = str(error)
+    return "the other end is gone" if "returned no data" in text or isinstance(error, TypeError) else text
