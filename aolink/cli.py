@@ -106,9 +106,9 @@ def _progress(total: int | None) -> Iterator[Callable[[str, int], None]]:
 def rig(
     rig: RigArgument,
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, say what was found, and end.")] = False,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not as the host commands.")] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not with the commands.")] = False,
     seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
-    listen: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="TCP ports instead of pseudo terminals.")] = None,
+    listen: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, not terminals.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
@@ -190,10 +190,13 @@ def devices(
 
 
 @app.command(
-    epilog="Example: aolink record --camera /dev/pts/3 --mirror /dev/pts/4 --rig section-vi -e o3 --exposures 100 -o a.mcap"
+    epilog="Example: aolink record --camera /dev/pts/3 --mirror /dev/pts/4 --rig section-vi"
+    " --estimator o3 --exposures 100 -o session.mcap"
 )
 def record(
-    camera: Annotated[str, typer.Option(metavar="PORT", help="Port of the camera: a device path or socket://host:port.")],
+    camera: Annotated[
+        str, typer.Option(metavar="PORT", help="Port of the camera: a device path or socket://host:port.")
+    ],
     mirror: Annotated[str, typer.Option(metavar="PORT", help="Port of the mirror driver.")],
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What the devices are: a rig file or the name of one.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
@@ -255,7 +258,9 @@ def info(file: FileArgument, as_json: JsonOption = False) -> None:
 def estimate(
     file: FileArgument,
     estimator: EstimatorOption = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE", help="A copy with the new estimates.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="A copy with the new estimates.")
+    ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -292,9 +297,15 @@ def estimate(
 @app.command(epilog="Example: aolink view session.mcap --screenshot session.png")
 def view(
     file: FileArgument,
-    save: Annotated[Path | None, typer.Option(metavar="X.rrd", help="Write a Rerun file instead of opening the viewer.")] = None,
-    screenshot: Annotated[Path | None, typer.Option(metavar="X.png", help="Write a picture of the viewer; needs no screen.")] = None,
-    web: Annotated[bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")] = False,
+    save: Annotated[
+        Path | None, typer.Option(metavar="X.rrd", help="Write a Rerun file instead of opening the viewer.")
+    ] = None,
+    screenshot: Annotated[
+        Path | None, typer.Option(metavar="X.png", help="Write a picture of the viewer; needs no screen.")
+    ] = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")
+    ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Look at a recording in Rerun."""
@@ -305,7 +316,9 @@ def view(
 
     for target in (save, screenshot):
         if target is not None and target.exists() and not overwrite:
-            raise AolinkError(f"{target} exists and is not overwritten: give another name, or --overwrite to replace it")
+            raise AolinkError(
+                f"{target} exists and is not overwritten: give another name, or --overwrite to replace it"
+            )
     recording = Recording(file)
     with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
         rrd = save or Path(folder) / f"{file.stem}.rrd"

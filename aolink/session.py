@@ -197,14 +197,14 @@ class _Session:
         self._first_step = self._queued_until = self._choose_first_step()
         end = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
         end_step = end if exposures else None
-        self._send_commands(end_step, self._first_step)  # queued before the first step is due
         self._camera.start(self._first_step, exposures)
+        self._send_commands(end_step, self._first_step)  # queued before the first step is due
+        self._receive(0.0)
         self._last_frame_ns = hub.now_ns()
         self._log(Log.INFO, f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
         self.report.ended = "interrupted"
         while not stop():
-            for link, received in hub.wait(self._send_due(end_step)):
-                self._take(link, self._device(link).handle(received), received.receive_ns)
+            self._receive(self._send_due(end_step))
             progress(self.report.exposures)
             if end_step is not None and self._is_over(exposures, end_step):
                 self.report.ended = "complete"
@@ -219,6 +219,15 @@ class _Session:
         finally:
             self._camera.stop()
 
+    def _receive(self, timeout_s: float) -> int:
+        """Deal with what comes within ``timeout_s``; gives the number of clock queries that were answered."""
+        answers = 0
+        for link, received in self._hub.wait(timeout_s):
+            events = self._device(link).handle(received)
+            answers += sum(isinstance(event, ClockSampled) for event in events)
+            self._take(link, events, received.receive_ns)
+        return answers
+
     def _device(self, link: Link) -> Camera | Mirror:
         return self._camera if link is self._camera.link else self._mirror
 
@@ -229,10 +238,7 @@ class _Session:
                 device.query_clock(asked_ns)
             answers = 0
             while answers < 2 and self._hub.now_ns() < asked_ns + 200_000_000:
-                for link, received in self._hub.wait(0.05):
-                    events = self._device(link).handle(received)
-                    answers += sum(isinstance(event, ClockSampled) for event in events)
-                    self._take(link, events, received.receive_ns)
+                answers += self._receive(0.05)
                 if self._hub.virtual:
                     break
         for device in (self._camera, self._mirror):
@@ -312,8 +318,7 @@ class _Session:
     def _finish(self, exposures: int) -> None:
         """What is still on its way when the last command has been applied."""
         now = self._hub.now_ns()
-        for link, received in self._hub.wait(0.0):
-            self._take(link, self._device(link).handle(received), received.receive_ns)
+        self._receive(0.0)
         self._take(self._camera.link, list(self._camera.flush()), now)
         self._estimate(self._assembler.flush(), now)
         for latency in self._latencies.values():
@@ -373,13 +378,14 @@ class _Session:
                 latency.estimated_ns = self._hub.now_ns()
 
     def _count_applied(self, applied: wire.Applied) -> None:
-        report = self.report
+        report, end = self.report, min(applied.first_step + applied.n_steps, self._queued_until)
+        n_steps = max(0, end - max(applied.first_step, self._first_step))  # of this session
         if applied.source == wire.Applied.PARKED:
-            report.steps_parked += applied.n_steps
+            report.steps_parked += n_steps
         else:
-            report.steps_applied += applied.n_steps
+            report.steps_applied += n_steps
         if applied.source == wire.Applied.CLIPPED:
-            report.steps_clipped += applied.n_steps
+            report.steps_clipped += n_steps
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:
         self.report.steps_late += answer.ack.late_steps

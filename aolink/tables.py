@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich import box
 from rich.markup import escape
 from rich.table import Table
 
 from aolink.estimation import Estimate
-from aolink.estimation.score import Score, score
+from aolink.estimation.score import Consistency, Score, score
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -62,3 +64,116 @@ def facts(values: Mapping[str, Any]) -> Table:
     if not values.get("complete", True):
         table.add_row("note", "the file does not end as a recording should: it was cut off, this is what is whole")
     return table
+
+
+def scores(by_name: Mapping[str, Score]) -> Table:
+    """RMSE against truth, NIS and NEES with their 95 % bounds; what is outside its bounds is marked."""
+    counted = next((each.exposures for each in by_name.values()), 0)
+    title = f"Estimates of {counted} exposures against the truth" if counted else "No truth in this recording: NIS only"
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, caption_justify="left", pad_edge=False)
+    table.add_column("estimator")
+    columns: dict[str, Callable[[Score], str]] = {"NIS": lambda each: _consistency(each.nis)}
+    if counted:
+        columns = {
+            "RMSE start": lambda each: f"{each.start_rmse:.4f}",
+            "RMSE end": lambda each: f"{each.end_rmse:.4f}",
+            "RMSE path": lambda each: f"{each.path_rmse:.4f}",
+            **columns,
+            "NEES start": lambda each: _consistency(each.start_nees),
+            "NEES end": lambda each: _consistency(each.end_nees),
+        }
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, each in by_name.items():
+        table.add_row(name, *(column(each) for column in columns.values()))
+    table.caption = (
+        "RMSE of states: norm over the states. ! outside the 95 % bounds of a consistent filter:\n" + _bounds(by_name)
+    )
+    return table
+
+
+def _consistency(value: Consistency) -> str:
+    return "-  " if math.isnan(value.mean) else f"{value.mean:.2f}{'  ' if value.inside else ' !'}"
+
+
+def _bounds(by_name: Mapping[str, Score]) -> str:
+    """NEES and NIS bounds; those of NIS depend on how many moments an estimator takes."""
+    nis: dict[str, list[str]] = {}
+    for name, each in by_name.items():
+        if not math.isnan(each.nis.mean):
+            nis.setdefault(f"{each.nis.low:.2f} to {each.nis.high:.2f}", []).append(name)
+    parts = [f"NIS {bounds} for {', '.join(names)}" for bounds, names in nis.items()]
+    nees = next((each.end_nees for each in by_name.values() if not math.isnan(each.end_nees.mean)), None)
+    if nees:
+        parts.insert(0, f"NEES {nees.low:.2f} to {nees.high:.2f}")
+    return "; ".join(parts)
+
+
+def scores_as_json(by_name: Mapping[str, Score]) -> dict[str, Any]:
+    """The same for scripts; what is not known is null."""
+    return {name: _without_nan(asdict(each)) for name, each in by_name.items()}
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_nan(each) for key, each in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+def session(report: Report) -> Table:
+    """Frames, commands, link, clock and latencies of a session."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_row(
+        "frames",
+        f"{report.frames_received} received, of them {report.frames_incomplete} with chunks missing;"
+        f" {report.frames_lost} lost whole",
+    )
+    table.add_row(
+        "link",
+        f"packets thrown away: {report.packets_bad_crc} for their checksum, {report.packets_bad_framing} for their"
+        f" framing; {report.packets_missing} missing by their numbers",
+    )
+    table.add_row(
+        "commands",
+        f"{report.steps_commanded} steps commanded, {report.steps_applied} applied, {report.steps_late} late,"
+        f" {report.steps_superseded} superseded, {report.steps_clipped} clipped, {report.steps_parked} parked;"
+        f" {report.blocks_retransmitted} blocks sent again",
+    )
+    table.add_row(
+        "clock",
+        f"device minus host {report.clock_offset_ns / 1e9:.6f} s, {report.clock_frequency_ppm:+.2f} ppm,"
+        f" standard deviation {report.clock_sigma_ns / 1e3:.0f} us",
+    )
+    if report.virtual_time:
+        table.add_row("latency", "n/a on virtual time")
+    for name, since, until in () if report.virtual_time else _LATENCY_STEPS:
+        table.add_row("latency", f"{name}: {_percentiles(report.latencies, since, until)}")
+    return table
+
+
+def _percentiles(latencies: Sequence[pb.Latency], since: str, until: str) -> str:
+    values = [
+        (getattr(each, until) - getattr(each, since)) / 1e6
+        for each in latencies
+        if getattr(each, until) and getattr(each, since)
+    ]
+    if not values:
+        return "no sample"
+    middle, high = np.percentile(values, [50, 99])
+    return f"p50 {middle:.2f} ms, p99 {high:.2f} ms ({len(values)} frames)"
+
+
+def demo_summary(result: DemoResult) -> list[str]:
+    """What came of the demo, and what to run next."""
+    if result.differences:
+        lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
+    else:
+        lines = ["online and offline estimates agree bit for bit"]
+    lines.append("times     " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in result.seconds.items()))
+    lines.append(f"recording {result.recording}")
+    lines.append(f"rerun     {result.rrd}")
+    lines.append(f"picture   {result.picture}" if result.picture else f"picture   none: {result.no_picture}")
+    lines.append(f"next      aolink view {result.recording}")
+    lines.append(f"          aolink info {result.recording}")
+    lines.append(f"          aolink estimate {result.recording} --estimator o3")
+    return lines

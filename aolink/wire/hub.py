@@ -8,7 +8,8 @@ speed of either side, so neither does anything that follows from it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TypeVar
 
 from google.protobuf.message import Message
@@ -52,6 +53,8 @@ class Hub:
         """From now on time is what the rig says."""
         self.virtual = True
         self._virtual_ns = max(link.handed.host_ns for link in self.links if link.handed)
+        for link in self.links:
+            link.before_send = partial(self._settle_others, link)
 
     def elapse_until(self, host_ns: int) -> None:
         """Virtual time: let a time-out pass in which nothing can come."""
@@ -60,13 +63,17 @@ class Hub:
 
     def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
         """The messages that came, in order of time; in real time, wait for them for up to ``timeout_s``."""
-        if self._pending:
-            pending, self._pending = self._pending, []
-            return pending
+        pending, self._pending = self._pending, []
         if self.virtual:
-            return self._wait_until_dealt_with()
-        wait_readable([link.transport for link in self.links], min(timeout_s, _SLICE_S))
-        return self._receive()
+            pending += self._receive_until_dealt_with(self.links)
+            # Time moves here and nowhere else: what a send sees must not depend on what has come by then.
+            self._virtual_ns = max(self._virtual_ns, *(link.handed.host_ns for link in self.links if link.handed))
+        elif not pending:
+            wait_readable([link.transport for link in self.links], min(timeout_s, _SLICE_S))
+            pending = [(link, r) for link in self.links for r in link.receive()]
+        order = {link: i for i, link in enumerate(self.links)}
+        pending.sort(key=lambda pair: (pair[1].receive_ns, order[pair[0]]))
+        return pending
 
     def request(
         self, link: Link, request: Message, answers: type[AnyMessage], is_it: Callable[[AnyMessage, int], bool]
@@ -99,17 +106,21 @@ class Hub:
         for link in self.links:
             link.transport.close()
 
-    def _receive(self) -> list[tuple[Link, Received]]:
-        received = [(link, r) for link in self.links for r in link.receive()]
-        received.sort(key=lambda pair: pair[1].receive_ns)  # stable: order of the lines, then of arrival
-        return received
+    def _settle_others(self, link: Link) -> None:
+        """Virtual time: two lines are two queues, and which the rig looks at first is anybody's guess.
 
-    def _wait_until_dealt_with(self) -> list[tuple[Link, Received]]:
+        So nothing is sent on one while something sent on another has not been dealt with.
+        """
+        others = [each for each in self.links if each is not link]
+        self._pending += self._receive_until_dealt_with(others)
+
+    def _receive_until_dealt_with(self, senders: Sequence[Link]) -> list[tuple[Link, Received]]:
+        """Everything that came until the rig had dealt with all that was sent on ``senders``."""
         received: list[tuple[Link, Received]] = []
         heard, last_heard = -1, time.monotonic()
         while True:
             received.extend((link, r) for link in self.links for r in link.receive())
-            waiting = [link.transport for link in self.links if not self._is_up_to_date(link)]
+            waiting = [link.transport for link in self.links if not self._has_dealt_with(senders, link)]
             if not waiting:
                 break
             total = sum(link.counts.bytes_received for link in self.links)
@@ -120,15 +131,12 @@ class Hub:
                     f"the rig on virtual time has said nothing for {_VIRTUAL_SILENCE_S:g} s: is it stopped?"
                 )
             wait_readable(waiting, _SLICE_S)
-        order = {link: i for i, link in enumerate(self.links)}
-        received.sort(key=lambda pair: (pair[1].receive_ns, order[pair[0]]))
-        handed = [link.handed.host_ns for link in self.links if link.handed]
-        self._virtual_ns = max(self._virtual_ns, *handed)
         return received
 
-    def _is_up_to_date(self, link: Link) -> bool:
+    def _has_dealt_with(self, senders: Sequence[Link], link: Link) -> bool:
+        """Whether the rig has said so on ``link``: everything that follows from it has come as well."""
         handed = link.handed
         if handed is None:
             return False
         taken = {"camera": handed.camera_packets, "mirror": handed.mirror_packets}
-        return all(taken[each.name] >= each.sent_packets for each in self.links)
+        return all(taken[each.name] >= each.sent_packets for each in senders)

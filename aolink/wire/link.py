@@ -57,6 +57,8 @@ class Link:
         """The last `VirtualTime` that came."""
         self.sent_packets = 0
         """Since the last Identify, which is packet 1."""
+        self.before_send: Callable[[], None] = lambda: None
+        """Called before anything is sent; the hub keeps the lines in step with it on virtual time."""
         self._now_ns = now_ns
         self._decoder = PacketDecoder()
         self._next_sequence = 0
@@ -70,6 +72,7 @@ class Link:
 
     def send(self, message: Message) -> int:
         """Send a message; gives the sequence number of its packet. Raises PortError."""
+        self.before_send()
         if isinstance(message, pb.Identify):
             self._next_sequence, self.sent_packets = 0, 0
         sequence = self._next_sequence

@@ -1,0 +1,198 @@
+"""Chunks become frames, frames and reports become exposures; what is lost is masked, counted and bridged."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aolink.assembly import Assembler, Frame, FrameReassembly, TruthReassembly
+from aolink.rig import load_rig
+from aolink.wire import messages_pb2 as pb
+
+RIG = load_rig("section-vi")
+SHAPE = (3, 100)
+PICTURE = np.arange(300, dtype=np.uint16).reshape(SHAPE)
+
+
+def chunks(frame_id: int, size: int = 100) -> list[pb.FrameChunk]:
+    data = PICTURE.astype("<u2").tobytes()
+    first = 200 * frame_id
+    return [
+        pb.FrameChunk(
+            frame_id=frame_id,
+            offset=offset,
+            total=len(data),
+            width=SHAPE[1],
+            height=SHAPE[0],
+            first_step=first,
+            last_step=first + 199,
+            exposure_start_ns=first * 10**6,
+            exposure_end_ns=(first + 200) * 10**6,
+            data=data[offset : offset + size],
+        )
+        for offset in range(0, len(data), size)
+    ]
+
+
+def feed(reassembly: FrameReassembly, parts: list[pb.FrameChunk]) -> list[Frame]:
+    return [frame for i, part in enumerate(parts) for frame in reassembly.add(part, 1000 + i)]
+
+
+def test_a_whole_frame() -> None:
+    (frame,) = feed(FrameReassembly(SHAPE), chunks(5))
+    assert np.array_equal(frame.pixels, PICTURE)
+    assert frame.mask.all()
+    assert (frame.frame_id, frame.first_step, frame.last_step, frame.chunks_lost) == (5, 1000, 1199, 0)
+    assert (frame.host_first_byte_ns, frame.host_receive_ns) == (1000, 1005)
+    assert (frame.device_start_ns, frame.device_end_ns) == (10**9, 1_200_000_000)
+
+
+@given(st.sets(st.integers(0, 5), max_size=5), st.integers(60, 200))
+def test_lost_chunks_are_masked_and_counted(lost: set[int], size: int) -> None:
+    reassembly = FrameReassembly(SHAPE)
+    parts = chunks(1, size)
+    kept = [part for i, part in enumerate(parts) if i not in lost]
+    frames = feed(reassembly, kept) + reassembly.flush()
+    if not kept:
+        assert frames == []
+        return
+    (frame,) = frames
+    arrived = np.zeros(600, dtype=bool)
+    for part in kept:
+        arrived[part.offset : part.offset + len(part.data)] = True
+    # A pixel is good only if both of its bytes came.
+    assert np.array_equal(frame.mask.ravel(), arrived.reshape(-1, 2).all(axis=1))
+    assert np.array_equal(frame.pixels[frame.mask], PICTURE[frame.mask])
+    assert (frame.chunks_lost == 0) == frame.mask.all()
+    if len({len(part.data) for part in parts}) == 1:
+        assert frame.chunks_lost == len(parts) - len(kept)
+
+
+def test_a_lost_last_chunk_shows_with_the_next_frame() -> None:
+    reassembly = FrameReassembly(SHAPE)
+    assert feed(reassembly, chunks(1)[:-1]) == []
+    first, second = feed(reassembly, chunks(2))
+    assert (first.chunks_lost, second.chunks_lost) == (1, 0)
+
+
+def test_lost_frames_are_counted() -> None:
+    frames = feed(FrameReassembly(SHAPE), chunks(1) + chunks(2) + chunks(6))
+    assert [frame.frames_lost_before for frame in frames] == [0, 0, 3]
+
+
+def test_a_chunk_that_makes_no_sense_is_refused() -> None:
+    good = chunks(3)
+    for change in (
+        {"offset": 600},
+        {"offset": 590},
+        {"total": 602},
+        {"width": 2**31, "total": 2**32 - 1},
+        {"last_step": 0},
+        {"data": b""},
+    ):
+        reassembly, bad = FrameReassembly(SHAPE), pb.FrameChunk()
+        bad.CopyFrom(good[0])
+        for name, value in change.items():
+            setattr(bad, name, value)
+        assert reassembly.add(bad, 0) == []
+        assert reassembly.refused == 1, change
+    reassembly = FrameReassembly(SHAPE)
+    feed(reassembly, good)
+    assert feed(reassembly, good[:2]) == []  # the frame is over
+    assert reassembly.refused == 2
+
+
+def test_a_truth_with_a_missing_chunk_is_dropped_and_the_next_is_whole() -> None:
+    truth = pb.Truth(frame_id=1, axes=1, n_outputs=1, path=list(range(100)))
+    data = truth.SerializeToString()
+
+    def pieces(frame_id: int) -> list[pb.TruthChunk]:
+        return [
+            pb.TruthChunk(frame_id=frame_id, offset=o, total=len(data), data=data[o : o + 300])
+            for o in range(0, len(data), 300)
+        ]
+
+    reassembly = TruthReassembly()
+    results = [reassembly.add(piece) for piece in pieces(1)[:1] + pieces(1)[2:] + pieces(2)]
+    assert [result for result in results if result] == [truth]
+
+
+def frame_at(first_step: int, n_steps: int = 200, frame_id: int = 1) -> Frame:
+    return Frame(
+        frame_id=frame_id,
+        first_step=first_step,
+        last_step=first_step + n_steps - 1,
+        pixels=np.zeros((1, 40), dtype=np.uint16),
+        mask=np.ones((1, 40), dtype=bool),
+        chunks_lost=0,
+        frames_lost_before=0,
+        device_start_ns=0,
+        device_end_ns=0,
+        host_first_byte_ns=0,
+        host_receive_ns=0,
+    )
+
+
+def applied(first: int, end: int) -> pb.Applied:
+    return pb.Applied(first_step=first, n_steps=end - first, u=[1e-3 * k for k in range(first, end)])
+
+
+def commanded(first: int, end: int) -> pb.CommandBlock:
+    return pb.CommandBlock(first_step=first, n_steps=end - first, u=[2e-3 * k for k in range(first, end)])
+
+
+def test_a_frame_waits_for_the_reports_of_its_steps() -> None:
+    assembler = Assembler(RIG)
+    assert assembler.add_applied(applied(0, 150)) == []
+    assert assembler.add_frame(frame_at(0)) == []
+    (exposure,) = assembler.add_applied(applied(150, 230))
+    assert np.array_equal(exposure.inputs[:, 0], 1e-3 * np.arange(200))
+    assert exposure.lead_inputs.shape == (0, 1)
+    assert exposure.inputs_assumed == 0
+
+
+def test_a_lost_report_is_replaced_by_the_command_and_counted() -> None:
+    assembler = Assembler(RIG)
+    assembler.add_command(commanded(0, 200))
+    assembler.add_applied(applied(0, 100))
+    assembler.add_applied(applied(150, 200))
+    (exposure,) = assembler.add_frame(frame_at(0))
+    assert exposure.inputs_assumed == 50
+    assert np.array_equal(exposure.inputs[100:150, 0], 2e-3 * np.arange(100, 150))
+
+
+def test_a_step_that_nothing_is_known_of_holds_the_last_value() -> None:
+    assembler = Assembler(RIG)
+    assembler.add_applied(applied(0, 100))
+    assembler.add_frame(frame_at(0))
+    (exposure,) = assembler.flush()
+    assert exposure.inputs_assumed == 100
+    assert (exposure.inputs[100:, 0] == exposure.inputs[99, 0]).all()
+
+
+def test_a_lost_frame_lengthens_the_lead_of_the_next() -> None:
+    assembler = Assembler(RIG)
+    assembler.add_applied(applied(0, 700))
+    assembler.add_frame(frame_at(0))
+    (exposure,) = assembler.add_frame(frame_at(450, frame_id=3))
+    assert np.array_equal(exposure.lead_inputs[:, 0], 1e-3 * np.arange(200, 450))
+    assert np.array_equal(exposure.inputs[:, 0], 1e-3 * np.arange(450, 650))
+
+
+@given(st.data())
+def test_the_order_of_frames_and_reports_does_not_matter(data: st.DataObject) -> None:
+    """As long as each stream is in order, the exposures are the same."""
+    reports = [applied(100 * k, 100 * (k + 1)) for k in range(6)]
+    frames = [frame_at(200 * k, frame_id=k + 1) for k in range(3)]
+    assembler, exposures = Assembler(RIG), []
+    waiting = list(frames)
+    for report in reports:
+        while waiting and data.draw(st.booleans()):
+            exposures += assembler.add_frame(waiting.pop(0))
+        exposures += assembler.add_applied(report)
+    for frame in waiting:
+        exposures += assembler.add_frame(frame)
+    assert [e.frame_id for e in exposures] == [1, 2, 3]
+    for e in exposures:
+        assert np.array_equal(e.inputs[:, 0], 1e-3 * np.arange(e.first_step, e.first_step + 200))

@@ -1,0 +1,128 @@
+"""A link over a real pseudo terminal: sequence numbers, duplicates, damage, another version."""
+
+from __future__ import annotations
+
+import os
+import pty
+import tty
+from collections.abc import Iterator
+
+import pytest
+
+from aolink.errors import PortError
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.link import Link
+from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet
+from aolink.wire.port import SerialPort, wait_readable
+
+
+class Peer:
+    """The device's end of a pseudo terminal."""
+
+    def __init__(self) -> None:
+        self.master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
+
+    def say(self, data: bytes) -> None:
+        os.write(self.master, data)
+
+    def close(self) -> None:
+        for descriptor in (self.master, self._slave):
+            os.close(descriptor)
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    peer = Peer()
+    yield peer
+    peer.close()
+
+
+@pytest.fixture
+def link(peer: Peer) -> Iterator[Link]:
+    port = SerialPort(peer.path)
+    yield Link("camera", port, lambda: 42)
+    port.close()
+
+
+def receive(link: Link, packets: int) -> list[object]:
+    messages: list[object] = []
+    while link.counts.packets_received + link.counts.bad_payload + link.counts.duplicates < packets:
+        wait_readable([link.transport], 5.0)
+        messages += [received.message for received in link.receive()]
+    return messages
+
+
+def event(text: str, sequence: int) -> bytes:
+    return encode_message(pb.Event(text=text), sequence)
+
+
+def test_messages_come_in_order_with_the_time_of_their_arrival(peer: Peer, link: Link) -> None:
+    peer.say(event("a", 0) + event("b", 1))
+    wait_readable([link.transport], 5.0)
+    received = link.receive()
+    assert [r.message for r in received] == [pb.Event(text="a"), pb.Event(text="b")]
+    assert {r.receive_ns for r in received} == {42}
+
+
+def test_gaps_are_counted_across_the_wrap_and_duplicates_are_dropped(peer: Peer, link: Link) -> None:
+    peer.say(event("a", 65534) + event("b", 1) + event("b", 1) + event("a", 65534) + event("c", 2))
+    assert receive(link, 5) == [pb.Event(text="a"), pb.Event(text="b"), pb.Event(text="c")]
+    assert (link.counts.sequence_gaps, link.counts.duplicates) == (2, 2)
+
+
+def test_what_does_not_parse_is_counted_and_the_rest_goes_on(peer: Peer, link: Link) -> None:
+    peer.say(encode_packet(Packet(1, 12, 0, b"\xff\xff")) + encode_packet(Packet(1, 99, 1, b"")) + event("a", 2))
+    assert receive(link, 3) == [pb.Event(text="a")]
+    assert link.counts.bad_payload == 2
+
+
+def test_another_protocol_version_is_remembered(peer: Peer, link: Link) -> None:
+    peer.say(encode_packet(Packet(7, 12, 0, b"")))
+    assert receive(link, 1) == []
+    assert link.foreign_version == 7
+
+
+def test_what_comes_behind_a_virtual_time_came_at_that_time(peer: Peer, link: Link) -> None:
+    peer.say(encode_message(pb.VirtualTime(host_ns=1000), 0) + event("a", 1))
+    peer.say(encode_message(pb.VirtualTime(host_ns=2000), 2) + event("b", 3))
+    times = []
+    while len(times) < 2:
+        wait_readable([link.transport], 5.0)
+        times += [received.receive_ns for received in link.receive()]
+    assert times == [1000, 2000]
+
+
+def test_what_is_sent_arrives_and_is_numbered_from_identify(peer: Peer, link: Link) -> None:
+    link.send(pb.Park())
+    assert [link.send(pb.Identify(nonce=1)), link.send(pb.Park())] == [0, 1]
+    assert link.sent_packets == 2
+    decoder, packets = PacketDecoder(), list[Packet]()
+    while len(packets) < 3:
+        packets += decoder.feed(os.read(peer.master, 4096))
+    assert [(p.type, p.sequence) for p in packets] == [(7, 0), (1, 0), (7, 1)]
+
+
+def test_a_port_that_is_pulled_is_one_clear_error(peer: Peer, link: Link) -> None:
+    descriptor, peer.master = peer.master, os.open(os.devnull, os.O_RDONLY)
+    os.close(descriptor)
+    with pytest.raises(PortError, match=f"lost {peer.path}: .*is the device still there"):
+        link.receive()
+
+
+def test_no_such_port() -> None:
+    with pytest.raises(PortError, match=r"there is no port /dev/nowhere: `aolink devices` lists"):
+        SerialPort("/dev/nowhere")
+    with pytest.raises(PortError, match="there is no port nonsense://"):
+        SerialPort("nonsense://x")
+
+
+def test_nothing_listens() -> None:
+    with pytest.raises(PortError, match="nothing listens at socket://127.0.0.1:1:"):
+        SerialPort("socket://127.0.0.1:1")
+
+
+def test_port_in_use(peer: Peer, link: Link) -> None:
+    with pytest.raises(PortError, match=f"port {peer.path} is in use by another program"):
+        SerialPort(peer.path)
