@@ -1,0 +1,1 @@
+"""Optics: image kernels on pixels, and the camera's counts."""

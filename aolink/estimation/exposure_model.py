@@ -1,0 +1,179 @@
+"""One exposure: start state, end state and path as one joint Gaussian.
+
+With z = (x(k0), xi), xi ~ N(0, I) the coefficients of the process noise inside the exposure,
+
+    path = basis z + c(u),     x(k0 + N) = end_rows z + d(u) + remainder.
+
+Every estimator is an update of z; they differ in what they observe, and in whether they model xi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation import stacked
+from aolink.plant import input_response, lift, output_rows, psd_root
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+
+# Noise slower than this many half periods an exposure is modelled, per noise channel; fewer where fewer do.
+_MOST_NOISE_MODES = 24
+# Share of the noise path (rms) that may be left out.
+_NOISE_LEFT_OUT = 0.02
+_TIME_BLOCK = 256
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InputResponse:
+    """What the inputs of one exposure do, and what the moments need of it."""
+
+    path: FloatArray
+    """c, response of the outputs, (axes, n_outputs, n_steps)."""
+    end: FloatArray
+    """d, response of the end state, (axes, n_states)."""
+    mean: FloatArray
+    """Mean of c over the exposure, (axes, n_outputs)."""
+    slope: FloatArray
+    """b, mean of C A^i weighted with c_i, (axes, n_outputs, n_states)."""
+    square: FloatArray
+    """s, mean of c squared, (axes, n_outputs)."""
+
+
+class ExposureModel:
+    """The joint Gaussian of one exposure of a plant, precomputed; it holds no state."""
+
+    def __init__(self, plant: Plant, n_steps: int) -> None:
+        self.plant = plant
+        self.n_steps = n_steps
+        self.state_rows = output_rows(plant, n_steps)
+        """C A^i, (n_outputs, n_steps, n_states)."""
+        self.transition, self.process_noise = lift(plant, n_steps)
+        self.mean_row = self.state_rows.mean(axis=1)
+        """C-bar, (n_outputs, n_states)."""
+        self.quadratic = np.einsum("oij,oik->ojk", self.state_rows, self.state_rows) / n_steps
+        """M = mean_i (C A^i)'(C A^i) for each output, (n_outputs, n_states, n_states)."""
+
+    @property
+    def n_coefficients(self) -> int:
+        """States and noise coefficients together."""
+        return int(self.basis.shape[2])
+
+    @property
+    def basis(self) -> FloatArray:
+        """Paths of the coefficients, (n_outputs, n_steps, n_coefficients); the first n_states are C A^i."""
+        return self._with_noise[0]
+
+    @property
+    def end_rows(self) -> FloatArray:
+        """End states of the coefficients, (n_states, n_coefficients)."""
+        return self._with_noise[1]
+
+    @cached_property
+    def end_remainder(self) -> FloatArray:
+        """Covariance of what the noise coefficients leave out of the end state, (n_states, n_states)."""
+        reached = self.end_rows[:, self.plant.n_states :]
+        root = psd_root(self.process_noise - reached @ reached.T)
+        return root @ root.T
+
+    @cached_property
+    def _with_noise(self) -> tuple[FloatArray, FloatArray]:
+        """Start columns and noise columns of path and end state.
+
+        Each noise channel is a sum of cosines, of unit variance each and orthonormal over the fast steps.
+        """
+        plant, n_steps = self.plant, self.n_steps
+        root = plant.B_w @ psd_root(plant.process_noise)
+        impulse = self.state_rows @ root  # C A^i B_w, (n_outputs, n_steps, n_noises)
+        energy = (np.arange(n_steps - 1, -1, -1)[:, None] * impulse**2).sum()
+        paths, ends, found = [self.state_rows], [self.transition], 0.0
+        phase = np.pi * (np.arange(n_steps) + 0.5) / n_steps
+        driven = [replace(plant, B=column[:, None], axes=1) for column in root.T]
+        for m in range(min(_MOST_NOISE_MODES, n_steps)):
+            if energy - found <= _NOISE_LEFT_OUT**2 * energy:
+                break
+            cosine = np.cos(m * phase) * np.sqrt((2 if m else 1) / n_steps)
+            channels = [input_response(channel, cosine[None, :, None]) for channel in driven]
+            paths.append(np.stack([path[0] for path, _ in channels], axis=-1))
+            ends.append(np.stack([end[0] for _, end in channels], axis=-1))
+            found += float((paths[-1] ** 2).sum())
+        return np.concatenate(paths, axis=2), np.concatenate(ends, axis=1)
+
+    def response(self, inputs: FloatArray) -> InputResponse:
+        """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
+        path, end = input_response(self.plant, by_axis(self.plant, inputs))
+        rows = stacked.transpose(self.state_rows)
+        return InputResponse(
+            path=path,
+            end=end,
+            mean=stacked.mean_over_path(path),
+            slope=stacked.mean_over_path(path[:, :, None, :] * rows),
+            square=stacked.mean_over_path(path * path),
+        )
+
+    def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
+        """basis @ coefficients + c; coefficients (axes, any first ones), c and result (axes, n_outputs, n_steps)."""
+        path = input_path.copy()
+        for j in range(coefficients.shape[1]):
+            path += self._columns[j] * coefficients[:, j, None, None]
+        return path
+
+    def path_sd(self, covariance: FloatArray) -> FloatArray:
+        """Standard deviation of the path, (axes, n_outputs, n_steps), from (axes, n_coefficients, n_coefficients)."""
+        count = covariance.shape[1]
+        covariance = np.ascontiguousarray(covariance)[:, None]
+        variance = np.empty((len(covariance), self.plant.n_outputs, self.n_steps))
+        basis = self.state_rows if count <= self.plant.n_states else self.basis
+        for start in range(0, self.n_steps, _TIME_BLOCK):
+            rows = np.ascontiguousarray(basis[:, start : start + _TIME_BLOCK, :count])
+            variance[..., start : start + _TIME_BLOCK] = stacked.dot(stacked.matmul(rows, covariance), rows)
+        return np.sqrt(np.maximum(variance, 0.0))
+
+    @cached_property
+    def _columns(self) -> FloatArray:
+        """The basis column by column, (n_coefficients, n_outputs, n_steps)."""
+        return np.ascontiguousarray(self.basis.transpose(2, 0, 1))
+
+
+@lru_cache(maxsize=16)
+def exposure_model(plant: Plant, n_steps: int) -> ExposureModel:
+    """The exposure model of a plant, made once."""
+    return ExposureModel(plant, n_steps)
+
+
+def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:
+    """Inputs of the rig as each copy of the plant has them, (k, axes * n_inputs) -> (axes, k, n_inputs).
+
+    What is not a number is taken as zero: it must not poison every estimate that follows.
+    """
+    finite = np.where(np.isfinite(inputs), inputs, 0.0)
+    return finite.reshape(len(inputs), plant.axes, plant.n_inputs).transpose(1, 0, 2)
+
+
+def path_from_coefficients(
+    model: ExposureModel, coefficients: FloatArray, covariance: FloatArray, inputs: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Path and its standard deviation, both (axes * n_outputs, n_steps).
+
+    Estimators and the reader of recordings both come here, so that a recorded estimate unfolds to the
+    bits that the estimator gave.
+
+    Parameters
+    ----------
+    coefficients:
+        Of ``model.basis``, (axes, n_states) or more of its columns.
+    covariance:
+        Of the coefficients, (axes, n, n).
+    inputs:
+        The exposure's, (n_steps, axes * n_inputs); an exposure of another length has a model of its own.
+    """
+    plant = model.plant
+    if len(inputs) != model.n_steps:
+        model = exposure_model(plant, len(inputs))
+    input_path, _ = input_response(plant, by_axis(plant, inputs))
+    shape = (plant.axes * plant.n_outputs, model.n_steps)
+    return model.path(coefficients, input_path).reshape(shape), model.path_sd(covariance).reshape(shape)

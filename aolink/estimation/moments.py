@@ -1,0 +1,160 @@
+"""Spatial moments of an exposure: measured from counts, with the covariance of their noise.
+
+The p-th moment is sum omega^p Y D over the pixels, with omega the pixel's centre, Y its density and D its
+width. The kernel and the pixels' width add to it as independent variables do; that is taken out, so
+that E[y_p] = mean(theta^p). Mishra & Wen (7) to (11).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.optics.camera import effective_noise_density, to_density
+from aolink.optics.kernel import kernel_moments
+from aolink.rig import Sensor
+
+FloatArray = NDArray[np.float64]
+Flux = Literal["known", "measured"]
+
+# Where the flux is measured, its sd must be this many times smaller: a ratio's variance is not finite otherwise.
+_LEAST_FLUX = 5.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """What was measured in one exposure, with Gaussian noise."""
+
+    value: FloatArray
+    """(axes, n_measurements)"""
+    covariance: FloatArray
+    """(axes, n_measurements, n_measurements)"""
+
+
+def raw_moments(sensor: Sensor, counts: NDArray[np.uint16], highest: int) -> FloatArray:
+    """M_p = sum omega^p Y D for p = 0 .. highest, kernel included, (axes, pixels) -> (axes, highest + 1).
+
+    Summed over whole numbers, counts times odd pixel coordinates, which floating point does without
+    rounding for all but huge sensors: so no axis depends on its neighbours, whatever BLAS does.
+    """
+    odd = 2.0 * np.arange(sensor.pixels) + 1 - sensor.pixels  # pixel centres from mid-field, in half pixels
+    powers = odd[:, None] ** np.arange(highest + 1)
+    sums = counts.astype(np.float64) @ powers - sensor.black_level * powers.sum(axis=0)
+    half, centre = sensor.pixel_width / 2, sum(sensor.field) / 2
+    about_centre: FloatArray = sums * (half ** np.arange(highest + 1) * sensor.pixel_width / sensor.counts_per_density)
+    if centre == 0:
+        return about_centre
+    return _recombine(about_centre, _shift(centre, highest))
+
+
+def noise_integrals(sensor: Sensor, highest: int) -> FloatArray:
+    """I(n), integral of omega^n over the field, for n = 0 .. highest, (highest + 1,)."""
+    low, high = sensor.field
+    return np.array([(high ** (n + 1) - low ** (n + 1)) / (n + 1) for n in range(highest + 1)])
+
+
+def known_flux_covariance(noise_density: float, integrals: FloatArray, orders: Sequence[int]) -> FloatArray:
+    """Cov(M_p, M_q) = V I(p + q); on [-1, 1]: 2/3 V and 2/5 V for orders 1 and 2, and nothing between them. (11)"""
+    p = np.asarray(orders)
+    return np.asarray(noise_density * integrals[p[:, None] + p])
+
+
+def measured_flux_covariance(
+    noise_density: float, integrals: FloatArray, orders: Sequence[int], ratios: FloatArray, total: FloatArray
+) -> FloatArray:
+    """Cov(y_p, y_q) of y_p = M_p/M_0 to first order.
+
+    V [I(p+q) - y_p I(q) - y_q I(p) + y_p y_q I(0)] / M_0^2
+
+    Parameters
+    ----------
+    ratios:
+        y_p, kernel included, (axes, orders).
+    total:
+        M_0, (axes,).
+    """
+    p = np.asarray(orders)
+    y, first = ratios, integrals[p]
+    spread = integrals[p[:, None] + p] - y[:, :, None] * first - first[:, None] * y[:, None, :]
+    spread = spread + y[:, :, None] * y[:, None, :] * integrals[0]
+    return np.asarray(noise_density * spread / total[:, None, None] ** 2)
+
+
+def without_kernel(kernel: FloatArray, highest: int) -> FloatArray:
+    """The matrix that takes the kernel out of moments 0 .. highest, (highest + 1, highest + 1).
+
+    The moments found are M_p = sum_k binom(p, k) kernel_k m_(p-k); this is the inverse of that map.
+    """
+    mixing = np.zeros((highest + 1, highest + 1))
+    for p in range(highest + 1):
+        for k in range(p + 1):
+            mixing[p, p - k] = math.comb(p, k) * kernel[k]
+    return np.asarray(np.linalg.inv(mixing))
+
+
+def measure_moments(
+    sensor: Sensor, counts: NDArray[np.uint16], orders: Sequence[int], flux: Flux = "known"
+) -> Measurement | str:
+    """Moments of line-sensor frames without the kernel, y_p with E[y_p] = mean(theta^p).
+
+    Parameters
+    ----------
+    counts:
+        One row for each axis, (axes, pixels), none missing or saturated.
+    orders:
+        Which moments, from 1.
+    flux:
+        "known": the total is one, as Mishra & Wen (9) to (11) take it; "measured": divide by it, as (7) does.
+
+    Returns
+    -------
+    The moments, or why there are none.
+    """
+    highest, p = max(orders), list(orders)
+    total_noise, integrals = effective_noise_density(sensor), noise_integrals(sensor, 2 * max(orders))
+    everything = range(highest + 1)
+    raw = raw_moments(sensor, counts, highest)
+    if flux == "measured":
+        total = raw[:, 0].copy()
+        sd = math.sqrt(total_noise * integrals[0])
+        if (total < _LEAST_FLUX * sd).any():
+            return f"the flux, {total.min():.3g}, is under {_LEAST_FLUX:g} of its standard deviations, {sd:.3g}"
+        raw = raw / total[:, None]
+        covariance = measured_flux_covariance(total_noise, integrals, everything, raw, total)
+    else:
+        raw[:, 0] = 1.0
+        covariance = np.array([known_flux_covariance(total_noise, integrals, everything)])
+        covariance[:, 0] = covariance[:, :, 0] = 0.0
+    unmix = without_kernel(kernel_moments(sensor.kernel, sensor.pixel_width, highest), highest)[p]
+    covariance = unmix @ covariance @ unmix.T
+    return Measurement(
+        value=_recombine(raw, unmix),
+        covariance=np.broadcast_to(covariance, (len(counts), *covariance.shape[1:])),
+    )
+
+
+def spot_significance(sensor: Sensor, counts: NDArray[np.uint16]) -> float:
+    """By how many standard deviations the light of the brightest stretch of a row stands out, over several lengths."""
+    light = np.concatenate([[0.0], np.cumsum(to_density(sensor, counts).ravel())]) * sensor.pixel_width
+    lengths = [2**k for k in range(sensor.pixels.bit_length())]
+    sd = math.sqrt(effective_noise_density(sensor) * sensor.pixel_width)
+    return max(float((light[n:] - light[:-n]).max()) / (sd * math.sqrt(n)) for n in lengths if n <= sensor.pixels)
+
+
+def _shift(centre: float, highest: int) -> FloatArray:
+    """Moments about ``centre`` to moments about zero, (highest + 1, highest + 1)."""
+    matrix = np.zeros((highest + 1, highest + 1))
+    for p in range(highest + 1):
+        for k in range(p + 1):
+            matrix[p, k] = math.comb(p, k) * centre ** (p - k)
+    return matrix
+
+
+def _recombine(moments: FloatArray, matrix: FloatArray) -> FloatArray:
+    """matrix @ moments for each axis, in elementwise operations."""
+    return np.stack([sum(row[k] * moments[:, k] for k in range(len(row))) for row in matrix], axis=1)

@@ -1,0 +1,38 @@
+"""The camera as an integer device: densities become counts and counts become densities."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.rig import Sensor
+
+FloatArray = NDArray[np.float64]
+
+
+def to_counts(sensor: Sensor, density: FloatArray) -> NDArray[np.uint16]:
+    """What the camera reads out for a density (one over slope units): rounded, and cut at zero and at full scale."""
+    counts = np.rint(sensor.black_level + sensor.counts_per_density * density)
+    return np.clip(counts, 0, sensor.full_scale).astype(np.uint16)
+
+
+def to_density(sensor: Sensor, counts: NDArray[np.uint16]) -> FloatArray:
+    """The density (one over slope units) that counts stand for; noise makes it negative where nothing shines."""
+    return (counts.astype(np.float64) - sensor.black_level) / sensor.counts_per_density
+
+
+def is_saturated(sensor: Sensor, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """True where a count is at an end of the scale, so that the light may have been more, or less."""
+    return np.asarray((counts == 0) | (counts >= sensor.full_scale))
+
+
+def pixel_noise_sd(sensor: Sensor) -> float:
+    """Standard deviation of a pixel's density by read-out noise, sqrt(V/D), one over slope units."""
+    return math.sqrt(sensor.noise_density / sensor.pixel_width)
+
+
+def effective_noise_density(sensor: Sensor) -> float:
+    """V with the rounding to whole counts added (variance 1/12 of a count), so that it is never zero."""
+    return sensor.noise_density + sensor.pixel_width / (12 * sensor.counts_per_density**2)

@@ -1,0 +1,343 @@
+"""The plant lifted over many fast steps, and what the camera can know of it.
+
+Everything here follows from x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x(k), Mishra & Wen (1).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from aolink.rig import Plant, Rig
+
+FloatArray = NDArray[np.float64]
+
+_BLOCK_STEPS = 32
+_LARGEST_CHECK = 200_000
+# A mode that shrinks to this over one exposure is gone before the next, whatever the camera saw of it.
+_FORGOTTEN = 1e-3
+
+
+def psd_root(covariance: FloatArray) -> FloatArray:
+    """A root R of a covariance that may be singular, R R' = covariance, (n, n)."""
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def output_rows(plant: Plant, n_steps: int) -> FloatArray:
+    """C A^i for i = 0 .. n_steps - 1, (n_outputs, n_steps, n_states)."""
+    rows, power = plant.C[None], plant.A
+    while len(rows) < n_steps:
+        rows = np.concatenate([rows, rows @ power])
+        power = power @ power
+    return np.ascontiguousarray(rows[:n_steps].transpose(1, 0, 2))
+
+
+@lru_cache(maxsize=64)
+def lift(plant: Plant, n_steps: int) -> tuple[FloatArray, FloatArray]:
+    """The plant over ``n_steps`` fast steps: A^N and Q_N = sum_i A^i B_w W B_w' A^i', both (n_states, n_states).
+
+    By doubling, so that a gap of an hour costs no more than one of a second.
+    """
+    n = plant.n_states
+    transition, noise = np.eye(n), np.zeros((n, n))
+    power, power_noise = plant.A, plant.B_w @ plant.process_noise @ plant.B_w.T
+    while n_steps:
+        if n_steps & 1:
+            transition, noise = power @ transition, power @ noise @ power.T + power_noise
+        power, power_noise = power @ power, power @ power_noise @ power.T + power_noise
+        n_steps >>= 1
+    return transition, (noise + noise.T) / 2
+
+
+@lru_cache(maxsize=16)
+def _block_maps(plant: Plant) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Maps over one block of L steps, transposed: inputs and start state to outputs, inputs and start state to end."""
+    n_u, n_y, n = plant.n_inputs, plant.n_outputs, plant.n_states
+    length = max(1, min(_BLOCK_STEPS, 2048 // max(n_u, n_y)))
+    rows = output_rows(plant, length).transpose(1, 0, 2)  # C A^i, (L, n_y, n)
+    impulse = rows @ plant.B
+    toeplitz = np.zeros((length, n_y, length, n_u))
+    kicks = np.empty((n, length, n_u))
+    kick = plant.B
+    for j in range(length):
+        toeplitz[j + 1 :, :, j] = impulse[: length - 1 - j]
+        kicks[:, length - 1 - j] = kick
+        kick = plant.A @ kick
+    maps = (
+        toeplitz.reshape(length * n_y, length * n_u),
+        rows.reshape(length * n_y, n),
+        kicks.reshape(n, length * n_u),
+        np.linalg.matrix_power(plant.A, length),
+    )
+    toeplitz_t, rows_t, kicks_t, transition_t = (np.ascontiguousarray(m.T) for m in maps)
+    return toeplitz_t, rows_t, kicks_t, transition_t
+
+
+def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What the inputs do from rest.
+
+    Parameters
+    ----------
+    u:
+        Inputs at each fast step, (axes, k, n_inputs).
+
+    Returns
+    -------
+    c:
+        Response of the outputs within the steps, c_i = sum_{j<i} C A^(i-1-j) B u_j, (axes, n_outputs, k).
+    d:
+        Response of the state one step after the last, sum_j A^(k-1-j) B u_j, (axes, n_states). (The paper's
+        printed predictor has the inputs in reverse order and one step early.)
+    """
+    axes, k, n_u = u.shape
+    toeplitz, rows, kicks, transition = _block_maps(plant)
+    length = toeplitz.shape[0] // n_u
+    # Zeros in front leave a plant at rest at rest, so the last block ends where the inputs do.
+    n_blocks = -(-k // length)
+    padded = np.zeros((axes, n_blocks * length, n_u))
+    padded[:, n_blocks * length - k :] = u
+    blocks = padded.reshape(axes, n_blocks, 1, length * n_u)
+    # One product a block: so small, BLAS uses one thread, and no axis depends on its neighbours.
+    pushed = (blocks @ kicks)[:, :, 0]
+    starts = np.empty((axes, n_blocks, 1, plant.n_states))
+    state = np.zeros((axes, 1, plant.n_states))
+    for b in range(n_blocks):
+        starts[:, b] = state
+        state = state @ transition + pushed[:, b, None]
+    path = (blocks @ toeplitz + starts @ rows).reshape(axes, n_blocks * length, plant.n_outputs)
+    return np.ascontiguousarray(path[:, n_blocks * length - k :].transpose(0, 2, 1)), state[:, 0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mode:
+    """One eigenvalue of A (of a complex pair, the one above the axis)."""
+
+    eigenvalue: complex
+    frequency_hz: float
+    time_constant_s: float
+    """Time in which it falls to 1/e; infinite where it does not."""
+    seen: bool
+    """Whether the outputs see it at the fast rate, (A, C)."""
+    seen_by_centroid: bool
+    """Whether the mean over each exposure sees it, (A^N, C-bar)."""
+
+    def __str__(self) -> str:
+        lasts = "undamped" if math.isinf(self.time_constant_s) else f"time constant {self.time_constant_s:.3g} s"
+        return f"the mode at {self.frequency_hz:.4g} Hz ({lasts})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservabilityReport:
+    """What can be known of the plant's state (remarks 1 and 2 of Mishra & Wen)."""
+
+    n_states: int
+    rank: int
+    """Dimension of the state space that the outputs see at the fast rate."""
+    centroid_rank: int
+    """Dimension that the means over exposures see; remark 1 holds where it equals ``rank``, and it need not."""
+    modes: tuple[Mode, ...]
+    o2_needs: str
+    """What an estimator of the second moment alone (`o2`) needs before it can work."""
+
+    @property
+    def detectable(self) -> bool:
+        """Whether every mode that the outputs do not see dies out by itself."""
+        return all(m.seen or abs(m.eigenvalue) < 1 - 1e-9 for m in self.modes)
+
+    @property
+    def unseen(self) -> tuple[Mode, ...]:
+        """Modes that the outputs do not see at the fast rate."""
+        return tuple(m for m in self.modes if not m.seen)
+
+    @property
+    def lost_by_centroid(self) -> tuple[Mode, ...]:
+        """Modes that the outputs see and the means over exposures do not."""
+        return tuple(m for m in self.modes if m.seen and not m.seen_by_centroid)
+
+
+def observability(plant: Plant, n_steps: int, fast_step_s: float) -> ObservabilityReport:
+    """Rank of what the camera sees, mode by mode (Popov-Belevitch-Hautus), for exposures of ``n_steps``."""
+    rows = output_rows(plant, n_steps)
+    transition, _ = lift(plant, n_steps)
+    eigenvalues = np.linalg.eigvals(plant.A)
+    blind = _unobservable(plant.A, plant.C, eigenvalues)
+    scale = float(np.linalg.norm(rows)) / math.sqrt(n_steps)
+    lifted = eigenvalues**n_steps
+    blind_centroid = _unobservable(transition, rows.mean(axis=1), lifted, scale)
+    modes = []
+    for value, value_n in zip(eigenvalues, lifted, strict=True):
+        if value.imag < 0:
+            continue
+        radius = abs(value)
+        modes.append(
+            Mode(
+                eigenvalue=complex(value),
+                frequency_hz=float(abs(np.angle(value))) / (2 * math.pi * fast_step_s),
+                time_constant_s=math.inf if radius >= 1 - 1e-12 else -fast_step_s / math.log(max(radius, 1e-300)),
+                seen=not _has_part_in(plant.A, value, blind),
+                seen_by_centroid=abs(value_n) < _FORGOTTEN or not _has_part_in(plant.A, value, blind_centroid),
+            )
+        )
+    n = plant.n_states
+    stable = bool(np.abs(lifted).max() < 1 - 1e-9)
+    centroid_rank = n - blind_centroid.shape[1]
+    return ObservabilityReport(
+        n_states=n,
+        rank=n - blind.shape[1],
+        centroid_rank=centroid_rank,
+        modes=tuple(modes),
+        o2_needs=_o2_needs(stable, centroid_rank == n),
+    )
+
+
+def _unobservable(A: FloatArray, C: FloatArray, eigenvalues: NDArray[Any], scale: float | None = None) -> FloatArray:
+    """Basis of the states that (A, C) cannot tell from zero, (n_states, dimension), real and orthonormal."""
+    C = C / (scale or np.linalg.norm(C))
+    blind = []
+    for value in eigenvalues:
+        pencil = np.vstack([value * np.eye(len(A)) - A, C])
+        null = linalg.null_space(pencil, rcond=1e-9 / max(1e-9, float(np.linalg.norm(pencil, 2))))
+        blind += [null.real, null.imag]
+    space = np.concatenate(blind, axis=1)
+    if not space.size or np.abs(space).max() < 1e-6:
+        return np.zeros((len(A), 0))
+    return np.asarray(linalg.orth(space, rcond=1e-6))
+
+
+def _has_part_in(A: FloatArray, value: complex, space: FloatArray) -> bool:
+    """Whether the invariant subspace of an eigenvalue of A has a part in ``space``."""
+    if not space.shape[1]:
+        return False
+    # The eigenvalue's own left space: what it cannot annihilate has a part in the mode.
+    power = np.linalg.matrix_power(value * np.eye(len(A)) - A, len(A))
+    left = linalg.null_space(power.conj().T, rcond=1e-9)
+    return bool(np.linalg.norm(left.conj().T @ space) > 1e-6)
+
+
+def _o2_needs(stable: bool, observable: bool) -> str:
+    needs = [
+        "a spot off centre (drive.offset or drive.amplitude, or plant.initial_mean): at zero state and input"
+        " the second moment's slope is zero, and x and -x look alike"
+    ]
+    if not stable:
+        needs.append("a plant that forgets (every eigenvalue of A inside the unit circle): this one does not")
+    if not observable:
+        needs.append("a state that the centroid sees whole, (A^N, C-bar) observable: this one is not")
+    return "; ".join(needs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something that `check_rig` has to say."""
+
+    severity: Literal["error", "warning", "info"]
+    key: str
+    """The rig file's key that it is about."""
+    message: str
+
+
+def check_rig(rig: Rig) -> list[Finding]:
+    """What will not work, what may surprise, and what is worth knowing of a rig; errors first."""
+    findings = [*_check_observability(rig), *_check_field(rig), *_check_sensor(rig)]
+    order = ("error", "warning", "info")
+    return sorted(findings, key=lambda f: order.index(f.severity))
+
+
+def _check_observability(rig: Rig) -> list[Finding]:
+    report = observability(rig.plant, rig.timing.exposure_steps, rig.timing.fast_step_s)
+    findings = []
+    if not report.rank:
+        return [Finding(severity="error", key="plant.C", message="the camera sees no state of the plant")]
+    for mode in report.unseen:
+        harm = "it dies out by itself" if abs(mode.eigenvalue) < 1 - 1e-9 else "its estimate will never converge"
+        findings.append(
+            Finding(severity="warning", key="plant.C", message=f"the outputs do not see all of {mode}; {harm}")
+        )
+    for mode in report.lost_by_centroid:
+        message = (
+            f"the centroid over {rig.timing.exposure_steps} fast steps loses {mode}, wholly or in part;"
+            " the blur may still show it, another exposure time would"
+        )
+        findings.append(Finding(severity="warning", key="timing.exposure_steps", message=message))
+    message = f"rank {report.rank} of {report.n_states} at the fast rate, {report.centroid_rank} by centroids"
+    findings.append(Finding(severity="info", key="plant", message=f"{message}; o2 needs {report.o2_needs}"))
+    return findings
+
+
+def _check_field(rig: Rig) -> list[Finding]:
+    """Whether the spot stays on the sensor, as it should go and with three standard deviations around that."""
+    path, sd = nominal_path(rig)
+    low, high = rig.sensor.field
+    least, most = float(path.min()), float(path.max())
+    key = "drive.amplitude" if rig.drive.kind == "sine" else "drive.offset"
+    where = f"the spot goes from {least:.3g} to {most:.3g}"
+    if least < low or most > high:
+        message = (
+            f"{where} under the drive, beyond sensor.field = [{low:g}, {high:g}]: lower {key} or widen sensor.field"
+        )
+        return [Finding(severity="error", key=key, message=message)]
+    reach_low, reach_high = float((path - 3 * sd[:, None]).min()), float((path + 3 * sd[:, None]).max())
+    if reach_low < low or reach_high > high:
+        message = (
+            f"{where} under the drive, and process noise carries it from {reach_low:.3g} to {reach_high:.3g}"
+            f" (three sd), beyond the field [{low:g}, {high:g}]: moments will be biased there"
+        )
+        return [Finding(severity="warning", key="sensor.field", message=message)]
+    return []
+
+
+def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
+    """Where the spot goes under the drive without noise, and how far noise takes it from there.
+
+    Returns
+    -------
+    The path from the initial mean until the drive has been round twice after the plant settled,
+    (axes * n_outputs, steps), and the largest standard deviation of each output in that time, (axes * n_outputs,).
+    """
+    plant, timing = rig.plant, rig.timing
+    radius = float(np.abs(np.linalg.eigvals(plant.A)).max())
+    settle = 5 / -math.log(radius) if 0 < radius < 1 - 1e-9 else 100 * timing.exposure_steps
+    turns = 2 * rig.drive.period_s / timing.fast_step_s if rig.drive.kind == "sine" else 0
+    n_steps = int(min(_LARGEST_CHECK, max(timing.exposure_steps, settle) + turns))
+    u = rig.drive.inputs(0, n_steps, timing.fast_step_s).reshape(n_steps, plant.axes, plant.n_inputs)
+    response, _ = input_response(plant, u.transpose(1, 0, 2))
+    path = response + output_rows(plant, n_steps) @ plant.initial_mean
+    transition, noise = lift(plant, n_steps)
+    late = plant.C @ (transition @ plant.initial_covariance @ transition.T + noise) @ plant.C.T
+    early = plant.C @ plant.initial_covariance @ plant.C.T
+    sd = np.sqrt(np.maximum(np.diag(late), np.diag(early)))
+    return path.reshape(rig.n_outputs, n_steps), np.tile(sd, plant.axes)
+
+
+def _check_sensor(rig: Rig) -> list[Finding]:
+    sensor = rig.sensor
+    findings = []
+    sd = math.sqrt(sensor.kernel.variance)
+    if sd < sensor.pixel_width / 3:
+        message = (
+            f"the kernel's sd, {sd:.3g}, is under a third of a pixel ({sensor.pixel_width:.3g}):"
+            " moments depend on where in a pixel the spot rests"
+        )
+        findings.append(Finding(severity="warning", key="sensor.kernel.sigma", message=message))
+    noise = 5 * math.sqrt(sensor.noise_density / sensor.pixel_width) * sensor.counts_per_density
+    if sensor.black_level < noise:
+        message = (
+            f"five sd of pixel noise are {noise:.0f} counts, more than the black level, {sensor.black_level:g}:"
+            " clipped at zero, the noise biases every moment"
+        )
+        findings.append(Finding(severity="warning", key="sensor.black_level", message=message))
+    peak = math.erf(sensor.pixel_width / 2 / sensor.kernel.sigma) / sensor.pixel_width * sensor.counts_per_density
+    if sensor.black_level + peak + noise > sensor.full_scale:
+        message = (
+            f"a resting spot and five sd of noise reach {sensor.black_level + peak + noise:.0f} counts,"
+            f" the full scale is {sensor.full_scale}: lower counts_per_density"
+        )
+        findings.append(Finding(severity="warning", key="sensor.counts_per_density", message=message))
+    return findings

@@ -1,0 +1,173 @@
+"""The simulated rig's physics: plant, mirror value and camera in fast steps, without a wire and without time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.exposure import Exposure, Truth
+from aolink.optics.camera import pixel_noise_sd, to_counts
+from aolink.optics.kernel import exposure_density
+from aolink.plant import psd_root
+from aolink.rig import Rig, load_rig
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraFrame:
+    """A frame as the simulated camera makes it, with the truth."""
+
+    frame_id: int
+    """The camera's own count, from 1."""
+    first_step: int
+    """Fast step at which the exposure starts."""
+    n_steps: int
+    pixels: NDArray[np.uint16]
+    """Counts, (rows, columns)."""
+    truth: Truth
+
+
+class RigModel:
+    """Plant, mirror and camera of a rig, advanced in fast steps.
+
+    What comes out depends on the rig, the seed, the inputs and when the camera was started, and not on
+    how the steps are cut into calls of `advance`: initial state, process noise and pixel noise have
+    random streams of their own, drawn in the order of time.
+    """
+
+    def __init__(self, rig: Rig, seed: int | None = None) -> None:
+        plant = rig.plant
+        self.rig = rig
+        self.step = 0
+        """The next fast step."""
+        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(3)
+        initial, self._process_noise, self._pixel_noise = (np.random.default_rng(s) for s in seeds)
+        scatter = initial.standard_normal((plant.axes, plant.n_states, 1))
+        self._state = plant.initial_mean + (psd_root(plant.initial_covariance) @ scatter)[..., 0]
+        self._noise_input = plant.B_w @ psd_root(plant.process_noise)
+        self._frames = 0
+        self._exposure: int | None = None  # first step of the exposure that runs, or of the next one
+        self._exposures_left = 0
+        self._start_state = self._state
+        self._pieces: list[FloatArray] = []  # outputs of the exposure that runs
+
+    def start_camera(self, first_step: int, exposures: int = 0) -> None:
+        """Expose from ``first_step`` on, ``exposures`` times (0: until stopped); what ran before is dropped."""
+        if first_step < self.step:
+            raise ValueError(f"fast step {first_step} has gone by, the next one is {self.step}")
+        self._exposure, self._exposures_left = first_step, exposures
+
+    def stop_camera(self) -> None:
+        """Expose no more; an exposure that runs gives no frame."""
+        self._exposure = None
+
+    def advance(self, u: FloatArray) -> list[CameraFrame]:
+        """Apply the mirror values ``u``, (k, axes * n_inputs), for k fast steps; the frames that end within them."""
+        first, states = self.step, self._run(u)
+        outputs = (self.rig.plant.C @ states[:-1, ..., None]).reshape(len(u), self.rig.n_outputs)
+        self.step += len(u)
+        frames: list[CameraFrame] = []
+        while self._exposure is not None and self._exposure < self.step:
+            start, end = self._exposure, self._exposure + self.rig.timing.exposure_steps
+            if start >= first:
+                self._start_state, self._pieces = states[start - first], []
+            self._pieces.append(outputs[max(start, first) - first : min(end, self.step) - first])
+            if end > self.step:
+                break
+            frames.append(self._frame(start, states[end - first]))
+            self._exposures_left -= 1
+            self._exposure = None if self._exposures_left == 0 else start + self.rig.timing.frame_period_steps
+        return frames
+
+    def _run(self, u: FloatArray) -> FloatArray:
+        """States before each of k steps and after the last, (k + 1, axes, n_states). Mishra & Wen (1)."""
+        plant = self.rig.plant
+        w = self._process_noise.standard_normal((len(u), plant.axes, self._noise_input.shape[1], 1))
+        # One small product for each step: the bits of a product over all steps would depend on their number.
+        forcing = plant.B @ u.reshape(len(u), plant.axes, plant.n_inputs, 1) + self._noise_input @ w
+        forcing = forcing[..., 0]
+        states = np.empty((len(u) + 1, plant.axes, plant.n_states))
+        states[0] = self._state
+        transition = np.ascontiguousarray(plant.A.T)
+        for k in range(len(u)):
+            np.dot(states[k], transition, out=states[k + 1])
+            states[k + 1] += forcing[k]
+        self._state = states[-1].copy()
+        return states
+
+    def _frame(self, first_step: int, end_state: FloatArray) -> CameraFrame:
+        sensor = self.rig.sensor
+        path = np.concatenate(self._pieces).T.copy()
+        self._frames += 1
+        noise = self._pixel_noise.standard_normal(sensor.shape)
+        density = exposure_density(sensor.kernel, sensor.edges, path) + pixel_noise_sd(sensor) * noise
+        return CameraFrame(
+            frame_id=self._frames,
+            first_step=first_step,
+            n_steps=path.shape[1],
+            pixels=to_counts(sensor, density),
+            truth=Truth(start_state=self._start_state.copy(), end_state=end_state.copy(), path=path),
+        )
+
+
+def simulate(
+    rig: Rig | str | Path, n_exposures: int, seed: int | None = None, *, inputs: FloatArray | None = None
+) -> list[Exposure]:
+    """Exposures of the simulated rig with their truth, without a wire.
+
+    Parameters
+    ----------
+    rig:
+        A rig, the name of one that comes with aolink, or a TOML file.
+    n_exposures:
+        How many; the first one starts at fast step 0.
+    seed:
+        Of the random numbers; the rig file's own where None.
+    inputs:
+        What the mirror applies at each fast step, (steps, n_inputs); the rig's drive, as its converter
+        puts it out, where None.
+
+    Examples
+    --------
+    >>> exposures = simulate("section-vi", 3)
+    >>> exposures[2].first_step, exposures[2].truth.path.shape
+    (400, (1, 200))
+    """
+    rig = rig if isinstance(rig, Rig) else load_rig(rig)
+    timing = rig.timing
+    n_steps = (n_exposures - 1) * timing.frame_period_steps + timing.exposure_steps if n_exposures else 0
+    if inputs is None:
+        inputs = rig.mirror.quantise(rig.drive.inputs(0, n_steps, timing.fast_step_s))
+    elif inputs.ndim != 2 or inputs.shape[0] < n_steps or inputs.shape[1] != rig.n_inputs:
+        raise ValueError(f"inputs have shape {inputs.shape}, expected at least ({n_steps}, {rig.n_inputs})")
+    model = RigModel(rig, seed)
+    if n_exposures:
+        model.start_camera(0, n_exposures)
+    frames = model.advance(inputs[:n_steps])
+    ends = [0] + [frame.first_step + frame.n_steps for frame in frames]
+    return [_exposure(rig, frame, inputs, after) for frame, after in zip(frames, ends[:-1], strict=True)]
+
+
+def _exposure(rig: Rig, frame: CameraFrame, inputs: FloatArray, after: int) -> Exposure:
+    """The exposure of a frame; ``after`` is the end of the one before it."""
+    start, end = frame.first_step, frame.first_step + frame.n_steps
+    step_ns = rig.timing.fast_step_ns
+    return Exposure(
+        frame_id=frame.frame_id,
+        first_step=start,
+        n_steps=frame.n_steps,
+        pixels=frame.pixels,
+        mask=np.ones(frame.pixels.shape, dtype=np.bool_),
+        inputs=inputs[start:end].copy(),
+        lead_inputs=inputs[after:start].copy(),
+        device_start_ns=start * step_ns,
+        device_end_ns=end * step_ns,
+        host_start_ns=start * step_ns,
+        host_receive_ns=end * step_ns,
+        clock_sigma_ns=0.0,
+        truth=frame.truth,
+    )

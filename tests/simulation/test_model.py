@@ -1,0 +1,178 @@
+"""The simulated physics: against the recursion, against its own covariances, and however it is cut."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aolink.optics.camera import to_density
+from aolink.optics.kernel import exposure_density
+from aolink.plant import lift
+from aolink.rig import load_rig
+from aolink.simulation.model import CameraFrame, RigModel, simulate
+
+RIG = load_rig("section-vi")
+STILL = dataclasses.replace(
+    RIG,
+    plant=dataclasses.replace(RIG.plant, process_noise=np.zeros((1, 1)), initial_covariance=np.zeros((2, 2))),
+)
+
+
+def with_timing(rig, exposure_steps: int, frame_period_steps: int):
+    timing = dataclasses.replace(
+        rig.timing, exposure_steps=exposure_steps, frame_period_steps=frame_period_steps
+    )  # fmt: skip
+    return dataclasses.replace(rig, timing=timing)
+
+
+def same(a: CameraFrame, b: CameraFrame) -> bool:
+    return (
+        (a.frame_id, a.first_step, a.n_steps) == (b.frame_id, b.first_step, b.n_steps)
+        and np.array_equal(a.pixels, b.pixels)
+        and all(np.array_equal(getattr(a.truth, f), getattr(b.truth, f)) for f in ("start_state", "end_state", "path"))
+    )
+
+
+@given(cuts=st.lists(st.integers(0, 300), max_size=12), start=st.integers(0, 50))
+@settings(max_examples=20, deadline=None)
+def test_frames_do_not_depend_on_how_the_steps_are_cut(cuts, start):
+    rig = with_timing(RIG, 20, 33)
+    u = rig.drive.inputs(0, 300, 1e-3)
+    whole = RigModel(rig, 7)
+    whole.start_camera(start)
+    expected = whole.advance(u)
+    pieces = RigModel(rig, 7)
+    pieces.start_camera(start)
+    bounds = [0, *sorted(cuts), 300]
+    frames = [f for a, b in itertools.pairwise(bounds) for f in pieces.advance(u[a:b])]
+    assert pieces.step == 300
+    assert len(frames) == len(expected) > 0
+    assert all(same(a, b) for a, b in zip(frames, expected, strict=True))
+
+
+def test_without_noise_the_path_is_the_recursion():
+    (exposure,) = simulate(STILL, 1)
+    x = np.zeros(2)
+    for k in range(200):
+        assert exposure.truth.path[0, k] == pytest.approx(x[0], abs=1e-12)
+        x = RIG.plant.A @ x + RIG.plant.B @ exposure.inputs[k]
+    np.testing.assert_allclose(exposure.truth.end_state[0], x, atol=1e-12)
+
+
+def test_the_output_is_sampled_before_the_input_acts():
+    model = RigModel(STILL, 1)
+    model.start_camera(0, 1)
+    (frame,) = model.advance(np.full((200, 1), 0.05))
+    assert frame.truth.path[0, 0] == 0.0
+    assert frame.truth.path[0, 1] == 0.0  # the input pushes the second state first
+    assert frame.truth.path[0, 2] == pytest.approx(0.001 * 0.05)
+
+
+def test_states_of_consecutive_exposures_join():
+    exposures = simulate(RIG, 4)
+    for before, after in itertools.pairwise(exposures):
+        np.testing.assert_array_equal(before.truth.end_state, after.truth.start_state)
+
+
+def test_states_scatter_as_the_lifted_covariance_says():
+    transition, noise = lift(RIG.plant, 200)
+    exposures = simulate(RIG, 3000, seed=3, inputs=np.zeros((600_000, 1)))
+    starts = np.array([e.truth.start_state[0] for e in exposures])
+    ends = np.array([e.truth.end_state[0] for e in exposures])
+    innovations = ends - starts @ transition.T
+    np.testing.assert_allclose(np.cov(innovations.T) / noise, 1, atol=0.12)
+    # Successive states are correlated over seven exposures, so fewer of them count.
+    np.testing.assert_allclose(np.cov(starts.T).diagonal() / RIG.plant.initial_covariance.diagonal(), 1, atol=0.25)
+
+
+def test_first_states_scatter_as_the_initial_covariance_says():
+    states = []
+    for seed in range(2000):
+        model = RigModel(with_timing(RIG, 1, 1), seed)
+        model.start_camera(0, 1)
+        states.append(model.advance(np.zeros((1, 1)))[0].truth.start_state[0])
+    ratio = np.var(states, axis=0) / RIG.plant.initial_covariance.diagonal()
+    np.testing.assert_allclose(ratio, 1, atol=0.15)
+
+
+def test_pixels_are_the_exposure_with_noise_of_v_over_d():
+    exposures = simulate(RIG, 300)
+    sensor = RIG.sensor
+    noise = np.array(
+        [
+            to_density(sensor, e.pixels)[0] - exposure_density(sensor.kernel, sensor.edges, e.truth.path[0])
+            for e in exposures
+        ]
+    )
+    assert noise.var() == pytest.approx(sensor.noise_density / sensor.pixel_width, rel=0.05)
+    assert abs(noise.mean()) < 5 * noise.std() / np.sqrt(noise.size)
+
+
+def test_seeds_make_the_difference_and_nothing_else():
+    first, again, other = (simulate(RIG, 2, seed=s) for s in (5, 5, 6))
+    assert np.array_equal(first[1].pixels, again[1].pixels)
+    assert not np.array_equal(first[1].pixels, other[1].pixels)
+
+
+def test_the_camera_does_not_disturb_the_plant():
+    with_camera, without = RigModel(RIG, 2), RigModel(RIG, 2)
+    with_camera.start_camera(0, 1)
+    u = np.zeros((500, 1))
+    with_camera.advance(u)
+    without.advance(u)
+    for model in (with_camera, without):
+        model.start_camera(500, 1)
+    (a,), (b,) = with_camera.advance(u), without.advance(u)
+    np.testing.assert_array_equal(a.truth.path, b.truth.path)
+    assert (a.frame_id, b.frame_id) == (2, 1)
+
+
+def test_the_camera_stops_when_told_and_after_its_exposures():
+    model = RigModel(with_timing(RIG, 10, 10))
+    model.start_camera(0)
+    assert len(model.advance(np.zeros((35, 1)))) == 3
+    model.stop_camera()
+    assert model.advance(np.zeros((35, 1))) == []
+    model.start_camera(80, 2)
+    assert [f.first_step for f in model.advance(np.zeros((100, 1)))] == [80, 90]
+
+
+def test_the_camera_does_not_start_in_the_past():
+    model = RigModel(RIG)
+    model.advance(np.zeros((10, 1)))
+    with pytest.raises(ValueError, match="fast step 9 has gone by"):
+        model.start_camera(9)
+
+
+def test_dead_time_is_led_in_by_its_inputs():
+    rig = with_timing(RIG, 20, 33)
+    exposures = simulate(rig, 3)
+    assert [e.first_step for e in exposures] == [0, 33, 66]
+    assert [len(e.lead_inputs) for e in exposures] == [0, 13, 13]
+    u = rig.mirror.quantise(rig.drive.inputs(0, 86, 1e-3))
+    np.testing.assert_array_equal(exposures[2].lead_inputs, u[53:66])
+    np.testing.assert_array_equal(exposures[2].inputs, u[66:86])
+    assert exposures[2].device_start_ns == 66_000_000
+
+
+def test_rigs_go_by_name_and_by_file(tmp_path):
+    (tmp_path / "mine.toml").write_text(RIG.toml)
+    named, filed = simulate("section-vi", 1), simulate(tmp_path / "mine.toml", 1)
+    np.testing.assert_array_equal(named[0].pixels, filed[0].pixels)
+    assert simulate("section-vi", 0) == []
+
+
+def test_too_few_inputs_are_refused():
+    with pytest.raises(ValueError, match=r"expected at least \(400, 1\)"):
+        simulate(RIG, 2, inputs=np.zeros((300, 1)))
+
+
+def test_many_copies_are_as_independent_as_their_noise():
+    plant = dataclasses.replace(RIG.plant, axes=3)
+    rig = dataclasses.replace(RIG, plant=plant)
+    states = RigModel(rig, 1)._run(np.zeros((5, 3)))
+    assert states.shape == (6, 3, 2)
+    assert len(np.unique(states[5])) == 6
