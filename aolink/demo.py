@@ -38,17 +38,15 @@ class DemoResult:
 
 
 @contextlib.contextmanager
-def simulated_rig(rig: str | Path, *, seed: int | None = None, real_time: bool = False) -> Iterator[tuple[str, str]]:
-    """A simulated rig as a process of its own; gives the ports of camera and mirror.
+def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
+    """A simulated rig as a process of its own, `aolink rig` with ``options``; gives the ports of camera and mirror.
 
     Raises
     ------
     DeviceError
         The process does not start.
     """
-    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json"]
-    command += ["--real-time"] if real_time else []
-    command += ["--seed", str(seed)] if seed is not None else []
+    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", *options]
     # A group of its own: Ctrl-C is for the session, which still has to park the mirror.
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
@@ -107,10 +105,9 @@ def run_demo(
         yield lambda done: progress(name, done)
         seconds[name] = time.monotonic() - start
 
-    with (
-        part("record") as tell,
-        simulated_rig(rig_name, seed=seed, real_time=real_time) as (camera, mirror),
-    ):
+    options = ["--real-time"] if real_time else []
+    options += ["--seed", str(seed)] if seed is not None else []
+    with part("record") as tell, simulated_rig(rig_name, *options) as (camera, mirror):
         report = record(
             rig, camera, mirror, path, estimators=ESTIMATORS, exposures=exposures, note="aolink demo", stop=stop,
             progress=tell,

@@ -50,17 +50,17 @@ class Plant:
 
     @property
     def n_states(self) -> int:
-        return self.A.shape[0]
+        return int(self.A.shape[0])
 
     @property
     def n_inputs(self) -> int:
         """Inputs of one copy."""
-        return self.B.shape[1]
+        return int(self.B.shape[1])
 
     @property
     def n_outputs(self) -> int:
         """Outputs of one copy."""
-        return self.C.shape[0]
+        return int(self.C.shape[0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -423,7 +423,7 @@ def _plant(table: _Table) -> Plant:
                 f"plant.initial_covariance is missing: plant.A has an eigenvalue of modulus {radius:.6g},"
                 " so there is no stationary covariance; give a matrix"
             )
-        covariance = linalg.solve_discrete_lyapunov(A, B_w @ W @ B_w.T)
+        covariance = np.asarray(linalg.solve_discrete_lyapunov(A, B_w @ W @ B_w.T), dtype=np.float64)
     else:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)

@@ -11,12 +11,12 @@ import contextlib
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
-import aolink
 from aolink.assembly import Assembler, Frame
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
 from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig, check_kind, identify
@@ -38,6 +38,8 @@ LEAD_BLOCKS = 3
 _START_DELAY_S = 0.25
 """Real time: from the first command to its first step."""
 _LINK_PERIOD_S = 1.0
+_ANSWER_NS = 200_000_000
+"""How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """Real time: how long a frame may take after its exposure's end before it counts as lost."""
 
@@ -147,7 +149,7 @@ def record(
     driver = Driver(rig, estimators)
     with open_devices(rig, camera_port, mirror_port) as (hub, camera, mirror):
         facts = {
-            "aolink_version": aolink.__version__,
+            "aolink_version": version("aolink"),
             "rig": rig.name,
             "rig_digest": rig.digest,
             "camera": f"{camera.identity.model} {camera.identity.serial_number} ({camera.identity.firmware})",
@@ -186,6 +188,8 @@ class _Session:
         self._queued_until = 0
         """First fast step that no command was sent for."""
         self._newest_frame = 0
+        self._asked: Camera | Mirror = camera
+        """Whose clock is asked next."""
         self._next_query_ns = self._next_link_ns = 0
         self._last_frame_ns = 0
         self._latencies: dict[int, pb.Latency] = {}
@@ -232,20 +236,21 @@ class _Session:
         return self._camera if link is self._camera.link else self._mirror
 
     def _warm_up_clocks(self) -> None:
-        for _ in range(WARM_UP_QUERIES):
-            asked_ns = self._hub.now_ns()
-            for device in (self._camera, self._mirror):
-                device.query_clock(asked_ns)
-            answers = 0
-            while answers < 2 and self._hub.now_ns() < asked_ns + 200_000_000:
-                answers += self._receive(0.05)
-                if self._hub.virtual:
-                    break
+        for _ in range(2 * WARM_UP_QUERIES):
+            self._query_next_clock(self._hub.now_ns())
+            deadline_ns = self._hub.now_ns() + _ANSWER_NS
+            while not self._receive(0.05) and not self._hub.virtual and self._hub.now_ns() < deadline_ns:
+                pass
         for device in (self._camera, self._mirror):
             if not device.clock.ready:
                 raise DeviceError(f"the {device.link.name} does not answer clock queries: is it still connected?")
-        self._next_query_ns = self._hub.now_ns() + round(QUERY_PERIOD_S * 1e9)
         self._next_link_ns = self._hub.now_ns() + round(_LINK_PERIOD_S * 1e9)
+
+    def _query_next_clock(self, now: int) -> None:
+        """Camera and mirror in turn, so that the one's query does not wait for the other's."""
+        self._asked, asked = (self._mirror if self._asked is self._camera else self._camera), self._asked
+        asked.query_clock(now)
+        self._next_query_ns = now + round(QUERY_PERIOD_S / 2 * 1e9)
 
     def _choose_first_step(self) -> int:
         if self._hub.virtual:
@@ -269,9 +274,7 @@ class _Session:
         if timeout_ns is not None and timeout_ns <= now:
             self._mirror.retransmit(now)
         if now >= self._next_query_ns:
-            for device in (self._camera, self._mirror):
-                device.query_clock(now)
-            self._next_query_ns = now + round(QUERY_PERIOD_S * 1e9)
+            self._query_next_clock(now)
         if now >= self._next_link_ns:
             self._record_links(now)
             self._next_link_ns = now + round(_LINK_PERIOD_S * 1e9)

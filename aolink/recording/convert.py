@@ -76,7 +76,7 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
         frame_id=estimate.frame_id,
         first_step=estimate.first_step,
         n_steps=estimate.n_steps,
-        status=pb.Estimate.Status.ValueType(estimate.status),
+        status=pb.Estimate.Status.Name(estimate.status),
         reason=estimate.reason,
         axes=axes,
         n_states=n_states,

@@ -119,7 +119,7 @@ def test_no_such_port() -> None:
 
 
 def test_nothing_listens() -> None:
-    with pytest.raises(PortError, match="nothing listens at socket://127.0.0.1:1:"):
+    with pytest.raises(PortError, match=r"nothing listens at socket://127\.0\.0\.1:1:"):
         SerialPort("socket://127.0.0.1:1")
 
 

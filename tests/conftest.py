@@ -1,0 +1,65 @@
+"""What several rooms of tests share: a rig as a process, the command line as a process, a recorded session."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from aolink.demo import simulated_rig
+from aolink.rig import load_rig
+from aolink.session import Report, record
+
+ESTIMATORS = ("open-loop", "o1", "o2", "o3")
+EXPOSURES = 12
+
+
+@dataclass(frozen=True)
+class Session:
+    """A recorded session and what it reported."""
+
+    path: Path
+    report: Report
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    """A session with the lively rig over two real pseudo terminals, two processes, on virtual time."""
+    path = tmp_path_factory.mktemp("recorded") / "session.mcap"
+    with simulated_rig("section-vi-lively") as (camera, mirror):
+        report = record(
+            load_rig("section-vi-lively"), camera, mirror, path, estimators=ESTIMATORS, exposures=EXPOSURES
+        )  # fmt: skip
+    return Session(path, report)
+
+
+@pytest.fixture
+def aolink(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run the command line in an empty folder."""
+
+    def run(*arguments: str | Path, **options: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "aolink", *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120, **options)  # type: ignore[call-overload, no-any-return]
+
+    return run
+
+
+@pytest.fixture
+def start_aolink(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """Start the command line in the background."""
+
+    def start(*arguments: str | Path) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "aolink", *map(str, arguments)]
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        return subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )  # fmt: skip
+
+    return start

@@ -1,0 +1,307 @@
+"""What bad input gets: one clear line that says what to do, an exit code that means something, nothing lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import resource
+import signal
+import subprocess
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.demo import simulated_rig
+from aolink.errors import DeviceError, RecordingError
+from aolink.recording.reader import Recording
+from aolink.recording.writer import RecordingWriter
+from aolink.rig import load_rig
+from aolink.session import open_devices
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet, schema_hash
+from aolink.wire.port import SerialPort
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+def record_arguments(
+    camera: str, mirror: str, *more: str, rig: str = "section-vi", output: str = "a.mcap"
+) -> list[str]:
+    return ["record", "--camera", camera, "--mirror", mirror, "--rig", rig, "-o", output, *more]
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], exit_code: int, pattern: str) -> None:
+    assert result.returncode == exit_code, result.stderr
+    assert re.fullmatch(rf"aolink: .*{pattern}.*\n", result.stderr), result.stderr
+
+
+@contextmanager
+def fake_device(answer: Callable[[Packet], bytes]) -> Iterator[str]:
+    """Something on a pseudo terminal that answers packets in its own way; gives its path."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    done = threading.Event()
+
+    def serve() -> None:
+        decoder = PacketDecoder()
+        os.set_blocking(master, False)
+        while not done.wait(0.01):
+            try:
+                data = os.read(master, 4096)
+            except BlockingIOError:
+                continue
+            for packet in decoder.feed(data):
+                os.write(master, answer(packet))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        done.set()
+        thread.join()
+        os.close(master)
+        os.close(slave)
+
+
+def test_no_such_port(aolink: Run) -> None:
+    result = aolink(*record_arguments("/dev/nowhere", "/dev/nowhere"))
+    assert_refused(result, 3, "there is no port /dev/nowhere: `aolink devices` lists those of this machine")
+
+
+def test_port_in_use(aolink: Run) -> None:
+    with simulated_rig("section-vi") as (camera, mirror):
+        held = SerialPort(camera)
+        result = aolink(*record_arguments(camera, mirror, "--exposures", "2"))
+        held.close()
+    assert_refused(result, 3, f"port {camera} is in use by another program")
+
+
+def test_swapped_ports(aolink: Run) -> None:
+    with simulated_rig("section-vi") as (camera, mirror):
+        result = aolink(*record_arguments(mirror, camera, "--exposures", "2"))
+    assert_refused(
+        result, 4, r"the camera port is a mirror \(section-vi\), expected a camera: are the two ports swapped"
+    )
+
+
+def test_a_port_where_nobody_answers(aolink: Run) -> None:
+    with fake_device(lambda packet: b"") as port:
+        result = aolink("devices", port)
+    assert result.returncode == 4
+    assert "no device answers on the given" in result.stderr
+    assert "nothing came" in result.stderr
+
+
+def test_a_device_that_is_not_ours(aolink: Run) -> None:
+    with fake_device(lambda packet: b"+++ OK\r\n") as port:
+        result = aolink("devices", port)
+    assert result.returncode == 4
+    assert "24 bytes came that are not aolink packets" in result.stderr
+
+
+def test_another_protocol_version(aolink: Run) -> None:
+    with fake_device(lambda packet: encode_packet(Packet(2, 2, packet.sequence, b"\x08\x01"))) as port:
+        result = aolink("devices", port)
+    assert result.returncode == 4
+    assert "speaks protocol version 2, this aolink speaks 1: update the host" in result.stderr
+
+
+def test_another_schema(aolink: Run) -> None:
+    def answer(packet: Packet) -> bytes:
+        nonce = pb.Identify.FromString(packet.payload).nonce
+        return encode_message(pb.Identity(nonce=nonce, protocol_version=1, schema_hash=b"otherone"), 0)
+
+    with fake_device(answer) as port:
+        result = aolink("devices", port)
+    assert result.returncode == 4
+    assert f"built with another messages.proto (6f746865726f6e65, here {schema_hash().hex()})" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "pattern"),
+    [
+        ("pixels = 40", "pixels = 64", r"sensor shape .* is \(1, 64\) in the file, \(1, 40\) on the device"),
+        ("exposure_steps = 200", "exposure_steps = 100", "timing.exposure_steps is 100 in the file, 200 on the device"),
+        ("input_max = 0.05", "input_max = 0.06", r"mirror.input_max is \[0.06\] in the file, \[0.05\] on the device"),
+    ],
+)
+def test_a_rig_file_of_another_device(aolink: Run, tmp_path: Path, old: str, new: str, pattern: str) -> None:
+    text = load_rig("section-vi").toml
+    assert old in text
+    (tmp_path / "other.toml").write_text(text.replace(old, new))
+    with simulated_rig("section-vi") as (camera, mirror):
+        result = aolink(*record_arguments(camera, mirror, rig="other.toml"))
+    assert_refused(result, 4, f"the rig file section-vi does not match the device: {pattern}; give the rig file")
+
+
+def test_ports_of_two_rigs(aolink: Run) -> None:
+    with simulated_rig("section-vi") as (camera, _), simulated_rig("section-vi", "--seed", "9") as (_, mirror):
+        result = aolink(*record_arguments(camera, mirror))
+    assert_refused(result, 4, "do not belong to the same rig")
+
+
+def test_an_existing_target_is_kept(aolink: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_text("precious")
+    with simulated_rig("section-vi") as (camera, mirror):
+        arguments = record_arguments(camera, mirror, "--exposures", "2")
+        assert_refused(aolink(*arguments), 5, "a.mcap exists and is not overwritten")
+        assert (tmp_path / "a.mcap").read_text() == "precious"
+        assert aolink(*arguments, "--overwrite").returncode == 0
+    assert Recording(tmp_path / "a.mcap").counts["/camera/image"] == 2
+    for command in (["estimate", "a.mcap", "-o", "a.mcap"], ["view", "a.mcap", "--save", "a.mcap"]):
+        assert "exists and is not overwritten" in aolink(*command).stderr
+
+
+def test_a_folder_that_does_not_exist(aolink: Run) -> None:
+    with simulated_rig("section-vi") as (camera, mirror):
+        result = aolink(*record_arguments(camera, mirror, output="no/such/a.mcap"))
+    assert_refused(result, 5, "cannot create no/such/a.mcap: no such file or directory")
+
+
+def test_an_unknown_estimator(aolink: Run) -> None:
+    with simulated_rig("section-vi") as (camera, mirror):
+        result = aolink(*record_arguments(camera, mirror, "--estimator", "o7"))
+    assert result.returncode == 6
+    assert "o7" in result.stderr
+    assert "open-loop" in result.stderr
+
+
+def test_a_full_disk(aolink: Run, tmp_path: Path) -> None:
+    """The limit on the size of files stands for the disk; the kernel refuses the write either way."""
+    limit = 200_000
+    with simulated_rig("section-vi") as (camera, mirror):
+        result = aolink(
+            *record_arguments(camera, mirror, "--estimator", "o3"),
+            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        )
+        assert_refused(result, 5, "cannot write a.mcap: the disk is full; what was recorded until then is in it")
+        parked = aolink("devices", mirror).stdout
+    assert "parked" in parked
+    recording = Recording(tmp_path / "a.mcap")
+    exposures = list(recording.exposures())
+    assert not recording.complete
+    assert len(exposures) > 10
+    assert [e.frame_id for e in exposures] == list(range(1, len(exposures) + 1))
+    assert "it was cut off" in aolink("info", "a.mcap").stdout
+
+
+def test_no_space_at_all() -> None:
+    with pytest.raises(RecordingError, match="cannot write /dev/full: the disk is full"):
+        RecordingWriter("/dev/full", load_rig("section-vi"), {}, 0, overwrite=True)
+
+
+def wait_for_size(path: Path, size: int, process: subprocess.Popen[str]) -> None:
+    while not path.exists() or path.stat().st_size < size:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("how", [[], ["--real-time"]])
+def test_ctrl_c_keeps_the_recording_whole_and_parks_the_mirror(
+    aolink: Run, start_aolink: Start, tmp_path: Path, how: list[str]
+) -> None:
+    with simulated_rig("section-vi", *how) as (camera, mirror):
+        process = start_aolink(*record_arguments(camera, mirror, "--estimator", "o3"))
+        wait_for_size(tmp_path / "a.mcap", 40_000, process)
+        process.send_signal(signal.SIGINT)
+        output, errors = process.communicate(timeout=30)
+        parked = aolink("devices", mirror).stdout
+    assert process.returncode == 130
+    assert errors == ""
+    assert "interrupted" in output
+    assert "parked" in parked
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.complete
+    assert recording.metadata["ended"] == "interrupted"
+    assert len(list(recording.exposures())) == len(recording.estimates("o3")) > 0
+
+
+def test_a_rig_killed_in_the_middle(start_aolink: Start, tmp_path: Path) -> None:
+    rig = start_aolink("rig", "section-vi", "--json")
+    assert rig.stdout is not None
+    ports = json.loads(rig.stdout.readline())
+    process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--estimator", "o3"))
+    wait_for_size(tmp_path / "a.mcap", 100_000, process)
+    rig.kill()
+    rig.communicate()
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 3
+    assert re.fullmatch(r"aolink: lost /dev/pts/\d+: .*; is the device still there\?\n", errors), errors
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.complete
+    assert recording.metadata["ended"].startswith("error: lost /dev/pts/")
+    assert len(recording.estimates("o3")) > 0
+
+
+def test_a_killed_host_leaves_a_readable_recording_and_a_parked_mirror(
+    aolink: Run, start_aolink: Start, tmp_path: Path
+) -> None:
+    """Nobody tells the mirror to park: its queue runs empty."""
+    with simulated_rig("section-vi", "--real-time") as (camera, mirror):
+        process = start_aolink(*record_arguments(camera, mirror))
+        wait_for_size(tmp_path / "a.mcap", 60_000, process)
+        process.kill()
+        process.communicate()
+        while "parked" not in aolink("devices", mirror).stdout:
+            time.sleep(0.05)
+    recording = Recording(tmp_path / "a.mcap")
+    assert not recording.complete
+    assert recording.counts["/camera/image"] == len(list(recording.exposures())) > 0
+
+
+def test_the_watchdog_parks_the_mirror_while_commands_are_queued(tmp_path: Path) -> None:
+    text = load_rig("section-vi").toml.replace("block_steps = 50", "queue_steps = 5000\nwatchdog_s = 0.1")
+    (tmp_path / "rig.toml").write_text(text)
+    rig = load_rig(tmp_path / "rig.toml")
+    with (
+        simulated_rig(tmp_path / "rig.toml", "--real-time") as ports,
+        open_devices(rig, *ports) as (hub, _, mirror),
+    ):
+        for k in range(0, 4000, 50):
+            mirror.send_block(mirror.identity.next_step + 100 + k, np.full((50, 1), 0.01), 0, hub.now_ns())
+        events: list[str] = []
+        while not events:
+            for link, received in hub.wait(1.0):
+                if link is mirror.link:
+                    events += [e.text for e in mirror.handle(received) if isinstance(e, pb.Event)]
+    assert events == ["mirror parked: no valid packet for 0.1 s"]
+
+
+def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() -> None:
+    rig = load_rig("section-vi")
+    with simulated_rig("section-vi") as ports, open_devices(rig, *ports) as (hub, _, mirror):
+        for value in (0.06, float("nan")):
+            u = np.array([[0.0], [value]])
+            with pytest.raises(DeviceError, match=r"input 0 at fast step 1 is .*, beyond the mirror's limits"):
+                mirror.send_block(0, u, 0, hub.now_ns())
+        mirror.identity.mirror.input_max[0] = 1.0  # a host that believes in other limits
+        mirror.send_block(0, np.array([[0.06]]), 0, hub.now_ns())
+        ((_, refusal),) = hub.wait(1.0)
+        with pytest.raises(DeviceError, match=r"the mirror refused command block 1 .*: an input is beyond the limits"):
+            mirror.handle(refusal)
+
+
+def test_help_has_an_example_for_every_command(aolink: Run) -> None:
+    for command in ("rig", "devices", "record", "info", "estimate", "view", "demo"):
+        result = aolink(command, "--help")
+        assert result.returncode == 0
+        assert f"Example: aolink {command}" in result.stdout
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello, this is a text file, not a recording\n"])
+def test_a_file_that_is_not_a_recording(aolink: Run, tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "bad.mcap").write_bytes(content)
+    for command in ("info", "estimate", "view"):
+        result = aolink(command, "bad.mcap")
+        assert_refused(result, 5, "bad.mcap")
+    assert_refused(aolink("info", "missing.mcap"), 5, "cannot read missing.mcap: no such file or directory")

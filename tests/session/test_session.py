@@ -1,0 +1,231 @@
+"""A whole session: two processes, real bytes, and what must hold of the recording."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import aolink
+from aolink.demo import simulated_rig
+from aolink.estimation import Driver, run
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
+from aolink.rig import load_rig
+from aolink.session import record
+from tests.conftest import ESTIMATORS, EXPOSURES, Session
+
+
+def test_everything_is_received_and_recorded(recorded: Session) -> None:
+    report, recording = recorded.report, Recording(recorded.path)
+    assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
+    assert report.frames_lost == report.frames_incomplete == report.packets_missing == report.blocks_retransmitted == 0
+    assert report.steps_commanded == report.steps_applied == 200 * EXPOSURES
+    assert report.steps_late == report.steps_parked == 0
+    assert recording.complete
+    for topic in (topics.IMAGE, topics.EXPOSURE, topics.TRUTH, *map(topics.estimate_topic, ESTIMATORS)):
+        assert recording.counts[topic] == EXPOSURES
+    assert recording.counts[topics.COMMAND] == recording.counts[topics.APPLIED] == 4 * EXPOSURES
+    assert recording.counts[topics.CLOCK] >= 16
+    assert recording.counts[topics.LINK] >= 2
+
+
+def test_the_wire_gives_what_the_model_gives_in_memory(recorded: Session) -> None:
+    """Nothing is lost or changed between the simulated rig's model and the exposures of the recording."""
+    simulated = aolink.simulate("section-vi-lively", EXPOSURES)
+    for ours, theirs in zip(Recording(recorded.path).exposures(), simulated, strict=True):
+        assert np.array_equal(ours.pixels, theirs.pixels)
+        assert np.array_equal(ours.inputs, theirs.inputs)
+        assert ours.truth is not None
+        assert theirs.truth is not None
+        assert np.array_equal(ours.truth.path, theirs.truth.path)
+        assert np.array_equal(ours.truth.end_state, theirs.truth.end_state)
+
+
+def test_online_and_offline_estimates_agree_bit_for_bit(recorded: Session) -> None:
+    recording = Recording(recorded.path)
+    for name, again in reestimate(recording, ESTIMATORS).items():
+        assert first_difference(recording.estimates(name), again) is None
+
+
+def test_writing_the_same_estimates_again_gives_the_same_bytes(recorded: Session, tmp_path: Path) -> None:
+    again = tmp_path / "again.mcap"
+    for path in (again, tmp_path / "third.mcap"):
+        write_reestimated(Recording(recorded.path), ["o1", "o3"], path)
+    assert again.read_bytes() == (tmp_path / "third.mcap").read_bytes()
+    ours, theirs = Recording(again), Recording(recorded.path)
+    assert first_difference(ours.estimates("o3"), theirs.estimates("o3")) is None
+    assert ours.estimators == ["o1", "o3"]
+
+
+def test_the_same_seed_gives_the_same_recording_byte_for_byte(recorded: Session, tmp_path: Path) -> None:
+    path = tmp_path / "again.mcap"
+    with simulated_rig("section-vi-lively") as (camera, mirror):
+        record(load_rig("section-vi-lively"), camera, mirror, path, estimators=ESTIMATORS, exposures=EXPOSURES)
+    assert path.read_bytes() == recorded.path.read_bytes()
+
+
+def test_another_seed_gives_another_recording(recorded: Session, tmp_path: Path) -> None:
+    path = tmp_path / "other.mcap"
+    with simulated_rig("section-vi-lively", "--seed", "2") as (camera, mirror):
+        record(load_rig("section-vi-lively"), camera, mirror, path, exposures=EXPOSURES)
+    (ours, theirs) = (next(Recording(p).exposures()) for p in (path, recorded.path))
+    assert not np.array_equal(ours.pixels, theirs.pixels)
+
+
+def test_over_tcp_it_is_the_same(recorded: Session, tmp_path: Path) -> None:
+    path = tmp_path / "tcp.mcap"
+    with simulated_rig("section-vi-lively", "--listen", "127.0.0.1:0") as (camera, mirror):
+        assert camera.startswith("socket://127.0.0.1:")
+        record(load_rig("section-vi-lively"), camera, mirror, path, estimators=ESTIMATORS, exposures=EXPOSURES)
+    assert path.read_bytes() == recorded.path.read_bytes()
+
+
+def test_a_rig_serves_one_session_after_another(tmp_path: Path) -> None:
+    rig = load_rig("section-vi-lively")
+    with simulated_rig("section-vi-lively") as (camera, mirror):
+        for name, first in (("a", 0), ("b", 600)):
+            record(rig, camera, mirror, tmp_path / name, exposures=3)
+            exposures = list(Recording(tmp_path / name).exposures())
+            assert [e.first_step for e in exposures] == [first, first + 200, first + 400]
+
+
+def test_removing_truth_and_estimates_changes_no_estimate(recorded: Session, tmp_path: Path) -> None:
+    whole = Recording(recorded.path)
+    bare = rewrite(recorded.path, tmp_path / "bare.mcap", lambda topic: topic == topics.TRUTH or "estimate" in topic)
+    assert next(bare.exposures()).truth is None
+    assert bare.estimators == []
+    for name, again in reestimate(bare, ESTIMATORS).items():
+        assert first_difference(whole.estimates(name), again) is None
+
+
+def test_changing_a_pixel_changes_the_estimates_from_there_on(recorded: Session) -> None:
+    exposures = list(Recording(recorded.path).exposures())
+    pixels = exposures[4].pixels.copy()
+    pixels[0, 3] += 1
+    changed = [*exposures[:4], replace(exposures[4], pixels=pixels), *exposures[5:]]
+    rig = load_rig("section-vi-lively")
+    before, after = (run(rig, series, ["o3"])["o3"] for series in (exposures, changed))
+    assert first_difference(before[:4], after[:4]) is None
+    assert (before[4].path != after[4].path).all()
+    assert not np.array_equal(before[5].end_state, after[5].end_state)
+
+
+def test_the_truth_is_not_read(recorded: Session) -> None:
+    exposures = list(Recording(recorded.path).exposures())
+    driver, blind = (Driver(load_rig("section-vi-lively"), ESTIMATORS) for _ in range(2))
+    for exposure in exposures:
+        pairs = zip(driver.step(exposure), blind.step(replace(exposure, truth=None)), strict=True)
+        assert all(first_difference([a], [b]) is None for a, b in pairs)
+
+
+def rewrite(source: Path, target: Path, drop: Callable[[str], bool]) -> Recording:
+    """A copy without some topics."""
+    from aolink.recording.writer import RecordingWriter
+
+    recording = Recording(source)
+    with RecordingWriter(target, recording.rig, recording.metadata, recording.start_ns, deterministic=True) as writer:
+        for each in recording.messages():
+            if not drop(each.topic):
+                writer.write(each.topic, each.message, each.log_time_ns)
+    return Recording(target)
+
+
+FAULTY = """
+[simulation.faults]
+bit_flip_rate = 0.02
+packet_loss_rate = 0.03
+command_loss_rate = 0.05
+duplicate_rate = 0.03
+"""
+
+
+def test_a_bad_link_loses_frames_and_nothing_else(tmp_path: Path) -> None:
+    """Every command gets through by retransmission, lost frames are bridged, and it is reproducible."""
+    rig_file = tmp_path / "faulty.toml"
+    rig_file.write_text(load_rig("section-vi-lively").toml + FAULTY)
+    rig, paths, reports = load_rig(rig_file), [], []
+    for name in ("a", "b"):
+        with simulated_rig(rig_file) as (camera, mirror):
+            paths.append(tmp_path / name)
+            reports.append(record(rig, camera, mirror, paths[-1], estimators=["o3"], exposures=60))
+    report = reports[0]
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    assert report.ended == "complete"
+    assert 0 < report.frames_lost < 15
+    assert report.frames_received == 60 - report.frames_lost == report.exposures
+    assert report.packets_bad_crc + report.packets_bad_framing > 0
+    assert report.packets_missing > 0
+    assert report.blocks_retransmitted > 0
+    # Every step was commanded: what was applied but not reported counts as neither.
+    assert report.steps_parked == 0
+    exposures = list(Recording(paths[0]).exposures())
+    for before, exposure in itertools.pairwise(exposures):
+        assert exposure.first_step - len(exposure.lead_inputs) == before.first_step + 200
+    assert any(e.inputs_assumed for e in exposures)
+    assert any(len(e.lead_inputs) for e in exposures)
+    # What was commanded stands in for what the device's report is missing for: within a converter step.
+    truth = aolink.simulate(rig, 60)
+    for exposure in exposures:
+        assert np.abs(exposure.inputs - truth[exposure.first_step // 200].inputs).max() < 2e-6
+    recording = Recording(paths[0])
+    assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"])["o3"]) is None
+    sd = np.concatenate([e.path_sd for e in recording.estimates("o3")])
+    assert np.isfinite(sd).all()
+
+
+def test_real_time_has_latencies_and_no_late_step(tmp_path: Path) -> None:
+    """The clock runs here, so nothing is said about how fast; only that order and counts are right."""
+    path = tmp_path / "real.mcap"
+    with simulated_rig("section-vi-lively", "--real-time") as (camera, mirror):
+        report = record(load_rig("section-vi-lively"), camera, mirror, path, estimators=["o3"], exposures=4)
+    assert (report.ended, report.exposures, report.virtual_time) == ("complete", 4, False)
+    assert report.steps_applied + report.steps_parked == 800
+    assert len(report.latencies) == 4
+    for latency in report.latencies:
+        assert 0 < latency.first_byte_ns <= latency.complete_ns <= latency.estimated_ns
+    exposures = list(Recording(path).exposures())
+    assert [e.frame_id for e in exposures] == [1, 2, 3, 4]
+    for exposure in exposures:
+        assert exposure.host_receive_ns > exposure.host_start_ns
+        assert 0 < exposure.clock_sigma_ns < 10_000_000
+    recording = Recording(path)
+    assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"])["o3"]) is None
+
+
+def test_the_demo_does_the_main_job(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
+    result = aolink("demo", "--rig", "section-vi-lively", "--exposures", "20", "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    (folder,) = tmp_path.glob("demo-*")
+    assert {"session.mcap", "session.rrd"} <= {file.name for file in folder.iterdir()}
+    assert "agree bit for bit" in result.stdout
+    for word in ("open-loop", "o1", "o2", "o3", "RMSE path", "NEES end", "20 received", "n/a on virtual time"):
+        assert word in result.stdout
+    if not (folder / "session.png").exists():
+        assert "picture   none: " in result.stdout
+
+
+@pytest.mark.parametrize("arguments", [["--exposures", "3"], ["--duration", "0.5"]])
+def test_by_hand(aolink: Callable[..., subprocess.CompletedProcess[str]], arguments: list[str]) -> None:
+    with simulated_rig("section-vi") as (camera, mirror):
+        listed = aolink("devices", camera, mirror)
+        assert f"{camera}: camera section-vi" in listed.stdout
+        assert "1 inputs" in listed.stdout
+        result = aolink(
+            "record", "--camera", camera, "--mirror", mirror, "--rig", "section-vi", "--estimator", "o3", *arguments,
+            "--note", "by hand", "-o", "a.mcap",
+        )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert "a.mcap: 3 exposures, complete" in result.stdout
+    info = aolink("info", "a.mcap")
+    assert "by hand" in info.stdout
+    assert "/camera/image 3" in info.stdout
+    estimated = aolink("estimate", "a.mcap", "--estimator", "o3", "--estimator", "o1", "-o", "b.mcap")
+    assert "o3: the same as recorded, bit for bit" in estimated.stdout
+    assert aolink("view", "b.mcap", "--save", "b.rrd").returncode == 0
