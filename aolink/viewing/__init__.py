@@ -1,0 +1,10 @@
+"""What a session looks like: Rerun files, their layout, and the viewer.
+
+Each topic has a function that turns a batch of plain data into Rerun entities on a given stream; `save_rrd`
+calls them with a whole recording.
+"""
+
+from aolink.viewing.save import save_rrd, send_recording
+from aolink.viewing.viewer import open_viewer, screenshot, serve_web
+
+__all__ = ["open_viewer", "save_rrd", "screenshot", "send_recording", "serve_web"]

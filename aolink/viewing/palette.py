@@ -1,0 +1,65 @@
+"""One colour and one name for each quantity, in every view."""
+
+from __future__ import annotations
+
+import zlib
+
+Colour = tuple[int, int, int]
+
+TRUTH: Colour = (245, 200, 40)
+MEASURED: Colour = (165, 165, 165)
+COMMANDED: Colour = (150, 150, 255)
+APPLIED: Colour = (40, 200, 180)
+MISSING: Colour = (90, 20, 40)
+"""A pixel or a frame that never came."""
+
+ESTIMATORS: dict[str, Colour] = {
+    "open-loop": (204, 121, 167),
+    "o1": (86, 180, 233),
+    "o2": (120, 130, 255),
+    "o3": (240, 110, 50),
+    "moments": (0, 175, 125),
+    "profile": (140, 210, 80),
+    "mixture": (240, 80, 140),
+    "sampled": (190, 130, 80),
+}
+"""In the order of rank: the last one in a recording is what a user wants to look at first."""
+
+_OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120), (255, 160, 160), (140, 180, 255))
+_SERIES: tuple[Colour, ...] = (
+    (86, 180, 233),
+    (240, 110, 50),
+    (0, 175, 125),
+    (204, 121, 167),
+    (240, 228, 100),
+    (190, 130, 80),
+)
+
+STATUS_COLOURS: dict[str, Colour] = {
+    "OK": (45, 110, 75),
+    "PREDICTED": (80, 80, 100),
+    "GATED": (190, 140, 30),
+    "DIVERGED": (190, 50, 50),
+    "REINITIALISED": (150, 80, 170),
+    "INPUT_INVALID": (120, 60, 60),
+    "COMMAND": (45, 110, 75),
+    "PARKED": (80, 80, 100),
+    "CLIPPED": (190, 50, 50),
+}
+"""Of an estimate's status and of what drove the mirror."""
+
+
+def estimator_colour(name: str) -> Colour:
+    """Colour of an estimator; one that aolink does not know gets one by its name, the same each time."""
+    return ESTIMATORS.get(name) or _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
+
+
+def series_colour(index: int) -> Colour:
+    """Colour of the ``index``-th of several lines that belong to no estimator."""
+    return _SERIES[index % len(_SERIES)]
+
+
+def by_rank(names: list[str]) -> list[str]:
+    """Estimators from the plainest to the one to look at first; those that aolink does not know come last."""
+    order = list(ESTIMATORS)
+    return sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))

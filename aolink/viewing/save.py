@@ -1,0 +1,157 @@
+"""A whole recording as a Rerun file, with its layout inside."""
+
+from __future__ import annotations
+
+import os
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import rerun as rr
+
+from aolink.errors import ViewerError
+from aolink.estimation.estimate import Estimate
+from aolink.estimation.score import score
+from aolink.exposure import Exposure
+from aolink.viewing import camera, devices, motion
+from aolink.viewing.blueprint import Contents, blueprint
+from aolink.viewing.palette import by_rank
+from aolink.viewing.timebase import Timebase
+
+if TYPE_CHECKING:
+    from aolink.recording.reader import Recording
+
+APPLICATION = "aolink"
+"""Rerun keeps a user's own layouts by this name."""
+
+
+def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False) -> Path:
+    """Write a recording as an .rrd file that any Rerun viewer opens with aolink's layout.
+
+    Parameters
+    ----------
+    recording:
+        What `aolink.read` gives.
+    path:
+        The file to write; it appears only when it is whole.
+    overwrite:
+        Whether a file of that name may be replaced.
+
+    Raises
+    ------
+    ViewerError
+        The file exists already or cannot be written, or the recording has nothing to show.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise ViewerError(f"{path} exists already: give another name, or say that it may be overwritten")
+    partial = path.with_name(path.name + ".partial")
+    stream = rr.RecordingStream(APPLICATION)
+    try:
+        try:
+            partial.touch()
+            stream.save(partial)
+            contents = send_recording(stream, recording)
+            stream.send_blueprint(blueprint(contents), make_active=False, make_default=True)
+            stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
+        finally:
+            stream.disconnect()
+        os.replace(partial, path)
+    except OSError as error:
+        raise ViewerError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents:
+    """Send everything in a recording to a stream; tells what there was, for the layout."""
+    rig = recording.rig
+    exposures = list(recording.exposures())
+    timebase = Timebase.of(rig, exposures)
+    truths = {e.frame_id: e.truth for e in exposures if e.truth is not None}
+    names = by_rank(list(recording.estimators))
+    estimates = {name: recording.estimates(name) for name in names}
+
+    _send_camera(stream, recording, timebase, exposures, estimates)
+    motion.log_truth(stream, timebase, exposures)
+    for sequence in estimates.values():
+        motion.log_estimates(stream, timebase, sequence)
+        motion.log_errors(stream, timebase, sequence, truths)
+    found = _send_devices(stream, recording, timebase)
+    stream.log(
+        "session", rr.TextDocument(_summary(recording, exposures, estimates), media_type="text/markdown"), static=True
+    )
+    return Contents(
+        rig=rig,
+        estimators=names,
+        measuring=[name for name, sequence in estimates.items() if any(e.innovation.shape[1] for e in sequence)],
+        truth=bool(truths),
+        commands=bool(found & {"/mirror/command", "/mirror/applied"}),
+        clock="/clock" in found,
+        link="/link" in found,
+        latency="/latency" in found,
+        log="/log" in found,
+    )
+
+
+def _send_camera(
+    stream: rr.RecordingStream,
+    recording: Recording,
+    timebase: Timebase,
+    exposures: list[Exposure],
+    estimates: dict[str, list[Estimate]],
+) -> None:
+    rig = recording.rig
+    paths = {name: {e.frame_id: e.path[0] for e in sequence} for name, sequence in estimates.items()}
+    true_paths = {e.frame_id: e.truth.path[0] for e in exposures if e.truth is not None}
+    top = camera.density_top(rig.sensor, exposures)
+    camera.log_frames(stream, timebase, exposures)
+    camera.log_history(stream, rig.sensor, timebase, exposures, {"truth": true_paths, **paths}, top)
+    camera.log_profile_axes(stream, rig.sensor, top)
+    camera.log_measured_profile(stream, rig.sensor, timebase, exposures, top)
+    for name, by_frame in {"truth": true_paths, **paths}.items():
+        camera.log_predicted_profile(stream, rig.sensor, timebase, exposures, name, by_frame, top)
+
+
+def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> set[str]:
+    """Send what does not come from exposures and estimates; the topics that had messages."""
+    topics = ("/mirror/command", "/mirror/applied", "/camera/exposure", "/latency", "/link", "/clock", "/log")
+    records = sorted(recording.messages(*topics), key=lambda r: r.topic)
+    by_topic: dict[str, list[Any]] = {topic: list(group) for topic, group in groupby(records, key=lambda r: r.topic)}
+    for topic, log in (
+        ("/mirror/command", devices.log_commands),
+        ("/mirror/applied", devices.log_applied),
+        ("/camera/exposure", devices.log_drops),
+        ("/latency", devices.log_latency),
+    ):
+        log(stream, timebase, [r.message for r in by_topic.get(topic, [])])
+    devices.log_link(stream, timebase, by_topic.get("/link", []))
+    devices.log_clock(stream, timebase, by_topic.get("/clock", []))
+    devices.log_log(stream, timebase, by_topic.get("/log", []))
+    return set(by_topic)
+
+
+def _summary(recording: Recording, exposures: list[Exposure], estimates: dict[str, list[Estimate]]) -> str:
+    """What a session was and, where the truth is known, who was right: a page of Markdown."""
+    rig = recording.rig
+    steps = rig.timing.exposure_steps
+    frames = exposures[-1].frame_id - exposures[0].frame_id + 1
+    lines = [
+        f"## {rig.name}",
+        f"{len(exposures)} exposures of {steps} fast steps, {steps * rig.timing.fast_step_s:g} s each;"
+        f" {frames - len(exposures)} frames lost.",
+        "",
+        "| estimator | path RMSE (slope units) | end state | NIS (95 % bounds) |",
+        "| --- | --- | --- | --- |",
+    ]
+    by_frame = {e.frame_id: e for e in exposures}
+    for name, sequence in estimates.items():
+        known = [e for e in sequence if e.frame_id in by_frame]
+        result = score([by_frame[e.frame_id] for e in known], known)
+        path, end = (f"{x:.4f}" if result.exposures else "truth unknown" for x in (result.path_rmse, result.end_rmse))
+        nis = result.nis
+        shown = "" if np.isnan(nis.mean) else f"{nis.mean:.2f} ({nis.low:.2f} to {nis.high:.2f})"
+        lines.append(f"| {name} | {path} | {end} | {shown} |")
+    return "\n".join([*lines, "", rig.summary])

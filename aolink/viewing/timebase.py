@@ -1,0 +1,100 @@
+"""The three timelines of every view: fast step, device time and frame number.
+
+Fast steps are what the devices count, so device time and frame number follow from them exactly; what
+only has a host time (the log, the link) comes to device time by the exposures' own pairs of both. Device
+time is a timestamp: a device that counts from its power-up begins in 1970.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import ArrayLike, NDArray
+
+from aolink.errors import ViewerError
+from aolink.exposure import Exposure
+from aolink.rig import Rig
+
+FAST_STEP = "fast_step"
+DEVICE_TIME = "device_time"
+FRAME = "frame"
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Timebase:
+    """How fast steps, device time, frames and host time go together in one session."""
+
+    fast_step_ns: int
+    frame_period_steps: int
+    first_step: int
+    """First fast step of the exposure that the others are counted from."""
+    frame_id: int
+    """Its frame."""
+    device_ns: IntArray
+    """Starts of exposures on the device's clock, ns, (n,)."""
+    host_ns: IntArray
+    """The same starts on the host's clock, ns, (n,)."""
+
+    @classmethod
+    def of(cls, rig: Rig, exposures: Sequence[Exposure]) -> Timebase:
+        """The timebase of a session, from its exposures in order. Raises `ViewerError` where there is none."""
+        if not exposures:
+            raise ViewerError(
+                "there is no exposure in this recording, so nothing to view; `aolink info` says what it holds"
+            )
+        return cls(
+            fast_step_ns=rig.timing.fast_step_ns,
+            frame_period_steps=rig.timing.frame_period_steps,
+            first_step=exposures[0].first_step,
+            frame_id=exposures[0].frame_id,
+            device_ns=np.array([e.device_start_ns for e in exposures], dtype=np.int64),
+            host_ns=np.array([e.host_start_ns for e in exposures], dtype=np.int64),
+        )
+
+    def device_of_step(self, steps: ArrayLike) -> IntArray:
+        """Device time at which a fast step begins, ns."""
+        device: IntArray = self.device_ns[0] + (np.asarray(steps, dtype=np.int64) - self.first_step) * self.fast_step_ns
+        return device
+
+    def frame_of_step(self, steps: ArrayLike) -> IntArray:
+        """The newest frame whose exposure had begun at a fast step."""
+        since: IntArray = (np.asarray(steps, dtype=np.int64) - self.first_step) // self.frame_period_steps
+        return self.frame_id + since
+
+    def device_of_host(self, host_ns: ArrayLike) -> IntArray:
+        """Device time for a host time, ns: the difference of the clocks is interpolated, and held beyond the ends."""
+        since = np.asarray(host_ns, dtype=np.int64) - self.host_ns[0]
+        gained = (self.device_ns - self.device_ns[0]) - (self.host_ns - self.host_ns[0])
+        ahead = np.interp(since.astype(np.float64), self.host_ns - self.host_ns[0], gained)
+        device: IntArray = self.device_ns[0] + since + np.rint(ahead).astype(np.int64)
+        return device
+
+    def every_step(self, steps: ArrayLike) -> list[rr.TimeColumn]:
+        """Columns for values at fast steps; they have no frame number, or a frame's 200 would share one place."""
+        steps = np.asarray(steps, dtype=np.int64)
+        return [_sequence(FAST_STEP, steps), _timestamp(self.device_of_step(steps))]
+
+    def at_steps(self, steps: ArrayLike, frames: ArrayLike | None = None) -> list[rr.TimeColumn]:
+        """Columns on all three timelines for values that come once a frame."""
+        frames = self.frame_of_step(steps) if frames is None else np.asarray(frames, dtype=np.int64)
+        return [*self.every_step(steps), _sequence(FRAME, frames)]
+
+    def at_host(self, host_ns: ArrayLike) -> list[rr.TimeColumn]:
+        """Columns on all three timelines for values that only have a host time."""
+        device = self.device_of_host(host_ns)
+        steps = self.first_step + (device - self.device_ns[0]) // self.fast_step_ns
+        return [_sequence(FAST_STEP, steps), _timestamp(device), _sequence(FRAME, self.frame_of_step(steps))]
+
+
+def _sequence(name: str, values: Any) -> rr.TimeColumn:
+    return rr.TimeColumn(name, sequence=values)
+
+
+def _timestamp(nanoseconds: IntArray) -> rr.TimeColumn:
+    return rr.TimeColumn(DEVICE_TIME, timestamp=nanoseconds.astype("datetime64[ns]"))

@@ -1,0 +1,289 @@
+"""The Rerun viewer as a process: on the screen, in a browser, or unseen for a picture.
+
+All of them listen on the loopback interface only (Rerun's own default is every interface), and none outlives
+the call that started it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+from urllib.parse import quote
+
+import numpy as np
+import rerun_cli  # type: ignore[import-untyped] # it has only its program
+from numpy.typing import NDArray
+from PIL import Image
+from rerun.experimental import ViewerClient
+
+from aolink.errors import ViewerError
+from aolink.viewing.timebase import FAST_STEP
+
+HOST = "127.0.0.1"
+PICTURE_SIZE = (1920, 1200)
+"""Of a screenshot, pixels."""
+
+_START_S = 30.0
+"""How long a viewer may take to answer; a software renderer on a busy machine needs a few seconds."""
+_SETTLE_S = 60.0
+"""How long its picture may take to stop changing."""
+_STOP_S = 5.0
+"""How long it may take to end by itself."""
+_EQUAL = 3
+"""Pictures in a row that must be equal: views appear one by one while their data is loaded."""
+_POLL_S = 0.05
+_CORNER = 40
+"""Pixels that hold the rounded corners of its window."""
+_LEAST_COLOURS = 50
+"""A picture with fewer is blank: an empty viewer has about a dozen."""
+
+_NO_DRIVER = (
+    "this machine cannot render: Rerun found no Vulkan driver;"
+    " on Debian: apt-get install mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri"
+)
+
+
+def screenshot(
+    rrd_path: str | Path, png_path: str | Path, *, step: int | None = None, size: tuple[int, int] = PICTURE_SIZE
+) -> Path:
+    """Take a picture of the viewer with a file in it; no display is needed.
+
+    Parameters
+    ----------
+    rrd_path:
+        A file of `save_rrd`.
+    png_path:
+        The picture to write; an older one is replaced.
+    step:
+        Fast step on which the time cursor stands; by default well inside the session.
+    size:
+        Width and height, pixels.
+
+    Raises
+    ------
+    ViewerError
+        The machine cannot render (the message names the packages it lacks), or nothing was shown.
+    """
+    png_path = Path(png_path)
+    with headless_viewer(rrd_path, step=step, size=size) as client:
+        picture = settled_picture(client)
+    # Headless too, the viewer keeps the place of its title bar free.
+    inside = picture[:, _CORNER:-_CORNER]
+    title_bar = int(np.argmax((inside != inside[:, :1]).any(axis=(1, 2))))
+    try:
+        Image.fromarray(picture[title_bar:]).save(png_path, format="PNG")
+    except OSError as error:
+        raise ViewerError(f"cannot write {png_path}: {(error.strerror or str(error)).lower()}") from None
+    return png_path
+
+
+@contextmanager
+def headless_viewer(
+    rrd_path: str | Path, *, step: int | None = None, size: tuple[int, int] = PICTURE_SIZE
+) -> Iterator[ViewerClient]:
+    """A viewer without a window that has a file open and stands at a fast step; it ends with the block."""
+    path = _existing(rrd_path)
+    port = free_port()
+    options = ["--headless", "--port", str(port), "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
+    with tempfile.TemporaryFile() as said, _rerun(options, said) as process:
+        client = _connected(process, port, said)
+        try:
+            client.open(str(path))
+            _until_loaded(client)
+            client.run_command("ui.toggle_top_panel")
+            client.set_time(FAST_STEP, sequence=_step_inside(client) if step is None else step, play_state="paused")
+        except (RuntimeError, ConnectionError) as error:
+            raise ViewerError(f"the viewer cannot show {path}: {_one_line(error)}") from None
+        yield client
+
+
+def settled_picture(client: ViewerClient, view_id: str | None = None) -> NDArray[np.uint8]:
+    """Picture of the whole viewer, or of one view, once it has stopped changing, (rows, columns, 3).
+
+    Raises `ViewerError` if it is blank.
+    """
+    deadline = time.monotonic() + _SETTLE_S
+    last, equal = b"", 0
+    while equal < _EQUAL:
+        if time.monotonic() > deadline:
+            raise ViewerError(f"the viewer's picture did not come to rest within {_SETTLE_S:g} s")
+        try:
+            picture = client.take_screenshot(view_id)
+        except (RuntimeError, ConnectionError) as error:
+            raise ViewerError(f"the viewer gave no picture: {_one_line(error)}") from None
+        equal = equal + 1 if picture == last else 1
+        last = picture
+    pixels = np.asarray(Image.open(io.BytesIO(last)).convert("RGB"))
+    if len(np.unique(pixels.reshape(-1, 3), axis=0)) < _LEAST_COLOURS:
+        raise ViewerError("the viewer's picture is blank: the machine renders nothing")
+    return pixels
+
+
+def open_viewer(rrd_path: str | Path) -> None:
+    """Open the native viewer and wait until its window is closed. Raises `ViewerError` where there is no display."""
+    path = _existing(rrd_path)
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
+    with tempfile.TemporaryFile() as said, _rerun([str(path), "--port", "auto"], said) as process:
+        if process.wait() != 0:
+            raise ViewerError(_why_it_ended(said))
+
+
+def serve_web(rrd_path: str | Path, port: int = 9090, *, on_ready: Callable[[str], None] | None = None) -> None:
+    """Serve a file with the web viewer on this machine's loopback until interrupted.
+
+    Parameters
+    ----------
+    port:
+        Of the page; the data goes over a second, free one.
+    on_ready:
+        Called once with the address to open.
+    """
+    path = _existing(rrd_path)
+    if not _is_free(port):
+        raise ViewerError(f"port {port} is in use: stop what uses it or choose another one")
+    data_port = free_port()
+    options = [str(path), "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
+    with tempfile.TemporaryFile() as said, _rerun(options, said) as process:
+        for listening in (port, data_port):
+            _wait_for(lambda p=listening: not _is_free(p), process, said)  # type: ignore[misc]
+        if on_ready is not None:
+            on_ready(f"http://{HOST}:{port}/?url={quote(f'rerun+http://{HOST}:{data_port}/proxy', safe='')}")
+        if process.wait() != 0:
+            raise ViewerError(_why_it_ended(said))
+
+
+def free_port() -> int:
+    """A port on which nobody listens."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def _rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
+    """Rerun's program, ended with the block."""
+    process = subprocess.Popen(
+        [str(_program()), "--bind", HOST, *options],
+        stdin=subprocess.DEVNULL,
+        stdout=said,
+        stderr=said,
+        env={**os.environ, "NO_COLOR": "1"},
+        start_new_session=True,  # Ctrl-C comes to us alone, and we end it
+        preexec_fn=_end_with_parent,
+    )
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _program() -> Path:
+    """The program itself: the `rerun` command is a wrapper whose child outlives it."""
+    folder = Path(rerun_cli.__file__).parent
+    for name in ("rerun", "Rerun.app/Contents/MacOS/Rerun"):
+        if (folder / name).is_file():
+            return folder / name
+    raise ViewerError("the Rerun viewer is missing: install rerun-sdk again")
+
+
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
+
+
+def _end_with_parent() -> None:
+    """In the child: end when the parent does, however that comes about. Linux only."""
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def _connected(process: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> ViewerClient:
+    """A client of a viewer, once that answers."""
+    clients: list[ViewerClient] = []
+
+    def answers() -> bool:
+        # A connection to a port on which nobody listens yet may block for seconds.
+        if _is_free(port):
+            return False
+        try:
+            client = ViewerClient.connect(f"rerun+http://{HOST}:{port}/proxy")
+            client.get_state()
+        except (RuntimeError, ConnectionError):
+            return False
+        clients.append(client)
+        return True
+
+    _wait_for(answers, process, said)
+    return clients[0]
+
+
+def _wait_for(ready: Callable[[], bool], process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
+    deadline = time.monotonic() + _START_S
+    while not ready():
+        if process.poll() is not None:
+            raise ViewerError(_why_it_ended(said))
+        if time.monotonic() > deadline:
+            raise ViewerError(f"Rerun did not answer within {_START_S:g} s")
+        time.sleep(_POLL_S)
+
+
+def _until_loaded(client: ViewerClient) -> None:
+    deadline = time.monotonic() + _SETTLE_S
+    while True:
+        state = client.get_state()
+        if not state.loading and any(t.name == FAST_STEP for r in state.recordings for t in r.timelines):
+            return
+        if time.monotonic() > deadline:
+            raise ViewerError("the viewer shows no recording with fast steps: give a file that aolink wrote")
+        time.sleep(_POLL_S)
+
+
+def _step_inside(client: ViewerClient) -> int:
+    """A fast step at which everything has begun and nothing has ended."""
+    timelines = [t for r in client.get_state().recordings for t in r.timelines if t.name == FAST_STEP]
+    start, end = timelines[0].start or 0, timelines[0].end or 0
+    return start + round(0.6 * (end - start))
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex((HOST, port)) != 0
+
+
+def _existing(path: str | Path) -> Path:
+    path = Path(path)
+    if not path.is_file():
+        raise ViewerError(f"there is no file {path}: `aolink view RECORDING --save FILE.rrd` writes one")
+    return path.resolve()
+
+
+def _why_it_ended(said: IO[bytes]) -> str:
+    """One sentence from what Rerun said before it ended."""
+    said.seek(0)
+    text = said.read().decode(errors="replace")
+    if any(sign in text for sign in ("No graphics adapter", "Failed to get render context", "create render state")):
+        return _NO_DRIVER
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    causes = [line for line in lines if "panicked at" in line or "ERROR" in line or line.startswith("Error")]
+    return f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why"
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,281 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rrd import read_blueprint, read_rrd, scalars
+from scipy import stats
+from stand_in import DEVICE_ZERO_NS, MEASUREMENTS, StandIn
+
+from aolink.errors import ViewerError
+from aolink.viewing import save_rrd
+from aolink.viewing.camera import HISTORY
+from aolink.viewing.motion import log_estimates, nis_bounds
+from aolink.viewing.palette import MISSING, TRUTH, estimator_colour
+from aolink.viewing.timebase import Timebase
+
+N = 200
+LOST = 3
+
+
+@pytest.fixture(scope="module")
+def recording() -> StandIn:
+    return StandIn(n=12, lost=(LOST,))
+
+
+@pytest.fixture(scope="module")
+def saved(recording: StandIn, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_rrd(recording, tmp_path_factory.mktemp("rrd") / "session.rrd")
+
+
+@pytest.fixture(scope="module")
+def entities(saved: Path) -> dict:
+    return read_rrd(saved)
+
+
+def dense(recording: StandIn, rows: dict[int, np.ndarray]) -> np.ndarray:
+    """Rows of 200 by first step, as one row a step; absent steps are left out."""
+    return np.concatenate([rows[e.first_step] for e in recording.exposures()])
+
+
+def without_breaks(values: np.ndarray) -> np.ndarray:
+    return values[~np.isnan(values).any(axis=1)]
+
+
+def test_rerun_finds_no_fault_in_the_file(saved: Path) -> None:
+    done = subprocess.run([sys.executable, "-m", "rerun_cli", "rrd", "verify", str(saved)], capture_output=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", sorted(MEASUREMENTS))
+def test_path_and_band_are_the_estimates(recording: StandIn, entities: dict, name: str) -> None:
+    estimates = recording.estimates(name)
+    mean = np.concatenate([e.path[0] for e in estimates])
+    sd = np.concatenate([e.path_sd[0] for e in estimates])
+    np.testing.assert_array_equal(without_breaks(scalars(entities[f"/path/{name}/mean"]))[:, 0], mean)
+    band = without_breaks(scalars(entities[f"/path/{name}/band"]))
+    np.testing.assert_allclose(band, np.stack([mean + 2 * sd, mean - 2 * sd], axis=1), rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", sorted(MEASUREMENTS))
+def test_errors_are_estimate_minus_truth(recording: StandIn, entities: dict, name: str) -> None:
+    pairs = list(zip(recording.estimates(name), recording.exposures(), strict=True))
+    error = [estimate.path[0] - exposure.truth.path[0] for estimate, exposure in pairs]
+    np.testing.assert_allclose(
+        without_breaks(scalars(entities[f"/error/path/{name}"]))[:, 0], np.concatenate(error), atol=1e-15
+    )
+    rms = scalars(entities[f"/error/path_rms/{name}"])[:, 0]
+    np.testing.assert_allclose(rms, [np.linalg.norm(e) / np.sqrt(N) for e in error])
+    for i in range(2):
+        end = [estimate.end_state[0, i] - exposure.truth.end_state[0, i] for estimate, exposure in pairs]
+        np.testing.assert_allclose(scalars(entities[f"/error/end/x{i + 1}/{name}"])[:, 0], end, atol=1e-15)
+
+
+def test_a_path_is_at_its_own_fast_steps_and_device_times(recording: StandIn, entities: dict) -> None:
+    truth = entities["/path/truth"]
+    steps = np.array(truth["fast_step"])
+    np.testing.assert_array_equal(np.array(truth["device_time"]), DEVICE_ZERO_NS + steps * 1_000_000)
+    known = ~np.isnan(scalars(truth)[:, 0])
+    np.testing.assert_array_equal(scalars(truth)[known, 0], recording.spot[steps[known]])
+    assert "frame" not in truth
+
+
+def test_a_lost_frame_breaks_the_lines(entities: dict) -> None:
+    truth = entities["/path/truth"]
+    (gap,) = np.flatnonzero(np.isnan(scalars(truth)[:, 0]))
+    assert truth["fast_step"][gap - 1 : gap + 2] == [LOST * N - 1, LOST * N, (LOST + 1) * N]
+
+
+def test_states_stand_where_they_hold(recording: StandIn, entities: dict) -> None:
+    estimates = recording.estimates("o3")
+    for where, states, steps in (
+        ("start", [e.start_state for e in estimates], [e.first_step for e in estimates]),
+        ("end", [e.end_state for e in estimates], [e.first_step + N for e in estimates]),
+    ):
+        for i in range(2):
+            entity = entities[f"/state/{where}/x{i + 1}/o3/mean"]
+            np.testing.assert_array_equal(scalars(entity)[:, 0], [s[0, i] for s in states])
+            assert entity["fast_step"] == steps
+            assert entity["frame"] == recording.frame_ids
+    band = scalars(entities["/state/end/x2/o3/band"])
+    np.testing.assert_allclose(band[:, 0] - band[:, 1], 4 * np.sqrt(0.04))
+
+
+@pytest.mark.parametrize(("name", "degrees"), [("o1", 1), ("o3", 2)])
+def test_nis_and_its_bounds(recording: StandIn, entities: dict, name: str, degrees: int) -> None:
+    np.testing.assert_array_equal(
+        scalars(entities[f"/nis/{name}/value"])[:, 0], [e.nis[0] for e in recording.estimates(name)]
+    )
+    low, high = nis_bounds(degrees)
+    assert stats.chi2.cdf(high, degrees) - stats.chi2.cdf(low, degrees) == pytest.approx(0.95)
+    np.testing.assert_array_equal(scalars(entities[f"/nis/{name}/bounds"]), [[low, high]] * 11)
+
+
+def test_an_estimator_that_does_not_measure_has_no_nis(entities: dict) -> None:
+    assert not [path for path in entities if path.startswith("/nis/open-loop")]
+    assert set(map(tuple, entities["/status/open-loop"]["StateChange:state"])) == {("PREDICTED",)}
+
+
+def test_frames_are_the_counts_that_came(recording: StandIn, entities: dict) -> None:
+    frames = entities["/camera/image"]
+    for buffer, exposure in zip(frames["Image:buffer"], recording.exposures(), strict=False):
+        np.testing.assert_array_equal(np.array(buffer[0], dtype=np.uint8).view("<u2"), exposure.pixels.ravel())
+    assert frames["frame"] == recording.frame_ids
+
+
+def test_the_newest_exposure_is_the_last_row_and_what_never_came_is_marked(entities: dict) -> None:
+    buffers = entities["/camera/history"]["Image:buffer"]
+    pictures = {
+        frame: np.array(buffer[0], dtype=np.uint8).reshape(HISTORY, 40, 3)
+        for frame, buffer in zip(entities["/camera/history"]["frame"], buffers, strict=True)
+    }
+    np.testing.assert_array_equal(pictures[6][-2], pictures[5][-1])
+    assert (pictures[5][-1, 30:34] == MISSING).all()
+    assert (pictures[LOST + 1][-2] == MISSING).all()
+    assert not (pictures[4][-1] == MISSING).all(axis=1).any()
+
+
+def test_a_path_runs_down_its_own_row(recording: StandIn, entities: dict) -> None:
+    strips = dict(
+        zip(
+            entities["/camera/history/path/truth"]["frame"],
+            entities["/camera/history/path/truth"]["LineStrips2D:strips"],
+            strict=True,
+        )
+    )
+    newest = np.array(strips[11][-1])
+    assert len(strips[11]) == 11
+    path = list(recording.exposures())[-1].truth.path[0]
+    np.testing.assert_allclose(newest[[0, -1], 0], (path[[0, -1]] + 1) / 0.05, rtol=1e-6)
+    assert HISTORY - 1 < newest[0, 1] < newest[-1, 1] < HISTORY
+
+
+def test_predicted_profile_has_unit_mass_about_the_path_it_came_from(recording: StandIn, entities: dict) -> None:
+    predicted = entities["/profile/predicted/o3"]["LineStrips2D:strips"]
+    measured = entities["/profile/measured"]["LineStrips2D:strips"]
+    (exposure, estimate) = next(zip(recording.exposures(), recording.estimates("o3"), strict=True))
+    stairs = np.array(measured[0][0])
+    counts = exposure.pixels.ravel()
+    scale = stairs[::2, 1][np.argmax(counts)] / ((counts.max() - 20000) / 2000)
+    np.testing.assert_allclose(stairs[::2, 1], scale * (counts - 20000.0) / 2000, atol=1e-5)
+    x, density = np.array(predicted[0][0]).T / [[1], [scale]]
+    assert density.sum() * 0.05 == pytest.approx(1, abs=1e-4)
+    assert (x * density).sum() * 0.05 == pytest.approx(estimate.path.mean(), abs=1e-3)
+
+
+def test_commands_and_what_was_applied(recording: StandIn, entities: dict) -> None:
+    steps = np.arange(12 * N)
+    sent, held = entities["/mirror/command"], entities["/mirror/applied"]
+    assert sent["fast_step"] == held["fast_step"] == steps.tolist()
+    expected = recording.rig.drive.inputs(0, 12 * N, 1e-3)
+    np.testing.assert_array_equal(scalars(sent), expected)
+    np.testing.assert_array_equal(scalars(held), np.round(expected, 4))
+    assert entities["/status/mirror"]["StateChange:state"] == [["COMMAND"], ["PARKED"], ["COMMAND"]]
+    assert entities["/status/mirror"]["fast_step"] == [0, 150, 200]
+
+
+def test_latency_counts_from_the_end_of_the_exposure(entities: dict) -> None:
+    np.testing.assert_allclose(scalars(entities["/latency/first_byte"]), 0.4)
+    np.testing.assert_allclose(scalars(entities["/latency/complete"]), 0.9)
+    assert "/latency/command_sent" not in entities  # it never happened
+
+
+def test_losses_add_up(entities: dict) -> None:
+    assert scalars(entities["/link/lost/frames"])[:, 0].tolist() == [0] * 3 + [1] * 8
+    assert scalars(entities["/link/lost/chunks"])[:, 0].tolist() == [0] * 4 + [1] * 7
+
+
+def test_link_and_clock(entities: dict) -> None:
+    np.testing.assert_allclose(scalars(entities["/link/received/mirror"])[:, 0], 180)
+    np.testing.assert_allclose(scalars(entities["/link/round_trip/camera"])[:, 0], 0.2)
+    np.testing.assert_allclose(scalars(entities["/clock/offset/camera"])[:, 0], [0, 20, 40])
+    np.testing.assert_allclose(scalars(entities["/clock/sigma/mirror"])[:, 0], [90, 45, 30])
+    assert entities["/clock/sigma/mirror"]["device_time"][1] - DEVICE_ZERO_NS == 10**9
+    assert entities["/clock/sigma/mirror"]["fast_step"] == [0, 1000, 2000]
+
+
+def test_the_log_keeps_its_levels(entities: dict) -> None:
+    assert entities["/log"]["TextLog:text"] == [["session: second 0"], ["session: second 1"], ["session: second 2"]]
+    assert entities["/log"]["TextLog:level"] == [["INFO"], ["WARN"], ["INFO"]]
+
+
+def test_a_quantity_has_one_colour_everywhere(entities: dict) -> None:
+    def colours(path: str) -> set[int]:
+        columns = [v for k, v in entities[path].items() if k.endswith(":colors")]
+        return {colour >> 8 for rows in columns for row in rows for colour in row or []}
+
+    for name, colour in (("truth", TRUTH), ("o3", estimator_colour("o3"))):
+        packed = {int.from_bytes(bytes(colour), "big")}
+        shown = [p for p in entities if name in p.split("/") and not p.startswith("/status")]
+        assert len(shown) >= 4
+        for path in shown:
+            assert colours(path) == packed, path
+
+
+def test_every_view_shows_entities_that_exist(saved: Path, entities: dict) -> None:
+    queries = [
+        expression
+        for view in read_blueprint(saved).values()
+        for row in view.get("ViewContents:query", [])
+        for expression in row
+    ]
+    exact = [q.removeprefix("+ ") for q in queries if "*" not in q and "$" not in q]
+    assert len(exact) > 30
+    assert [path for path in exact if not path.endswith("/axes") and path not in entities] == []
+
+
+def test_what_a_session_lacks_has_no_view(tmp_path: Path) -> None:
+    path = save_rrd(StandIn(n=4, with_truth=False, with_latency=False, names=()), tmp_path / "bare.rrd")
+    entities = read_rrd(path)
+    assert "/profile/measured" in entities
+    assert not [p for p in entities if p.startswith(("/error", "/path", "/nis", "/latency", "/state"))]
+    layout = str(read_blueprint(path))
+    assert "Mirror input " in layout
+    for absent in ("error", "NIS", "Latency", "state"):
+        assert f"{absent} " not in layout
+
+
+def test_many_axes_become_percentiles(tmp_path: Path) -> None:
+    axes = 1800
+    recording = StandIn(n=3, names=("o3",))
+    rng = np.random.default_rng(0)
+    estimates = [
+        replace(
+            e, path=rng.normal(size=(axes, N)), path_sd=np.ones((axes, N)), nis=rng.chisquare(2, size=axes),
+            start_state=rng.normal(size=(axes, 2)), start_covariance=np.tile(np.eye(2), (axes, 1, 1)),
+            end_state=rng.normal(size=(axes, 2)), end_covariance=np.tile(np.eye(2), (axes, 1, 1)),
+        )
+        for e in recording.estimates("o3")
+    ]  # fmt: skip
+    path = tmp_path / "many.rrd"
+    with rr.RecordingStream("test") as stream:
+        stream.save(path)
+        log_estimates(stream, Timebase.of(recording.rig, list(recording.exposures())), estimates)
+    entities = read_rrd(path)
+    assert len(entities) < 30
+    values = np.concatenate([e.path for e in estimates], axis=1)
+    np.testing.assert_array_equal(scalars(entities["/path/o3/mean"])[:, 0], values[0])
+    np.testing.assert_allclose(scalars(entities["/path/o3/mean/axes"]), np.percentile(values, [5, 50, 95], axis=0).T)
+
+
+def test_an_existing_file_is_only_replaced_when_told_to(tmp_path: Path) -> None:
+    path = tmp_path / "session.rrd"
+    path.write_text("precious")
+    with pytest.raises(ViewerError, match="exists already"):
+        save_rrd(StandIn(n=2), path)
+    assert path.read_text() == "precious"
+    save_rrd(StandIn(n=2), path, overwrite=True)
+    assert "/path/truth" in read_rrd(path)
+
+
+def test_a_file_that_cannot_be_written_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(ViewerError, match=r"cannot write .*no such file"):
+        save_rrd(StandIn(n=2), tmp_path / "absent" / "session.rrd")
+    with pytest.raises(ViewerError, match="no exposure"):
+        save_rrd(StandIn(n=0), tmp_path / "empty.rrd")
+    assert list(tmp_path.iterdir()) == []

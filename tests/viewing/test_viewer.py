@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import io
+import os
+import socket
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from PIL import Image
+from stand_in import StandIn
+
+from aolink.errors import ViewerError
+from aolink.viewing import open_viewer, save_rrd, screenshot, serve_web
+from aolink.viewing.palette import TRUTH, estimator_colour
+from aolink.viewing.viewer import free_port, headless_viewer, settled_picture
+
+TEXTS = ("Session", "Log")
+PICTURES = ("Camera", "Intensity")
+
+
+@pytest.fixture(scope="module")
+def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_rrd(StandIn(n=60, names=("o3", "open-loop")), tmp_path_factory.mktemp("rrd") / "session.rrd")
+
+
+@pytest.fixture(autouse=True)
+def _no_viewer_left_behind() -> Iterator[None]:
+    before = set(psutil.Process().children(recursive=True))
+    yield
+    assert set(psutil.Process().children(recursive=True)) <= before
+
+
+def needs_a_renderer(error: ViewerError) -> None:
+    if "no Vulkan driver" in str(error) and not os.environ.get("AOLINK_REQUIRE_RENDER"):
+        pytest.skip(str(error))
+    raise error
+
+
+def pixels(png: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+
+def columns_with(picture: np.ndarray, colour: tuple[int, int, int]) -> float:
+    """Share of the picture's columns in which a colour appears."""
+    near = np.abs(picture.astype(int) - colour).max(axis=2) < 30
+    return float(near.any(axis=0).mean())
+
+
+def coloured_columns(picture: np.ndarray) -> float:
+    """Share of the picture's columns in which something is not grey: lines do it, frames and grids do not."""
+    return float((np.ptp(picture.astype(int), axis=2) > 40).any(axis=0).mean())
+
+
+def listening(*processes: psutil.Process) -> set[str]:
+    """Addresses on which they listen."""
+    connections = [c for process in processes for c in process.net_connections()]
+    return {c.laddr.ip for c in connections if c.status == psutil.CONN_LISTEN}
+
+
+def spread_tabs(layout: dict) -> dict:
+    """The layout with all tabs beside each other: the viewer draws only what is visible."""
+    for part in layout.values():
+        container = part.get("ContainerBlueprint", {})
+        if container.get("container_kind") == "Tabs":
+            container["container_kind"] = "Grid"
+            container.pop("active_tab", None)
+    return layout
+
+
+@pytest.mark.long
+def test_every_view_shows_data(rrd: Path) -> None:
+    try:
+        with headless_viewer(rrd) as client:
+            client.set_blueprint(spread_tabs(client.get_blueprint().blueprint), "recording")
+            settled_picture(client)
+            state = client.get_state()
+            pictures = {view.name: pixels(client.take_screenshot(view.view_id)) for view in state.views}
+            assert [view.name for view in state.views if view.reports] == []
+            assert [entry.message for entry in client.get_logs() if entry.level == "ERROR"] == []
+    except ViewerError as error:
+        needs_a_renderer(error)
+    assert len(pictures) > 20
+    for name, picture in pictures.items():
+        if name.startswith(TEXTS):
+            assert (picture.min(axis=2) > 120).mean() > 0.002, name
+        else:
+            # A legend alone colours less than a tenth of a view's columns.
+            assert coloured_columns(picture) > (0.15 if name.startswith(PICTURES) else 0.4), name
+    (path,) = (picture for name, picture in pictures.items() if name.startswith("Path, o3"))
+    assert columns_with(path, TRUTH) > 0.6
+    assert columns_with(path, estimator_colour("o3")) > 0.4
+
+
+@pytest.mark.long
+def test_a_screenshot_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
+    try:
+        screenshot(rrd, tmp_path / "session.png", size=(1600, 1000))
+    except ViewerError as error:
+        needs_a_renderer(error)
+    picture = pixels((tmp_path / "session.png").read_bytes())
+    rows, columns, _ = picture.shape
+    assert columns == 1600
+    assert 900 < rows < 1000  # without the empty title bar
+    assert coloured_columns(picture) > 0.8
+
+
+@pytest.mark.long
+def test_a_viewer_ends_with_its_block_whatever_happens_in_it(rrd: Path) -> None:
+    viewers: list[psutil.Process] = []
+
+    def interrupted() -> None:
+        with headless_viewer(rrd):
+            viewers.extend(psutil.Process().children(recursive=True))
+            assert listening(*viewers) == {"127.0.0.1"}
+            raise KeyboardInterrupt
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+    except ViewerError as error:
+        needs_a_renderer(error)
+    assert not viewers[0].is_running()
+
+
+def test_without_a_driver_the_error_names_the_packages(
+    rrd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WGPU_BACKEND", "dx12")  # one that a Linux machine never has
+    with pytest.raises(ViewerError, match="apt-get install mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri"):
+        screenshot(rrd, tmp_path / "session.png")
+    assert not (tmp_path / "session.png").exists()
+
+
+def test_a_missing_file_is_one_clear_error(tmp_path: Path) -> None:
+    for view in (open_viewer, serve_web, lambda path: screenshot(path, tmp_path / "x.png")):
+        with pytest.raises(ViewerError, match="there is no file"):
+            view(tmp_path / "absent.rrd")
+
+
+def test_without_a_display_the_error_says_what_else_works(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(ViewerError, match="--screenshot"):
+        open_viewer(rrd)
+
+
+def test_the_web_viewer_is_served_on_loopback_until_interrupted(rrd: Path) -> None:
+    port, seen = free_port(), []
+
+    def look(address: str) -> None:
+        with urllib.request.urlopen(address) as page:
+            seen.append(page.read())
+        seen.append(listening(*psutil.Process().children(recursive=True)))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        serve_web(rrd, port, on_ready=look)
+    assert b"<canvas" in seen[0]
+    assert seen[1] == {"127.0.0.1"}
+
+
+def test_a_port_in_use_is_one_clear_error(rrd: Path) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(ViewerError, match=f"port {port} is in use"):
+            serve_web(rrd, port)
