@@ -25,6 +25,8 @@ class Contents:
     """In rank order; the last is the one whose band is shown first."""
     measuring: list[str]
     """Those of them that have an innovation."""
+    density_top: float
+    """Of the intensity profile's plot, one over slope units."""
     truth: bool
     commands: bool
     clock: bool
@@ -66,7 +68,7 @@ def _history(contents: Contents) -> rrb.View:
 
 
 def _profile(contents: Contents) -> rrb.View:
-    x_range, y_range = profile_bounds(contents.rig.sensor)
+    x_range, y_range = profile_bounds(contents.rig.sensor, contents.density_top)
     return rrb.Spatial2DView(
         origin="profile",
         name="Intensity density (1/slope unit) over slope",

@@ -13,10 +13,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
-from aolink.optics.camera import to_density
+from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import Sensor
-from aolink.viewing.palette import MEASURED, MISSING, TRUTH, Colour, estimator_colour
+from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH, Colour, estimator_colour
 from aolink.viewing.timebase import Timebase
 
 FloatArray = NDArray[np.float64]
@@ -87,7 +87,8 @@ def log_history(
     rows[np.isnan(profiles)] = MISSING
     pictures = np.empty((len(exposures), HISTORY, n, 3), dtype=np.uint8)
     pictures[:] = MISSING
-    for j in range(len(exposures)):
+    for j, exposure in enumerate(exposures):
+        pictures[j, : max(0, HISTORY - 1 - (exposure.frame_id - exposures[0].frame_id))] = NOTHING
         for k, row in _visible(exposures, j):
             pictures[j, row] = rows[k]
     layout = rr.components.ImageFormat(width=n, height=HISTORY, color_model="RGB", channel_datatype="U8")
@@ -110,7 +111,8 @@ def log_profile_axes(stream: rr.RecordingStream, sensor: Sensor, top: float) -> 
     stream.log("profile/axes", rr.LineStrips2D(grid, colors=(90, 90, 90), radii=fine, draw_order=1.0), static=True)
     names = [f"{x:g}" for x in slopes] + [f"{y:g}" for y in heights[1:]]
     left = low - 0.05 * (high - low)
-    places = place([(x, -0.1 * top) for x in slopes] + [(left, y) for y in heights[1:]])
+    below = _depth(sensor, top)
+    places = place([(x, -below) for x in slopes] + [(left, y) for y in heights[1:]])
     numbers = rr.Points2D(places, labels=names, radii=rr.Radius.ui_points(0), colors=(140, 140, 140), show_labels=True)
     stream.log("profile/axes/numbers", numbers, static=True)
 
@@ -137,11 +139,17 @@ def log_predicted_profile(
     _send_strips(stream, f"profile/predicted/{name}", timebase, known, strips, colour_of(name), 1.5)
 
 
-def profile_bounds(sensor: Sensor) -> tuple[tuple[float, float], tuple[float, float]]:
+def profile_bounds(sensor: Sensor, top: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Range of the profile's plot in its drawing units: x, and y downwards."""
     low, high = sensor.field
     width = high - low
-    return (low - 0.1 * width, high + 0.05 * width), (-PROFILE_ASPECT * width * 1.06, PROFILE_ASPECT * width * 0.22)
+    unit = PROFILE_ASPECT * width / top
+    return (low - 0.1 * width, high + 0.05 * width), (-1.06 * top * unit, (_depth(sensor, top) + 0.14 * top) * unit)
+
+
+def _depth(sensor: Sensor, top: float) -> float:
+    """How far the noise reaches below zero: what is written under the plot goes there."""
+    return max(0.08 * top, 2.5 * pixel_noise_sd(sensor))
 
 
 def _profile_place(sensor: Sensor, top: float) -> Callable[[object], NDArray[np.float32]]:

@@ -12,6 +12,8 @@ COMMANDED: Colour = (150, 150, 255)
 APPLIED: Colour = (40, 200, 180)
 MISSING: Colour = (90, 20, 40)
 """A pixel or a frame that never came."""
+NOTHING: Colour = (13, 13, 13)
+"""Where there was no exposure yet: the viewer's own background."""
 
 ESTIMATORS: dict[str, Colour] = {
     "open-loop": (204, 121, 167),

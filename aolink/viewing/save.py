@@ -74,7 +74,7 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
     names = by_rank(list(recording.estimators))
     estimates = {name: recording.estimates(name) for name in names}
 
-    _send_camera(stream, recording, timebase, exposures, estimates)
+    top = _send_camera(stream, recording, timebase, exposures, estimates)
     motion.log_truth(stream, timebase, exposures)
     for sequence in estimates.values():
         motion.log_estimates(stream, timebase, sequence)
@@ -87,6 +87,7 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
         rig=rig,
         estimators=names,
         measuring=[name for name, sequence in estimates.items() if any(e.innovation.shape[1] for e in sequence)],
+        density_top=top,
         truth=bool(truths),
         commands=bool(found & {"/mirror/command", "/mirror/applied"}),
         clock="/clock" in found,
@@ -102,7 +103,8 @@ def _send_camera(
     timebase: Timebase,
     exposures: list[Exposure],
     estimates: dict[str, list[Estimate]],
-) -> None:
+) -> float:
+    """Send frames, history and profiles; the density at the top of the profile's plot."""
     rig = recording.rig
     paths = {name: {e.frame_id: e.path[0] for e in sequence} for name, sequence in estimates.items()}
     true_paths = {e.frame_id: e.truth.path[0] for e in exposures if e.truth is not None}
@@ -113,6 +115,7 @@ def _send_camera(
     camera.log_measured_profile(stream, rig.sensor, timebase, exposures, top)
     for name, by_frame in {"truth": true_paths, **paths}.items():
         camera.log_predicted_profile(stream, rig.sensor, timebase, exposures, name, by_frame, top)
+    return top
 
 
 def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> set[str]:

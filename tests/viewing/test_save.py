@@ -8,16 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from rrd import read_blueprint, read_rrd, scalars
 from scipy import stats
-from stand_in import DEVICE_ZERO_NS, MEASUREMENTS, StandIn
 
 from aolink.errors import ViewerError
+from aolink.recording.reader import Recording
 from aolink.viewing import save_rrd
 from aolink.viewing.camera import HISTORY
 from aolink.viewing.motion import log_estimates, nis_bounds
-from aolink.viewing.palette import MISSING, TRUTH, estimator_colour
+from aolink.viewing.palette import MISSING, NOTHING, TRUTH, estimator_colour
 from aolink.viewing.timebase import Timebase
+from tests.conftest import Session
+from tests.viewing.rrd import read_blueprint, read_rrd, scalars
+from tests.viewing.stand_in import DEVICE_ZERO_NS, MEASUREMENTS, StandIn
 
 N = 200
 LOST = 3
@@ -38,13 +40,35 @@ def entities(saved: Path) -> dict:
     return read_rrd(saved)
 
 
-def dense(recording: StandIn, rows: dict[int, np.ndarray]) -> np.ndarray:
-    """Rows of 200 by first step, as one row a step; absent steps are left out."""
-    return np.concatenate([rows[e.first_step] for e in recording.exposures()])
-
-
 def without_breaks(values: np.ndarray) -> np.ndarray:
     return values[~np.isnan(values).any(axis=1)]
+
+
+def absent_from_views(path: Path) -> list[str]:
+    """Entities that a view names and the file does not hold; percentiles are only there with many axes."""
+    entities = read_rrd(path)
+    queries = [
+        expression
+        for view in read_blueprint(path).values()
+        for row in view.get("ViewContents:query", [])
+        for expression in row
+    ]
+    exact = [q.removeprefix("+ ") for q in queries if "*" not in q and "$" not in q]
+    assert len(exact) > 30
+    return [name for name in exact if not name.endswith("/axes") and name not in entities]
+
+
+def test_a_recorded_session_shows_its_estimates(recorded: Session, tmp_path: Path) -> None:
+    recording = Recording(recorded.path)
+    path = save_rrd(recording, tmp_path / "session.rrd")
+    entities = read_rrd(path)
+    for name in recording.estimators:
+        shown = scalars(entities[f"/path/{name}/mean"])[:, 0]
+        np.testing.assert_array_equal(shown, np.concatenate([e.path[0] for e in recording.estimates(name)]))
+    truth = np.concatenate([e.truth.path[0] for e in recording.exposures()])
+    np.testing.assert_array_equal(scalars(entities["/path/truth"])[:, 0], truth)
+    assert entities["/camera/image"]["frame"] == [e.frame_id for e in recording.exposures()]
+    assert absent_from_views(path) == []
 
 
 def test_rerun_finds_no_fault_in_the_file(saved: Path) -> None:
@@ -138,6 +162,7 @@ def test_the_newest_exposure_is_the_last_row_and_what_never_came_is_marked(entit
     assert (pictures[5][-1, 30:34] == MISSING).all()
     assert (pictures[LOST + 1][-2] == MISSING).all()
     assert not (pictures[4][-1] == MISSING).all(axis=1).any()
+    assert (pictures[4][: HISTORY - 5] == NOTHING).all()
 
 
 def test_a_path_runs_down_its_own_row(recording: StandIn, entities: dict) -> None:
@@ -217,16 +242,8 @@ def test_a_quantity_has_one_colour_everywhere(entities: dict) -> None:
             assert colours(path) == packed, path
 
 
-def test_every_view_shows_entities_that_exist(saved: Path, entities: dict) -> None:
-    queries = [
-        expression
-        for view in read_blueprint(saved).values()
-        for row in view.get("ViewContents:query", [])
-        for expression in row
-    ]
-    exact = [q.removeprefix("+ ") for q in queries if "*" not in q and "$" not in q]
-    assert len(exact) > 30
-    assert [path for path in exact if not path.endswith("/axes") and path not in entities] == []
+def test_every_view_shows_entities_that_exist(saved: Path) -> None:
+    assert absent_from_views(saved) == []
 
 
 def test_what_a_session_lacks_has_no_view(tmp_path: Path) -> None:

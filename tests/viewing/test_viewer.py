@@ -11,12 +11,12 @@ import numpy as np
 import psutil
 import pytest
 from PIL import Image
-from stand_in import StandIn
 
 from aolink.errors import ViewerError
 from aolink.viewing import open_viewer, save_rrd, screenshot, serve_web
 from aolink.viewing.palette import TRUTH, estimator_colour
 from aolink.viewing.viewer import free_port, headless_viewer, settled_picture
+from tests.viewing.stand_in import StandIn
 
 TEXTS = ("Session", "Log")
 PICTURES = ("Camera", "Intensity")
