@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import warnings
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
 
 from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
@@ -57,6 +60,8 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
             stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
         finally:
             stream.disconnect()
+        if not _whole(partial):
+            raise ViewerError(f"cannot write {path}: Rerun could not finish the file; is the disk full?")
         os.replace(partial, path)
     except OSError as error:
         raise ViewerError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
@@ -95,6 +100,16 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
         latency="/latency" in found,
         log="/log" in found,
     )
+
+
+def _whole(path: Path) -> bool:
+    """Whether a file holds a layout and its footer, which come last: Rerun only logs it when a write fails."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RerunWarning)
+        try:
+            return bool(RrdReader(path).blueprints())
+        except (RuntimeError, RerunWarning):
+            return False
 
 
 def _send_camera(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -295,4 +296,15 @@ def test_a_file_that_cannot_be_written_is_one_clear_error_and_leaves_nothing(tmp
         save_rrd(StandIn(n=2), tmp_path / "absent" / "session.rrd")
     with pytest.raises(ViewerError, match="no exposure"):
         save_rrd(StandIn(n=0), tmp_path / "empty.rrd")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
+    try:
+        with pytest.raises(ViewerError, match="disk full"):
+            save_rrd(StandIn(n=12), tmp_path / "session.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
