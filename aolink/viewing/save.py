@@ -56,7 +56,8 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
             partial.touch()
             stream.save(partial)
             contents = send_recording(stream, recording)
-            stream.send_blueprint(blueprint(contents), make_active=False, make_default=True)
+            # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
+            stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
             stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
         finally:
             stream.disconnect()

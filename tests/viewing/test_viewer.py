@@ -3,6 +3,8 @@ from __future__ import annotations
 import io
 import os
 import socket
+import time
+import urllib.parse
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+import rerun as rr
 from PIL import Image
 
 from aolink.errors import ViewerError
@@ -161,6 +164,32 @@ def test_the_web_viewer_is_served_on_loopback_until_interrupted(rrd: Path) -> No
         serve_web(rrd, port, on_ready=look)
     assert b"<canvas" in seen[0]
     assert seen[1] == {"127.0.0.1"}
+
+
+def test_a_viewer_that_gets_the_data_over_the_network_shows_the_layout(rrd: Path, tmp_path: Path) -> None:
+    with rr.RecordingStream("another") as stream:
+        stream.save(tmp_path / "another.rrd")
+        stream.send_columns(
+            "line", [rr.TimeColumn("fast_step", sequence=[0, 1])], rr.Scalars.columns(scalars=[0.0, 1.0])
+        )
+    names: set[str] = set()
+
+    def look(address: str) -> None:
+        (data,) = urllib.parse.parse_qs(urllib.parse.urlsplit(address).query)["url"]
+        with headless_viewer(tmp_path / "another.rrd") as client:
+            client.open(data)
+            deadline = time.monotonic() + 30
+            while "Session" not in names and time.monotonic() < deadline:
+                time.sleep(0.1)
+                names.update(view.name for view in client.get_state().views)
+        raise KeyboardInterrupt
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            serve_web(rrd, free_port(), on_ready=look)
+    except ViewerError as error:
+        needs_a_renderer(error)
+    assert {"Session", "Log", "Path, all (slope units)"} <= names
 
 
 def test_a_port_in_use_is_one_clear_error(rrd: Path) -> None:
