@@ -19,6 +19,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from aolink.errors import AolinkError, RigError
+from aolink.rig import Rig, load_rig
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -51,6 +52,19 @@ def main() -> None:
     except BrokenPipeError:  # the reader of a pipe has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(141)
+
+
+def _load_checked(path_or_name: str) -> Rig:
+    """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
+    from aolink.plant import check_rig
+
+    loaded = load_rig(path_or_name)
+    for finding in check_rig(loaded):
+        if finding.severity == "error":
+            raise RigError(f"{path_or_name}: {finding.key}: {finding.message}")
+        if finding.severity == "warning":
+            _err.print(f"aolink: warning: {escape(finding.key)}: {escape(finding.message)}")
+    return loaded
 
 
 class _StopRequest:
@@ -112,12 +126,10 @@ def rig(
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
-    from aolink.rig import load_rig
-
-    loaded = load_rig(rig)
     if check:
-        _check_rig(loaded, as_json)
+        _print_findings(load_rig(rig), as_json)
         return
+    loaded = _load_checked(rig)
     from aolink.simulation.server import RigServer, open_streams
 
     streams = open_streams(listen)
@@ -140,7 +152,7 @@ def rig(
             stream.close()
 
 
-def _check_rig(loaded: Any, as_json: bool) -> None:
+def _print_findings(loaded: Rig, as_json: bool) -> None:
     from aolink.plant import check_rig
 
     findings = check_rig(loaded)
@@ -211,9 +223,8 @@ def record(
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
     """
     from aolink import session
-    from aolink.rig import load_rig
 
-    loaded = load_rig(rig)
+    loaded = _load_checked(rig)
     if exposures is not None and duration is not None:
         raise typer.BadParameter("give --exposures or --duration, not both")
     if duration is not None:
@@ -322,14 +333,14 @@ def view(
     recording = Recording(file)
     with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
         rrd = save or Path(folder) / f"{file.stem}.rrd"
-        viewing.save_rrd(recording, rrd)
+        viewing.save_rrd(recording, rrd, overwrite=overwrite)
         if save is not None:
             _out.print(f"written: {save}")
         if screenshot is not None:
             viewing.screenshot(rrd, screenshot)
             _out.print(f"written: {screenshot}")
         if web:
-            viewing.serve_web(rrd)
+            viewing.serve_web(rrd, on_ready=lambda address: _out.print(f"{address}\nCtrl-C stops it."))
         elif save is None and screenshot is None:
             viewing.open_viewer(rrd)
 
@@ -347,10 +358,11 @@ def demo(
     from aolink.demo import new_folder, run_demo
     from aolink.recording.reader import Recording
 
+    loaded = _load_checked(rig)
     folder = new_folder(out)
     with _StopRequest().installed() as stop, _progress(exposures) as tell:
         result = run_demo(
-            rig, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
+            loaded, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
         )  # fmt: skip
     recording = Recording(result.recording)
     estimates = {name: recording.estimates(name) for name in recording.estimators}

@@ -14,7 +14,7 @@ from pathlib import Path
 from aolink.errors import AolinkError, DeviceError, ViewerError
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
-from aolink.rig import load_rig
+from aolink.rig import Rig
 from aolink.session import Report, record
 
 ESTIMATORS = ("open-loop", "o1", "o2", "o3")
@@ -82,7 +82,7 @@ def new_folder(parent: Path) -> Path:
 
 
 def run_demo(
-    rig_name: str,
+    rig: Rig,
     folder: Path,
     *,
     exposures: int,
@@ -94,7 +94,8 @@ def run_demo(
     """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays."""
     from aolink import viewing
 
-    rig = load_rig(rig_name)
+    rig_file = folder / "rig.toml"
+    rig_file.write_text(rig.toml)
     path, rrd, picture = folder / "session.mcap", folder / "session.rrd", folder / "session.png"
     seconds: dict[str, float] = {}
 
@@ -107,7 +108,7 @@ def run_demo(
 
     options = ["--real-time"] if real_time else []
     options += ["--seed", str(seed)] if seed is not None else []
-    with part("record") as tell, simulated_rig(rig_name, *options) as (camera, mirror):
+    with part("record") as tell, simulated_rig(rig_file, *options) as (camera, mirror):
         report = record(
             rig, camera, mirror, path, estimators=ESTIMATORS, exposures=exposures, note="aolink demo", stop=stop,
             progress=tell,

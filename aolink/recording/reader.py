@@ -13,7 +13,7 @@ from pathlib import Path
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
 from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Footer, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import CRCValidationError, StreamReader
 
@@ -172,8 +172,6 @@ class Recording:
                 rig_text = record.data.decode()
             elif isinstance(record, Metadata) and record.name in (topics.SESSION_METADATA, topics.END_METADATA):
                 self.metadata.update(record.metadata)
-            elif isinstance(record, Footer):
-                self.complete = True
         return rig_text
 
     def _records(self) -> Iterator[McapRecord]:
@@ -182,6 +180,7 @@ class Recording:
             with self.path.open("rb") as file:
                 try:
                     yield from StreamReader(file, validate_crcs=True, record_size_limit=_MAX_RECORD).records
+                    self.complete = True
                 except InvalidMagic:
                     if file.tell() <= _MAGIC_BYTES:
                         raise RecordingError(f"{self.path} is not a recording: it is not an MCAP file") from None

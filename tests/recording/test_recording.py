@@ -1,0 +1,177 @@
+"""Recordings: read by stock tools, whole after a crash, lossless."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+import aolink
+from aolink.assembly import Frame
+from aolink.estimation import exposure_model
+from aolink.recording import convert, topics
+from aolink.recording.reader import Recording
+from aolink.recording.writer import RecordingWriter
+from aolink.rig import load_rig
+from tests.conftest import ESTIMATORS, EXPOSURES, Session
+
+
+def test_the_mcap_reader_with_stock_decoders_reads_it(recorded: Session) -> None:
+    """The file needs nothing but itself: the schemas inside it decode every message."""
+    by_topic: dict[str, list[object]] = {}
+    with recorded.path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        attachments = {a.name: a.data for a in reader.iter_attachments()}
+        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+        for decoded in reader.iter_decoded_messages():
+            by_topic.setdefault(decoded.channel.topic, []).append(decoded.decoded_message)
+    assert sum(map(len, by_topic.values())) == summary.statistics.message_count
+    image, info, truth = (by_topic[t][3] for t in (topics.IMAGE, topics.EXPOSURE, topics.TRUTH))
+    exposure = list(Recording(recorded.path).exposures())[3]
+    assert (image.encoding, image.width, image.height) == ("mono16", 40, 1)  # type: ignore[attr-defined]
+    assert np.array_equal(np.frombuffer(image.data, "<u2"), exposure.pixels[0])  # type: ignore[attr-defined]
+    assert info.frame_id == exposure.frame_id == 4  # type: ignore[attr-defined]
+    assert exposure.truth is not None
+    assert np.array_equal(np.array(truth.path), exposure.truth.path[0])  # type: ignore[attr-defined]
+    assert attachments["rig.toml"].decode() == load_rig("section-vi-lively").toml
+    assert metadata["aolink"]["rig_digest"] == load_rig("section-vi-lively").digest
+    assert metadata["aolink/end"]["ended"] == "complete"
+
+
+def test_the_recorded_basis_expands_the_recorded_coefficients(recorded: Session) -> None:
+    """Whoever reads the file without aolink can expand a path with NumPy alone."""
+    with recorded.path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        (data,) = [a.data for a in reader.iter_attachments() if a.name == "exposure_basis.npy"]
+        estimates = [m.decoded_message for m in reader.iter_decoded_messages(topics=["/estimate/open-loop"])]
+    (tmp := recorded.path.with_suffix(".npy")).write_bytes(data)
+    basis = np.load(tmp)
+    rig, recording = load_rig("section-vi-lively"), Recording(recorded.path)
+    ours, exposure = recording.estimates("open-loop")[5], list(recording.exposures())[5]
+    inputs = exposure_model(rig.plant, 200).response(exposure.inputs).path[0, 0]
+    path = basis[0] @ np.array(estimates[5].coefficients) + inputs
+    np.testing.assert_allclose(path, ours.path[0], rtol=0, atol=1e-12)
+
+
+def test_reruns_own_importer_reads_it(recorded: Session, tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    target = tmp_path / "converted.rrd"
+    rerun = Path(sys.executable).parent / "rerun"
+    result = subprocess.run(
+        [rerun, "mcap", "convert", recorded.path, "-o", target], capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    columns: dict[str, int] = {}
+    for chunk in RrdReader(target).stream():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            columns[f"{chunk.entity_path} {name}"] = columns.get(f"{chunk.entity_path} {name}", 0) + batch.num_rows
+    pictures = {name: rows for name, rows in columns.items() if name.startswith("/camera/image ") and "buffer" in name}
+    assert set(pictures.values()) == {EXPOSURES}, columns
+    assert any(name.startswith("/estimate/o3 ") and rows == EXPOSURES for name, rows in columns.items()), columns
+
+
+def test_a_recording_cut_anywhere_gives_what_is_whole(recorded: Session, tmp_path: Path) -> None:
+    data, whole = recorded.path.read_bytes(), list(Recording(recorded.path).exposures())
+    counts = []
+    for size in np.linspace(len(data) * 0.4, len(data) - 1, 25).astype(int):
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(data[:size])
+        recording = Recording(path)
+        assert not recording.complete
+        exposures = list(recording.exposures())
+        for ours, theirs in zip(exposures, whole, strict=False):
+            assert np.array_equal(ours.pixels, theirs.pixels)
+        counts.append(len(exposures))
+    assert counts == sorted(counts)
+    assert counts[0] < counts[-1] == EXPOSURES
+
+
+def test_the_file_is_flushed_by_the_messages_own_time(recorded: Session, tmp_path: Path) -> None:
+    """What is older than 100 ms of session time is in the file, whether or not more comes."""
+    rig, path = load_rig("section-vi"), tmp_path / "a.mcap"
+    messages = [m for m in Recording(recorded.path).messages() if not m.topic.startswith("/estimate")]
+    writer = RecordingWriter(path, rig, {}, 0, deterministic=True)
+    for each in messages:
+        writer.write(each.topic, each.message, each.log_time_ns)
+    newest = messages[-1].log_time_ns
+    due = sum(m.log_time_ns < newest - 200_000_000 for m in messages)
+    written = 0
+    for _ in range(1000):  # the writer's thread takes its time; its file must get there without more messages
+        written = sum(1 for _ in Recording(path).messages())
+        if written >= due:
+            break
+        time.sleep(0.01)
+    assert written >= due > 0
+    assert not Recording(path).complete
+    writer.close()
+    assert sum(1 for _ in Recording(path).messages()) == len(messages)
+
+
+masks = st.lists(st.booleans(), min_size=40, max_size=40)
+
+
+@given(masks, st.lists(st.integers(0, 65535), min_size=40, max_size=40))
+def test_frames_survive_the_recording(mask: list[bool], counts: list[int]) -> None:
+    pixels = np.where(mask, np.array(counts), 0).astype(np.uint16).reshape(4, 10)
+    frame = Frame(
+        frame_id=2**40,
+        first_step=2**33,
+        last_step=2**33 + 199,
+        pixels=pixels,
+        mask=np.array(mask).reshape(4, 10),
+        chunks_lost=3,
+        frames_lost_before=1,
+        device_start_ns=-5,
+        device_end_ns=5,
+        host_first_byte_ns=10**18,
+        host_receive_ns=10**18 + 1,
+        host_start_ns=10**18 - 1,
+        clock_sigma_ns=1.5,
+    )
+    again = convert.frame_from_messages(*convert.frame_messages(frame))
+    for name, value in vars(frame).items():
+        assert np.array_equal(getattr(again, name), value), name
+
+
+def test_estimates_survive_the_recording(recorded: Session) -> None:
+    """The driver's own estimates, not recorded ones, against what is read back."""
+    recording = Recording(recorded.path)
+    for name in ESTIMATORS:
+        for ours, theirs in zip(aolink.estimate(recording, name), recording.estimates(name), strict=True):
+            assert np.array_equal(ours.path_sd, theirs.path_sd)
+            assert ours.status == theirs.status
+
+
+@pytest.mark.parametrize("room", ["wire/messages", "recording/schemas"])
+def test_the_generated_classes_are_those_of_the_proto_files(room: str, tmp_path: Path) -> None:
+    import importlib
+
+    from grpc_tools import protoc
+
+    root, target = Path(aolink.__file__).parent.parent, tmp_path / "set"
+    assert protoc.main(["", f"-I{root}", f"--descriptor_set_out={target}", f"{root}/aolink/{room}.proto"]) == 0
+    (compiled,) = descriptor_pb2.FileDescriptorSet.FromString(target.read_bytes()).file
+    generated = descriptor_pb2.FileDescriptorProto()
+    importlib.import_module(f"aolink.{room.replace('/', '.')}_pb2").DESCRIPTOR.CopyToProto(generated)
+    compiled.ClearField("source_code_info")
+    for message in compiled.message_type:
+        for field in message.field:
+            field.ClearField("json_name")
+    for message in generated.message_type:
+        for field in message.field:
+            field.ClearField("json_name")
+    assert generated == compiled, "run tools/protocol"

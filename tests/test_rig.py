@@ -1,0 +1,166 @@
+"""The rig file is validated whole: what is wrong is one message that names the key."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aolink.errors import RigError
+from aolink.rig import builtin_rigs, load_rig, parse_rig
+
+TEXT = load_rig("section-vi").toml
+A = "[[1.0000, 0.0010], [-0.0197, 0.9704]]"
+
+
+def changed(old: str, new: str) -> str:
+    assert TEXT.count(old) == 1, old
+    return TEXT.replace(old, new)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('name = "section-vi"', "", "name is missing"),
+        (
+            "[timing]",
+            "[timing]\nspeed = 3",
+            r"timing.speed is not a key that aolink knows; known here: exp",
+        ),
+        ("[plant]", "[colour]\nx = 1\n[plant]", "colour is not a key that aolink knows"),
+        (
+            A,
+            "[[1.0, 0.001]]",
+            "plant.A has shape 1 x 2, expected a square matrix",
+        ),
+        (
+            A,
+            "[[1.0, 0.001], [1.0]]",
+            "plant.A: expected numbers in rows of equal",
+        ),
+        (A, "[[1.0, 0.1], [0.1, 0.9]]", "plant.A is unstable: .* modulus 1.06"),
+        (A, "[[1.0, 0.001], [0.0, 0.9]]", "plant.initial_covariance is missing"),
+        ("B = [[0.0], [1.0]]", "B = [[1.0]]", "plant.B has shape 1 x 1, expected 2 x any"),
+        ("C = [[1.0, 0.0]]", "C = [[0.0, 0.0]]", "plant.C is zero: .* nothing is observable"),
+        ("C = [[1.0, 0.0]]", "C = [[1.0, nan]]", "plant.C holds a number that is not finite"),
+        (
+            "C = [[1.0, 0.0]]",
+            "C = [[1.0, 0.0], [0.0, 1.0]]",
+            "sensor.kind = 'line' sees one slope, but the plant",
+        ),
+        ("process_noise = 0.1", "process_noise = -0.1", "plant.process_noise has the negative eigenvalue -0.1"),
+        ("fast_step_s = 0.001", "fast_step_s = 0", "timing.fast_step_s = 0 must be above 0"),
+        ("fast_step_s = 0.001", 'fast_step_s = "fast"', "timing.fast_step_s: expected a finite number, found 'fast'"),
+        ("exposure_steps = 200", "exposure_steps = 2.5", "timing.exposure_steps: expected a whole number"),
+        (
+            "exposure_steps = 200",
+            "exposure_steps = 200\nframe_period_steps = 100",
+            "timing.frame_period_steps = 100 is",
+        ),
+        ('kind = "line"', 'kind = "square"', "sensor.kind = 'square' is not known: use one of line"),
+        ("field = [-1.0, 1.0]", "field = [1.0, -1.0]", "the lower edge must be below the upper one"),
+        ("field = [-1.0, 1.0]", "field = [1.0]", "sensor.field has shape 1, expected 2"),
+        ("sigma = 0.05", "sigma = true", "sensor.kernel.sigma: expected a finite number, found True"),
+        ("black_level = 20000", "black_level = 70000", "sensor.black_level = 70000 is not below the full"),
+        (
+            "block_steps = 50",
+            "block_steps = 5000",
+            "mirror.block_steps = 5000 does not fit into one packet",
+        ),
+        (
+            "block_steps = 50",
+            "block_steps = 50\nqueue_steps = 60",
+            "mirror.queue_steps = 60 must hold at least",
+        ),
+        ("dac_bits = 16", "dac_bits = 16\npark = 1.0", "mirror.park is outside mirror.input_min .. mirror.input_max"),
+        ("input_max = 0.05", "input_max = -0.06", "mirror.input_min must be below mirror.input_max"),
+        ("amplitude = 0.0109", "amplitude = 0.06", "drive.amplitude and drive.offset reach beyond mirror.input_"),
+        ("amplitude = 0.0109", "", "drive.amplitude is missing"),
+        (
+            "[simulation]",
+            "[simulation.faults]\nbit_flip_rate = 2\n[simulation]",
+            "simulation.faults.bit_flip_rate = 2",
+        ),
+        ("[simulation]", "[simulation", "not valid TOML"),
+    ],
+)
+def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:
+    with pytest.raises(RigError, match=message) as caught:
+        parse_rig(changed(old, new))
+    assert "\n" not in str(caught.value)
+
+
+@given(st.text())
+def test_any_text_is_a_rig_or_one_error(text: str) -> None:
+    with pytest.raises(RigError):
+        parse_rig(text)
+
+
+@pytest.mark.parametrize("name", builtin_rigs())
+def test_the_rigs_that_come_along_are_good(name: str) -> None:
+    rig = load_rig(name)
+    assert rig.name == name
+    assert len(rig.summary) > 80
+    assert rig.digest == load_rig(f"{name}.toml").digest
+
+
+def test_a_file_goes_before_a_name_and_is_named_in_errors(tmp_path: Path) -> None:
+    path = tmp_path / "section-vi.toml"
+    path.write_text(changed("seed = 1", "seed = 77"))
+    assert load_rig(path).simulation.seed == 77
+    path.write_text(changed("seed = 1", "seed = -1"))
+    with pytest.raises(RigError, match=rf"{re.escape(str(path))}: simulation.seed"):
+        load_rig(path)
+    with pytest.raises(RigError, match=r"cannot read the rig file .*no.toml: No such file .* or one of: section-vi"):
+        load_rig(tmp_path / "no.toml")
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(RigError, match="is not a rig file: it is not text"):
+        load_rig(path)
+
+
+def test_the_stationary_covariance_is_stationary() -> None:
+    plant = load_rig("section-vi-lively").plant
+    P = plant.initial_covariance
+    W = plant.B_w @ plant.process_noise @ plant.B_w.T
+    np.testing.assert_allclose(plant.A @ P @ plant.A.T + W, P, rtol=1e-9)
+
+
+def test_the_converter_rounds_to_its_steps_and_keeps_the_limits() -> None:
+    mirror = load_rig("section-vi").mirror
+    u = np.linspace(mirror.input_min[0], mirror.input_max[0], 1001)[:, None]
+    rounded = mirror.quantise(u)
+    step = 0.1 / 65535
+    assert np.abs(rounded - u).max() <= step / 2 * (1 + 1e-9)
+    np.testing.assert_allclose((rounded + 0.05) / step, np.round((rounded + 0.05) / step), atol=1e-6)
+    assert rounded[0, 0] == -0.05
+    assert rounded[-1, 0] == pytest.approx(0.05, abs=1e-15)
+
+
+def test_check_says_what_is_wrong_and_what_is_lost(
+    aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    assert "the rig file is good" in aolink("rig", "section-vi", "--check").stdout
+    (tmp_path / "far.toml").write_text(changed("field = [-1.0, 1.0]", "field = [-0.2, 0.2]"))
+    result = aolink("rig", "far.toml", "--check")
+    assert result.returncode == 2
+    assert re.search(r"error +(drive.amplitude|sensor.field)", result.stdout), result.stdout
+    refused = aolink("rig", "far.toml")
+    assert refused.returncode == 2
+    assert re.fullmatch(r"aolink: far.toml: (drive.amplitude|sensor.field): .*\n", refused.stderr), refused.stderr
+    # An undamped mode at 10 Hz averages to nothing in 200 ms: the centroid loses it, the blur may not.
+    omega = 2 * np.pi * 10 * 1e-3
+    c, s = float(np.cos(omega)), float(np.sin(omega))
+    lost = changed(A, f"[[{c}, {s}], [{-s}, {c}]]")
+    lost = lost.replace("process_noise = 0.1 ", "initial_covariance = [[0.01, 0], [0, 0.01]]\nprocess_noise = 0.1 ")
+    lost = lost.replace("amplitude = 0.0109", "amplitude = 0.0")
+    (tmp_path / "lost.toml").write_text(lost)
+    result = aolink("rig", "lost.toml", "--check")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert re.search(r"warning .*10(\.0+)? Hz", result.stdout), result.stdout
+    assert "warning: timing.exposure_steps: the centroid" in aolink("rig", "lost.toml", "--listen", "nonsense").stderr
