@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -65,6 +66,11 @@ def _load_checked(path_or_name: str) -> Rig:
         if finding.severity == "warning":
             _err.print(f"aolink: warning: {escape(finding.key)}: {escape(finding.message)}")
     return loaded
+
+
+def _command() -> str:
+    """What the user types for this program: its name where the shell finds it, else its path."""
+    return "aolink" if shutil.which("aolink") else str(Path(sys.executable).with_name("aolink"))
 
 
 class _StopRequest:
@@ -143,7 +149,7 @@ def rig(
                 print(f"{line}  {name}")
             print(
                 f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
-                f"  aolink record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig} --estimator o3"
+                f"  {_command()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig} --estimator o3"
                 " --exposures 100 -o session.mcap\nCtrl-C stops it.",
                 flush=True,
             )
@@ -368,7 +374,7 @@ def demo(
     estimates = {name: recording.estimates(name) for name in recording.estimators}
     _out.print(tables.scores(tables.score_all(recording, estimates)))
     _out.print(tables.session(result.report))
-    for line in tables.demo_summary(result):
+    for line in tables.demo_summary(result, _command()):
         _out.print(line)
     stop.exit_if_asked()
     if result.differences:

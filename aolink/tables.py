@@ -163,8 +163,8 @@ def _percentiles(latencies: Sequence[pb.Latency], since: str, until: str) -> str
     return f"p50 {middle:.2f} ms, p99 {high:.2f} ms ({len(values)} frames)"
 
 
-def demo_summary(result: DemoResult) -> list[str]:
-    """What came of the demo, and what to run next."""
+def demo_summary(result: DemoResult, command: str) -> list[str]:
+    """What came of the demo, and what to run next with ``command``."""
     if result.differences:
         lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
     else:
@@ -173,7 +173,7 @@ def demo_summary(result: DemoResult) -> list[str]:
     lines.append(f"recording {result.recording}")
     lines.append(f"rerun     {result.rrd}")
     lines.append(f"picture   {result.picture}" if result.picture else f"picture   none: {result.no_picture}")
-    lines.append(f"next      aolink view {result.recording}")
-    lines.append(f"          aolink info {result.recording}")
-    lines.append(f"          aolink estimate {result.recording} --estimator o3")
+    lines.append(f"next      {command} view {result.recording}")
+    lines.append(f"          {command} info {result.recording}")
+    lines.append(f"          {command} estimate {result.recording} --estimator o3")
     return lines
