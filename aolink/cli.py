@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -29,7 +30,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="A logged hardware-in-the-loop pipeline for adaptive optics and any loop closed through a slow camera.",
 )
-_out = Console(highlight=False, soft_wrap=True)
+_out = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
 _err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
@@ -39,6 +40,20 @@ EstimatorOption = Annotated[
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"aolink {version('aolink')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None: ...
 
 
 def main() -> None:
@@ -149,8 +164,8 @@ def rig(
                 print(f"{line}  {name}")
             print(
                 f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
-                f"  {_command()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig} --estimator o3"
-                " --exposures 100 -o session.mcap\nCtrl-C stops it.",
+                f"  {_command()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig}"
+                " --estimator o3 --exposures 100 -o session.mcap\nCtrl-C stops it.",
                 flush=True,
             )
         server.run(stop)

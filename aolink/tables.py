@@ -55,6 +55,8 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
 def facts(values: Mapping[str, Any]) -> Table:
     """Name and value, line by line."""
     table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
     for name, value in values.items():
         if isinstance(value, Mapping):
             value = ", ".join(f"{key} {count}" for key, count in value.items())

@@ -65,7 +65,7 @@ class Hub:
         """The messages that came, in order of time; in real time, wait for them for up to ``timeout_s``."""
         pending, self._pending = self._pending, []
         if self.virtual:
-            pending += self._receive_until_dealt_with(self.links)
+            pending += self._receive_until_dealt_with()
             # Time moves here and nowhere else: what a send sees must not depend on what has come by then.
             self._virtual_ns = max(self._virtual_ns, *(link.handed.host_ns for link in self.links if link.handed))
         elif not pending:
@@ -109,18 +109,20 @@ class Hub:
     def _settle_others(self, link: Link) -> None:
         """Virtual time: two lines are two queues, and which the rig looks at first is anybody's guess.
 
-        So nothing is sent on one while something sent on another has not been dealt with.
+        So nothing is sent on one while something sent on another has not been dealt with. Either nothing is
+        read here or everything that is due: what has been read must not depend on speed.
         """
         others = [each for each in self.links if each is not link]
-        self._pending += self._receive_until_dealt_with(others)
+        if not all(self._has_dealt_with(others, each) for each in self.links):
+            self._pending += self._receive_until_dealt_with()
 
-    def _receive_until_dealt_with(self, senders: Sequence[Link]) -> list[tuple[Link, Received]]:
-        """Everything that came until the rig had dealt with all that was sent on ``senders``."""
+    def _receive_until_dealt_with(self) -> list[tuple[Link, Received]]:
+        """Everything that came until the rig had dealt with all that was sent."""
         received: list[tuple[Link, Received]] = []
         heard, last_heard = -1, time.monotonic()
         while True:
             received.extend((link, r) for link in self.links for r in link.receive())
-            waiting = [link.transport for link in self.links if not self._has_dealt_with(senders, link)]
+            waiting = [link.transport for link in self.links if not self._has_dealt_with(self.links, link)]
             if not waiting:
                 break
             total = sum(link.counts.bytes_received for link in self.links)
