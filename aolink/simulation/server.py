@@ -136,27 +136,25 @@ class FaultInjector:
 
     def __init__(self, faults: Faults, seed: np.random.SeedSequence) -> None:
         self._faults = faults
-        self._rng = np.random.default_rng(seed)
+        # One for each direction: how packets in and packets out take turns is a matter of speed.
+        self._incoming, self._outgoing = (np.random.default_rng(each) for each in seed.spawn(2))
 
     def loses_command(self) -> bool:
         """Whether a packet from the host is lost."""
-        return self._hits(self._faults.command_loss_rate)
+        return _hits(self._incoming, self._faults.command_loss_rate)
 
     def damage(self, packet: bytes) -> bytes:
         """What is left of a packet to the host: nothing, twice it, one with a bit flipped, or itself."""
-        if self._hits(self._faults.packet_loss_rate):
+        if _hits(self._outgoing, self._faults.packet_loss_rate):
             return b""
-        if self._hits(self._faults.bit_flip_rate):
-            bit = int(self._rng.integers(8 * (len(packet) - 1)))
+        if _hits(self._outgoing, self._faults.bit_flip_rate):
+            bit = int(self._outgoing.integers(8 * (len(packet) - 1)))
             damaged = bytearray(packet)
             damaged[bit // 8] ^= 1 << bit % 8
             packet = bytes(damaged)
-        if self._hits(self._faults.duplicate_rate):
+        if _hits(self._outgoing, self._faults.duplicate_rate):
             packet *= 2
         return packet
-
-    def _hits(self, rate: float) -> bool:
-        return rate > 0 and float(self._rng.random()) < rate
 
 
 class LineEnd:
@@ -359,6 +357,10 @@ def open_streams(listen: str | None) -> dict[Line, Stream]:
         raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")
     number = int(port)
     return {"camera": TcpStream(host, number), "mirror": TcpStream(host, number + 1 if number else 0)}
+
+
+def _hits(rng: np.random.Generator, rate: float) -> bool:
+    return rate > 0 and float(rng.random()) < rate
 
 
 def _pieces(data: bytes) -> list[bytes]:
