@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.exposure_model import ExposureModel, exposure_model
-from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise, steady_gain
+from aolink.estimation.exposure_model import exposure_model
+from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
+from aolink.estimation.filterpy_engine import FilterpyMoments
 from aolink.estimation.moments import (
     Flux,
     Measurement,
@@ -22,18 +23,24 @@ from aolink.estimation.moments import (
     noise_integrals,
     spot_significance,
 )
+from aolink.estimation.observation import Observation, PathMoments, steady_gain
+from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.exposure import Exposure
-from aolink.optics.camera import effective_noise_density, is_saturated
+from aolink.optics.camera import effective_noise_density, is_saturated, to_density
 from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]
+Engine = Literal["aolink", "filterpy"]
 
-_ORDERS: dict[str, tuple[int, ...]] = {"open-loop": (), "o1": (1,), "o2": (2,), "o3": (1, 2)}
-ESTIMATOR_NAMES: tuple[str, ...] = tuple(_ORDERS)
+_PAPER_ORDERS: dict[str, tuple[int, ...]] = {"o1": (1,), "o2": (2,), "o3": (1, 2)}
+ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments")
 """The names that `make_estimator` knows."""
 
 # A frame without a spot reaches this about once in thirty.
 _LEAST_SIGNIFICANCE = 4.0
+_HIGHEST_ORDER = 8
+# Share of the pixels that `moments` can do with.
+_LEAST_USABLE = 0.5
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,14 @@ class Options:
     """"known": the light of a frame sums to one; "measured": moments are divided by what it sums to."""
     gate: bool = True
     """Whether measurements that cannot be believed are left out."""
+    engine: Engine = "aolink"
+    """What o1 to o3 run on: "aolink", or "filterpy", for one axis."""
+    orders: tuple[int, ...] = (0, 1, 2, 3)
+    """Of `moments`: which functions of the basis; 0 is the light in the window."""
+    basis: Basis = "monomial"
+    """Of `moments`: "monomial", "legendre" or "fourier"."""
+    shot_gain: float = 0.0
+    """Of `moments`: variance of a pixel's density by shot noise, for each unit of density."""
 
 
 class Estimator:
@@ -60,14 +75,13 @@ class Estimator:
         self.name = name
         self.rig = rig
         self.options = options
-        model = exposure_model(rig.plant, rig.timing.exposure_steps)
-        orders = _ORDERS[name]
-        gain = None
-        if name == "o1" and options.gain == "steady-state":
-            gain = _steady_gain(rig, model, options)
-            if gain is None:
-                self.options = replace(options, gain="time-varying")
-        self._filter = BlurFilter(rig.plant, orders, process_noise=options.process_noise, gain=gain, gate=options.gate)
+        if options.gain == "steady-state" and name == "o1" and _steady_gain(rig, options) is None:
+            self.options = options = replace(options, gain="time-varying")
+        self._observation = _observation(rig, name, options)
+        predict = self._observation.predict if isinstance(self._observation, FilterpyMoments) else None
+        self._filter = BlurFilter(
+            rig.plant, self._observation, process_noise=options.process_noise, gate=options.gate, predict=predict
+        )
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
 
@@ -76,15 +90,10 @@ class Estimator:
         model = exposure_model(self.rig.plant, exposure.n_steps)
         reasons = self._bridge(exposure)
         response = model.response(exposure.inputs)
-        measurement: Measurement | str | None = None
-        if self._filter.orders:
-            measurement = measure(self.rig, exposure, self._filter.orders, self.options.flux)
-        if isinstance(measurement, str):
-            reasons.insert(0, measurement)
-            measurement = None
-        posterior = self._filter.step(model, response, measurement)
-        reasons += _told(posterior)
-        coefficients, covariance = self._coefficients(model, posterior)
+        measured, remark = measure(self.rig, exposure, self._observation, self.options)
+        posterior = self._filter.step(model, response, measured)
+        reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
+        coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
         shape = (self.rig.n_outputs, exposure.n_steps)
         return Estimate(
             estimator=self.name,
@@ -123,34 +132,35 @@ class Estimator:
         self._last_input = exposure.inputs[-1]
         return reasons
 
-    def _coefficients(self, model: ExposureModel, posterior: Posterior) -> tuple[FloatArray, FloatArray]:
-        """The path's coefficients. Those who look leave the noise inside the exposure out, as the paper does."""
-        mean, covariance = posterior.start.mean, posterior.start.covariance
-        if self._filter.orders:
-            return mean, covariance
-        axes, n = mean.shape
-        whole = np.zeros((axes, model.n_coefficients))
-        whole[:, :n] = mean
-        spread = np.zeros((axes, model.n_coefficients, model.n_coefficients))
-        spread[:] = np.eye(model.n_coefficients)
-        spread[:, :n, :n] = covariance
-        return whole, spread
 
-
-def measure(rig: Rig, exposure: Exposure, orders: Sequence[int], flux: Flux) -> Measurement | str:
-    """The moments of an exposure, or why it has none."""
-    sensor = rig.sensor
-    if exposure.pixels.shape != sensor.shape:
-        return f"the frame has {exposure.pixels.shape} pixels, the rig's sensor {sensor.shape}"
-    if not exposure.complete:
-        return f"{int((~exposure.mask).sum())} of {exposure.mask.size} pixels are missing"
-    saturated = int(is_saturated(sensor, exposure.pixels).sum())
-    if saturated:
-        return f"{saturated} pixels are at an end of the scale"
-    significance = spot_significance(sensor, exposure.pixels)
+def measure(
+    rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options
+) -> tuple[Measurement | Profile | None, str]:
+    """What an observation takes of an exposure, or nothing; and what there is to say about it."""
+    if observation is None:
+        return None, ""
+    sensor, pixels = rig.sensor, exposure.pixels
+    if pixels.shape != sensor.shape:
+        return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
+    saturated = is_saturated(sensor, pixels) & exposure.mask
+    usable = exposure.mask & ~saturated
+    remark = ""
+    if not usable.all():
+        remark = f"{int((~exposure.mask).sum())} of {pixels.size} pixels are missing"
+        if saturated.any():
+            remark = f"{int(saturated.sum())} of {pixels.size} pixels are at an end of the scale"
+        if isinstance(observation, PathMoments) or usable.sum() < _LEAST_USABLE * pixels.size:
+            return None, remark
+        remark += ": left out"
+    density = np.where(usable, to_density(sensor, pixels), 0.0)
+    significance = spot_significance(sensor, density)
     if significance < _LEAST_SIGNIFICANCE:
-        return f"no spot: the brightest stretch is {significance:.1f} standard deviations of noise"
-    return measure_moments(sensor, exposure.pixels.reshape(rig.plant.axes, -1), orders, flux)
+        return None, f"no spot: the brightest stretch is {significance:.1f} standard deviations of noise"
+    rows = (rig.plant.axes, -1)
+    if not isinstance(observation, PathMoments):
+        return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
+    moments = measure_moments(sensor, pixels.reshape(rows), observation.orders, options.flux)
+    return (None, moments) if isinstance(moments, str) else (moments, "")
 
 
 def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
@@ -168,17 +178,28 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     EstimatorError
         There is no such estimator or option, or it cannot work on this rig.
     """
-    if name not in _ORDERS:
+    if name not in ESTIMATOR_NAMES:
         raise EstimatorError(f"there is no estimator {name!r}: use one of {', '.join(ESTIMATOR_NAMES)}")
     known = Options.__dataclass_fields__
     for key in options:
         if key not in known:
             raise EstimatorError(f"estimators have no option {key!r}: use {', '.join(known)}")
     chosen = Options(**options)
-    choices = {"gain": ("steady-state", "time-varying"), "process_noise": get_args(Noise), "flux": get_args(Flux)}
+    choices = {
+        "gain": ("steady-state", "time-varying"),
+        "process_noise": get_args(Noise),
+        "flux": get_args(Flux),
+        "basis": get_args(Basis),
+        "engine": get_args(Engine),
+    }
     for key, values in choices.items():
         if getattr(chosen, key) not in values:
             raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
+    orders = tuple(chosen.orders)
+    if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
+        raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
+    if chosen.engine == "filterpy" and (name not in _PAPER_ORDERS or rig.plant.axes != 1):
+        raise EstimatorError(f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, not this")
     return Estimator(rig, name, chosen)
 
 
@@ -203,10 +224,22 @@ def run(rig: Rig, exposures: Iterable[Exposure], names: Sequence[str]) -> dict[s
     return estimates
 
 
-def _steady_gain(rig: Rig, model: ExposureModel, options: Options) -> FloatArray | None:
+def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | None:
+    if name == "open-loop":
+        return None
+    if name in _PAPER_ORDERS:
+        gain = _steady_gain(rig, options) if name == "o1" and options.gain == "steady-state" else None
+        engine = FilterpyMoments if options.engine == "filterpy" else PathMoments
+        return engine(rig.plant.n_outputs, _PAPER_ORDERS[name], gain)
+    return WindowedMoments(
+        rig.sensor, options.orders, basis=options.basis, flux=options.flux, shot_gain=options.shot_gain
+    )
+
+
+def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file; None where there is none."""
-    integrals = noise_integrals(rig.sensor, 2)
-    noise = known_flux_covariance(effective_noise_density(rig.sensor), integrals, [1])
+    model = exposure_model(rig.plant, rig.timing.exposure_steps)
+    noise = known_flux_covariance(effective_noise_density(rig.sensor), noise_integrals(rig.sensor, 2), [1])
     return steady_gain(model, added_noise(model, options.process_noise), noise)
 
 

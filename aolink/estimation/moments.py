@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.optics.camera import effective_noise_density, to_density
+from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import kernel_moments
 from aolink.rig import Sensor
 
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 Flux = Literal["known", "measured"]
 
 # Where the flux is measured, its sd must be this many times smaller: a ratio's variance is not finite otherwise.
-_LEAST_FLUX = 5.0
+LEAST_FLUX = 5.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,8 +122,8 @@ def measure_moments(
     if flux == "measured":
         total = raw[:, 0].copy()
         sd = math.sqrt(total_noise * integrals[0])
-        if (total < _LEAST_FLUX * sd).any():
-            return f"the flux, {total.min():.3g}, is under {_LEAST_FLUX:g} of its standard deviations, {sd:.3g}"
+        if (total < LEAST_FLUX * sd).any():
+            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd:.3g}"
         raw = raw / total[:, None]
         covariance = measured_flux_covariance(total_noise, integrals, everything, raw, total)
     else:
@@ -138,9 +138,9 @@ def measure_moments(
     )
 
 
-def spot_significance(sensor: Sensor, counts: NDArray[np.uint16]) -> float:
+def spot_significance(sensor: Sensor, density: FloatArray) -> float:
     """By how many standard deviations the light of the brightest stretch of a row stands out, over several lengths."""
-    light = np.concatenate([[0.0], np.cumsum(to_density(sensor, counts).ravel())]) * sensor.pixel_width
+    light = np.concatenate([[0.0], np.cumsum(density)]) * sensor.pixel_width
     lengths = [2**k for k in range(sensor.pixels.bit_length())]
     sd = math.sqrt(effective_noise_density(sensor) * sensor.pixel_width)
     return max(float((light[n:] - light[:-n]).max()) / (sd * math.sqrt(n)) for n in lengths if n <= sensor.pixels)

@@ -16,7 +16,7 @@ from aolink.estimation.moments import (
     spot_significance,
     without_kernel,
 )
-from aolink.optics.camera import to_counts
+from aolink.optics.camera import to_counts, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import Sensor, load_rig
 
@@ -132,8 +132,8 @@ def test_a_flux_that_its_noise_drowns_is_not_divided_by():
 
 def test_a_spot_stands_out_and_its_absence_does_not():
     lit, dark = frames(SENSOR, np.zeros((200, 200)), seed=3), frames(SENSOR, np.full((200, 1), 9.0), seed=3)
-    assert min(spot_significance(SENSOR, row) for row in lit) > 4
-    assert np.mean([spot_significance(SENSOR, row) > 4 for row in dark]) < 0.05
+    assert min(spot_significance(SENSOR, to_density(SENSOR, row)) for row in lit) > 4
+    assert np.mean([spot_significance(SENSOR, to_density(SENSOR, row)) > 4 for row in dark]) < 0.05
 
 
 @pytest.mark.parametrize("axes", [1, 7])

@@ -1,0 +1,49 @@
+"""filterpy as the engine: the same estimates, and really filterpy's."""
+
+import dataclasses
+
+import filterpy.kalman
+import numpy as np
+import pytest
+
+from aolink.errors import EstimatorError
+from aolink.estimation import make_estimator
+from aolink.simulation.model import simulate
+
+
+@pytest.mark.parametrize("name", ["o1", "o2", "o3"])
+@pytest.mark.parametrize("gain", ["steady-state", "time-varying"])
+def test_filterpy_gives_our_estimates(rig, name, gain):
+    exposures = simulate(rig, 40, seed=3)
+    exposures[20] = dataclasses.replace(exposures[20], mask=np.zeros((1, 40), bool))
+    ours, theirs = make_estimator(rig, name, gain=gain), make_estimator(rig, name, gain=gain, engine="filterpy")
+    for exposure in exposures:
+        a, b = ours.step(exposure), theirs.step(exposure)
+        assert (a.status, a.reason) == (b.status, b.reason)
+        for field in dataclasses.fields(a):
+            value = getattr(a, field.name)
+            if isinstance(value, np.ndarray):
+                np.testing.assert_allclose(value, getattr(b, field.name), atol=1e-9, rtol=0, err_msg=field.name)
+
+
+@pytest.mark.parametrize("name", ["o1", "o2", "o3"])
+@pytest.mark.parametrize("method", ["update", "predict"])
+def test_it_is_filterpy_that_works(rig, name, method, monkeypatch):
+    def fail(*args, **kwargs):
+        raise ZeroDivisionError
+
+    for kind in (filterpy.kalman.KalmanFilter, filterpy.kalman.ExtendedKalmanFilter):
+        monkeypatch.setattr(kind, method, fail)
+    (exposure,) = simulate(rig, 1)
+    estimator = make_estimator(rig, name, engine="filterpy", gain="time-varying")
+    with pytest.raises(ZeroDivisionError):
+        estimator.step(exposure)
+    make_estimator(rig, name).step(exposure)
+
+
+def test_filterpy_does_one_axis_of_the_papers_filters(rig):
+    with pytest.raises(EstimatorError, match="runs o1, o2, o3 on a plant of one axis"):
+        make_estimator(rig, "moments", engine="filterpy")
+    many = dataclasses.replace(rig, plant=dataclasses.replace(rig.plant, axes=2))
+    with pytest.raises(EstimatorError, match="one axis"):
+        make_estimator(many, "o1", engine="filterpy")
