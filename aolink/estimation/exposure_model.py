@@ -109,11 +109,22 @@ class ExposureModel:
         rows = stacked.transpose(self.state_rows)
         return InputResponse(
             path=path,
-            end=end,
+            end=stacked.batch_last(end),
             mean=stacked.mean_over_path(path),
             slope=stacked.mean_over_path(path[:, :, None, :] * rows),
             square=stacked.mean_over_path(path * path),
         )
+
+    def cross_quadratic(self, first: int, second: int) -> FloatArray:
+        """Symmetric M with mean(theta_1 theta_2) = x'Mx for two outputs without inputs, (n_states, n_states)."""
+        product = self.state_rows[first].T @ self.state_rows[second] / self.n_steps
+        return np.asarray((product + product.T) / 2)
+
+    def cross_response(self, response: InputResponse, first: int, second: int) -> tuple[FloatArray, FloatArray]:
+        """What inputs add to the mean product of two outputs: slope (axes, n_states) and constant (axes,)."""
+        c, rows = response.path, self.state_rows
+        both = c[:, first, None] * rows[second].T + c[:, second, None] * rows[first].T
+        return stacked.mean_over_path(both), stacked.mean_over_path(c[:, first] * c[:, second])
 
     def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
         """basis @ coefficients + c; coefficients (axes, any first ones), c and result (axes, n_outputs, n_steps)."""

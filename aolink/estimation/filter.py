@@ -119,16 +119,17 @@ class BlurFilter:
             coefficients=coefficients,
             end=self.belief,
             status=status,
-            innovation=np.nan_to_num(done.innovation),
-            innovation_covariance=np.nan_to_num(done.innovation_covariance),
-            nis=np.nan_to_num(done.nis),
+            innovation=_numbers(done.innovation),
+            innovation_covariance=_numbers(done.innovation_covariance),
+            nis=_numbers(done.nis),
         )
 
     def _trusted(self, prior: Belief, done: Correction, lost: NDArray[np.bool_]) -> tuple[Belief, NDArray[np.int64]]:
         """The correction where it can be believed, the prior elsewhere; and the status of each axis."""
         after = done.posterior
-        sane = np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
-        used = (done.nis <= self._gate) & sane
+        used = done.nis <= self._gate
+        if not (np.isfinite(after.mean).all() and np.isfinite(after.covariance).all()):
+            used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
         self._missed = np.where(used, 0, np.where(lost, 1, self._missed + 1))
         status = np.where(used, np.where(lost, Status.REINITIALISED, Status.OK), Status.GATED)
         status = np.where(~used & (self._missed >= _PATIENCE), Status.DIVERGED, status)
@@ -149,13 +150,18 @@ def _with_noise(state: Belief, count: int) -> Belief:
     return Belief(mean, covariance)
 
 
+def _numbers(values: FloatArray) -> FloatArray:
+    """Zero for what is not a number, the largest one for what is too large."""
+    return values if np.isfinite(values).all() else np.nan_to_num(values)
+
+
 def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
     """Axis by axis, the first belief where chosen."""
     if chosen.all():
         return first
     if not chosen.any():
         return second
-    return Belief(
-        np.where(chosen[:, None], first.mean, second.mean),
-        np.where(chosen[:, None, None], first.covariance, second.covariance),
-    )
+    mean, covariance = second.mean.copy("K"), second.covariance.copy("K")
+    np.copyto(mean, first.mean, where=chosen[:, None])
+    np.copyto(covariance, first.covariance, where=chosen[:, None, None])
+    return Belief(mean, covariance)

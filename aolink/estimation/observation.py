@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
@@ -65,24 +67,28 @@ class PathMoments:
         Moments, of 1 and 2.
     gain:
         A constant gain (n_states, n_measurements) instead of the optimal one.
+    crosses:
+        Whether the cross moments of each two outputs follow, y_11 of a lenslet's x and y.
     """
 
     models_noise = False
 
-    def __init__(self, n_outputs: int, orders: Sequence[int], gain: FloatArray | None = None) -> None:
-        self.orders, self.gain = tuple(orders), gain
-        self.n_measurements = n_outputs * len(self.orders)
+    def __init__(
+        self, n_outputs: int, orders: Sequence[int], gain: FloatArray | None = None, *, crosses: bool = False
+    ) -> None:
+        self.orders, self.gain, self.crosses = tuple(orders), gain, crosses
+        self.n_measurements = n_outputs * len(self.orders) + crosses * math.comb(n_outputs, 2)
 
     def correct(
         self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
     ) -> Correction:
         """One step of the (extended) Kalman filter."""
-        h, H = predicted_moments(model, response, prior.mean, self.orders)
+        h, H = predicted_moments(model, response, prior.mean, self.orders, crosses=self.crosses)
         return corrected(prior, measured.value - h, H, measured.covariance, self.gain)
 
 
 def predicted_moments(
-    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int], *, crosses: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Moments of the path without process noise, and their Jacobian by the start state.
 
@@ -98,7 +104,7 @@ def predicted_moments(
 
     Returns
     -------
-    h (axes, n_outputs * orders) and H (axes, n_outputs * orders, n_states); an output's orders are together.
+    h (axes, m) and H (axes, m, n_states); an output's orders are together, cross moments come last.
     """
     moments, slopes = [], []
     for o in range(model.plant.n_outputs):
@@ -109,6 +115,12 @@ def predicted_moments(
             half = stacked.matvec(model.quadratic[o], state) + response.slope[:, o]
             moments.append(stacked.dot(state, half + response.slope[:, o]) + response.square[:, o])
             slopes.append(2 * half)
+    for o, p in itertools.combinations(range(model.plant.n_outputs), 2) if crosses else ():
+        # mean (a'x + c)(b'x + d) = x'M_ab x + (b_ad + b_bc)'x + s_cd
+        mixed = stacked.matvec(model.cross_quadratic(o, p), state)
+        slope, square = model.cross_response(response, o, p)
+        moments.append(stacked.dot(state, mixed + slope) + square)
+        slopes.append(2 * mixed + slope)
     h = np.empty((len(moments), len(state)))
     H = np.empty((len(moments), model.plant.n_states, len(state)))
     for m, (moment, slope) in enumerate(zip(moments, slopes, strict=True)):
@@ -124,8 +136,9 @@ def corrected(
     Mishra & Wen (18) to (20), with the innovation y - h(x). ``gain`` (n_states, n_measurements) stands in
     for the optimal one; Joseph's form gives the covariance that it really has.
     """
+    R = stacked.batch_last(R)
     PH = stacked.matmul(prior.covariance, stacked.transpose(H))
-    S = stacked.symmetric(stacked.matmul(H, PH) + R)
+    S = stacked.matmul(H, PH) + R
     S_inverse = stacked.inverse(S)
     K = stacked.matmul(PH, S_inverse) if gain is None else gain
     mean = prior.mean + stacked.matvec(K, innovation)

@@ -21,6 +21,13 @@ def tile(matrix: FloatArray, axes: int) -> FloatArray:
     return np.asarray(np.moveaxis(copies, -1, 0))
 
 
+def batch_last(a: FloatArray) -> FloatArray:
+    """The same array, (axes, ...), contiguous in memory along the batch."""
+    copy = np.empty((*a.shape[1:], a.shape[0])).transpose((a.ndim - 1, *range(a.ndim - 1)))
+    copy[...] = a
+    return copy
+
+
 def transpose(a: FloatArray) -> FloatArray:
     """(..., n, m) -> (..., m, n)"""
     return a.swapaxes(-1, -2)
@@ -30,27 +37,33 @@ def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """(..., n, k) @ (..., k, m)"""
     if a.shape[-1] > _WRITTEN_OUT:
         return np.asarray(np.matmul(np.ascontiguousarray(a), np.ascontiguousarray(b)))
-    out: FloatArray = a[..., :, 0, None] * b[..., None, 0, :]
-    for j in range(1, a.shape[-1]):
-        out += a[..., :, j, None] * b[..., None, j, :]
-    return out
+    return _sum_of_products(
+        [a[..., :, j, None] for j in range(a.shape[-1])], [b[..., None, j, :] for j in range(b.shape[-2])]
+    )
 
 
 def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
     """(..., n, k) @ (..., k)"""
     if a.shape[-1] > _WRITTEN_OUT:
         return matmul(a, x[..., None])[..., 0]
-    out: FloatArray = a[..., 0] * x[..., 0, None]
-    for j in range(1, a.shape[-1]):
-        out += a[..., j] * x[..., j, None]
-    return out
+    return _sum_of_products([a[..., j] for j in range(a.shape[-1])], [x[..., j, None] for j in range(x.shape[-1])])
 
 
 def dot(x: FloatArray, y: FloatArray) -> FloatArray:
     """(..., k) . (..., k)"""
-    out: FloatArray = x[..., 0] * y[..., 0]
-    for j in range(1, x.shape[-1]):
-        out += x[..., j] * y[..., j]
+    return _sum_of_products([x[..., j] for j in range(x.shape[-1])], [y[..., j] for j in range(y.shape[-1])])
+
+
+def _sum_of_products(left: list[FloatArray], right: list[FloatArray]) -> FloatArray:
+    """left[0] * right[0] + left[1] * right[1] + ..., in this order."""
+    shape = np.broadcast_shapes(left[0].shape, right[0].shape)
+    # NumPy would put the small axes innermost where it cannot tell; long batches want the batch there.
+    order = (len(shape) - 1, *range(len(shape) - 1))
+    out, product = (np.empty((*shape[1:], *shape[:1])).transpose(order) for _ in range(2))
+    np.multiply(left[0], right[0], out=out)
+    for a, b in zip(left[1:], right[1:], strict=True):
+        np.multiply(a, b, out=product)
+        out += product
     return out
 
 

@@ -1,0 +1,97 @@
+"""Image kernels on a plane of pixels, whose two axes the kernel may couple.
+
+Positions are (x, y), x along the columns and y along the rows of a frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+FloatArray = NDArray[np.float64]
+
+_QUADRATURE = np.polynomial.legendre.leggauss(8)
+
+
+def kernel_covariance(width: FloatArray) -> FloatArray:
+    """Covariance of Psi(w) = exp(-w' Sigma^-2 w) / (pi |Sigma|), (2, 2): Sigma^2 / 2.
+
+    Mishra & Wen (4), with the constant that gives it unit mass.
+
+    Parameters
+    ----------
+    width:
+        Sigma, symmetric positive definite, slope units, (2, 2).
+    """
+    return np.asarray(width @ width / 2)
+
+
+def pixel_mass_2d(
+    covariance: FloatArray, x_edges: FloatArray, y_edges: FloatArray, positions: FloatArray
+) -> FloatArray:
+    """Share of a resting spot's light that each pixel gets.
+
+    Along x by quadrature within each column, along y given x by error functions.
+
+    Parameters
+    ----------
+    covariance:
+        Of the kernel, slope units squared, (2, 2).
+    x_edges, y_edges:
+        Edges of columns and rows, slope units, (columns + 1,) and (rows + 1,).
+    positions:
+        Where the spot rests, slope units, (..., 2).
+
+    Returns
+    -------
+    (..., rows, columns)
+    """
+    (xx, xy), (_, yy) = covariance
+    nodes, weights = _QUADRATURE
+    half = np.diff(x_edges) / 2
+    x = x_edges[:-1, None] + half[:, None] * (nodes + 1)  # (columns, nodes)
+    away = x - positions[..., 0, None, None]
+    across = np.exp(-(away**2) / (2 * xx)) / math.sqrt(2 * math.pi * xx) * half[:, None] * weights
+    # Given x, y is Gaussian about a line, with what x does not explain of its variance.
+    line = positions[..., 1, None, None] + xy / xx * away
+    sd = math.sqrt(2 * (yy - xy**2 / xx))
+    along = np.diff(erf((y_edges - line[..., None]) / sd) / 2, axis=-1)  # (..., columns, nodes, rows)
+    return np.asarray(np.einsum("...cn,...cnr->...rc", across, along))
+
+
+def kernel_moments_2d(covariance: FloatArray, pixel: tuple[float, float], highest: int) -> FloatArray:
+    """E[x^p y^q] of a resting spot about its position, as sums over pixel centres find it, by p and q.
+
+    Parameters
+    ----------
+    pixel:
+        Width and height of a pixel, slope units.
+
+    Returns
+    -------
+    (highest + 1, highest + 1); entries with p + q > highest are zero.
+    """
+    total = np.array(covariance, dtype=np.float64)
+    gaussian = np.zeros((highest + 1, highest + 1))
+    gaussian[0, 0] = 1.0
+    for p in range(highest + 1):
+        for q in range(highest + 1 - p):
+            # Stein: E[x f] = sum_j cov(x, x_j) E[df/dx_j].
+            if p >= 1 and p + q >= 2:
+                gaussian[p, q] = (p - 1) * total[0, 0] * (gaussian[p - 2, q] if p >= 2 else 0.0)
+                gaussian[p, q] += q * total[0, 1] * (gaussian[p - 1, q - 1] if q >= 1 else 0.0)
+            elif q >= 2:
+                gaussian[p, q] = (q - 1) * total[1, 1] * gaussian[0, q - 2]
+    square = [[(w / 2) ** k / (k + 1) if k % 2 == 0 else 0.0 for k in range(highest + 1)] for w in pixel]
+    out = np.zeros_like(gaussian)
+    for p in range(highest + 1):
+        for q in range(highest + 1 - p):
+            out[p, q] = sum(
+                math.comb(p, a) * math.comb(q, b) * gaussian[a, b] * square[0][p - a] * square[1][q - b]
+                for a in range(p + 1)
+                for b in range(q + 1)
+            )
+    return out

@@ -1,0 +1,41 @@
+"""The bits of an estimate do not depend on the number of threads."""
+
+import os
+import subprocess
+import sys
+
+PROGRAM = """
+import hashlib
+import dataclasses
+import numpy as np
+from aolink.estimation import ESTIMATOR_NAMES, exposure_model, run
+from aolink.estimation.filter import BlurFilter
+from aolink.estimation.windowed import Profile, WindowedMoments
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+digest = hashlib.sha256()
+rig = load_rig("section-vi-lively")
+for estimates in run(rig, simulate(rig, 10), ESTIMATOR_NAMES).values():
+    for e in estimates:
+        for value in (e.path, e.path_sd, e.end_state, e.end_covariance, e.coefficient_covariance, e.nis):
+            digest.update(value.tobytes())
+plant = dataclasses.replace(rig.plant, axes=64)
+rng = np.random.default_rng(1)
+profile = Profile(density=rng.standard_normal((64, 40)), mask=np.ones((64, 40), bool))
+model = exposure_model(plant, 200)
+step = BlurFilter(plant, WindowedMoments(rig.sensor)).step(model, model.response(rng.random((200, 64))), profile)
+digest.update(step.coefficients.covariance.tobytes())
+print(digest.hexdigest())
+"""
+
+
+def digest(threads: int) -> str:
+    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    environment = os.environ | dict.fromkeys(names, str(threads))
+    done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def test_one_thread_and_two_give_the_same_bits():
+    assert digest(1) == digest(2) != ""
