@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import sys
 from dataclasses import replace
@@ -12,7 +11,7 @@ from enum import StrEnum
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -20,7 +19,10 @@ from rich.markup import escape
 
 from aolink.errors import AolinkError, RigError
 from aolink.rig import Rig, load_rig, parse_light
-from aolink.terminal import StopRequest, ask, progress_bar
+from aolink.terminal import StopRequest, ask, input_ended, progress_bar
+
+if TYPE_CHECKING:
+    from aolink.recording.reader import Recording
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -39,6 +41,9 @@ EstimatorOption = Annotated[
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+
+_MOST_EXPOSURES = 2**32 - 1
 
 
 class Light(StrEnum):
@@ -72,9 +77,6 @@ def main() -> None:
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # the reader of a pipe has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
 
 
 def _load_checked(path_or_name: str) -> Rig:
@@ -88,6 +90,16 @@ def _load_checked(path_or_name: str) -> Rig:
         if finding.severity == "warning":
             _err.print(f"aolink: warning: {escape(finding.key)}: {escape(finding.message)}")
     return loaded
+
+
+def _open(file: Path) -> Recording:
+    """Open a recording, and say so where it is not whole."""
+    from aolink.recording.reader import Recording
+
+    recording = Recording(file)
+    if recording.damage:
+        _err.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
+    return recording
 
 
 def _command() -> str:
@@ -109,6 +121,7 @@ def rig(
             help="What the camera sees, start after start: dark, flat, flat:DENSITY, still, moving; the last stays.",
         ),
     ] = None,
+    tied: Annotated[bool, typer.Option("--tied", help="End when standard input does: for a parent process.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
@@ -135,7 +148,7 @@ def rig(
                 " --estimator o3 --exposures 100 -o session.mcap\nCtrl-C stops it.",
                 flush=True,
             )
-        server.run(stop)
+        server.run(lambda: stop() or (tied and input_ended()))
         for stream in streams.values():
             stream.close()
 
@@ -201,7 +214,7 @@ def record(
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What the devices are: a rig file or the name of one.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
     estimator: EstimatorOption = None,
-    exposures: Annotated[int | None, typer.Option(min=1, help="How many exposures.")] = None,
+    exposures: Annotated[int | None, typer.Option(min=1, max=_MOST_EXPOSURES, help="How many exposures.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="How long, in seconds of device time.")] = None,
     note: Annotated[str, typer.Option(metavar="TEXT", help="Goes into the recording.")] = "",
     calibration: Annotated[
@@ -209,6 +222,7 @@ def record(
         typer.Option(help="Frames of this for `aolink calibrate`: the mirror stays parked, whatever the rig's drive."),
     ] = None,
     overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Record a session: play the rig's drive, record everything, estimate on the way.
 
@@ -220,9 +234,10 @@ def record(
     if exposures is not None and duration is not None:
         raise typer.BadParameter("give --exposures or --duration, not both")
     if duration is not None:
-        if not duration > 0:
-            raise typer.BadParameter("--duration must be above zero")
-        exposures = max(1, math.ceil(duration / (loaded.timing.frame_period_steps * loaded.timing.fast_step_s)))
+        periods = duration / (loaded.timing.frame_period_steps * loaded.timing.fast_step_s)
+        if not 0 < periods <= _MOST_EXPOSURES:
+            raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
+        exposures = math.ceil(periods)
     with StopRequest().installed() as stop, progress_bar(_err, exposures) as tell:
         report = session.record(
             loaded,
@@ -239,8 +254,14 @@ def record(
         )
     from aolink import tables
 
-    _out.print(tables.session(report))
-    _out.print(f"{output}: {report.exposures} exposures, {report.ended}; look at it: aolink view {output}")
+    for warning in report.warnings:
+        _err.print(f"aolink: warning: {escape(warning)}")
+    if as_json:
+        print(json.dumps(tables.session_as_json(report), allow_nan=False))
+    else:
+        _out.print(tables.session(report))
+        text = f"{output}: {report.exposures} exposures, {report.ended}; look at it: {_command()} view {output}"
+        _out.print(text, markup=False)
     stop.exit_if_asked()
 
 
@@ -300,12 +321,11 @@ def calibrate(
 def info(file: FileArgument, as_json: JsonOption = False) -> None:
     """Say what a recording holds."""
     from aolink import tables
-    from aolink.recording.reader import Recording
 
-    recording = Recording(file)
+    recording = _open(file)
     facts = tables.recording_facts(recording)
     if as_json:
-        print(json.dumps(facts))
+        print(json.dumps(facts, allow_nan=False))
     else:
         _out.print(tables.facts(facts))
 
@@ -325,29 +345,30 @@ def estimate(
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
 
-    recording = Recording(file)
+    recording = _open(file)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     total = recording.counts.get("/camera/image", 0)
-    if output is not None:
-        with progress_bar(_err, total) as tell:
+    with progress_bar(_err, total) as tell:
+        if output is not None:
             write_reestimated(recording, names, output, overwrite=overwrite, progress=lambda n: tell("estimate", n))
-        recording = Recording(output)
-        estimates = {name: recording.estimates(name) for name in names}
-    else:
-        with progress_bar(_err, total) as tell:
+            written = Recording(output)
+            estimates = {name: written.estimates(name) for name in names}
+        else:
             estimates = reestimate(recording, names, lambda n: tell("estimate", n))
+    differences = {
+        name: first_difference(recording.estimates(name), estimates[name])
+        for name in names
+        if name in recording.estimators
+    }
     scores = tables.score_all(recording, estimates)
     if as_json:
-        print(json.dumps(tables.scores_as_json(scores)))
+        print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
         return
     _out.print(tables.scores(scores))
-    online = Recording(file)
-    for name in names:
-        if name in online.estimators:
-            difference = first_difference(online.estimates(name), estimates[name])
-            _out.print(f"{name}: {difference or 'the same as recorded, bit for bit'}")
+    for name, difference in differences.items():
+        _out.print(f"{name}: {difference or 'the same as recorded, bit for bit'}")
     if output is not None:
-        _out.print(f"written: {output}")
+        _out.print(f"written: {output}", markup=False)
 
 
 @app.command(epilog="Example: aolink view session.mcap --screenshot session.png")
@@ -368,22 +389,21 @@ def view(
     import tempfile
 
     from aolink import viewing
-    from aolink.recording.reader import Recording
 
     for target in (save, screenshot):
         if target is not None and target.exists() and not overwrite:
             raise AolinkError(
                 f"{target} exists and is not overwritten: give another name, or --overwrite to replace it"
             )
-    recording = Recording(file)
+    recording = _open(file)
     with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
         rrd = save or Path(folder) / f"{file.stem}.rrd"
         viewing.save_rrd(recording, rrd, overwrite=overwrite)
         if save is not None:
-            _out.print(f"written: {save}")
+            _out.print(f"written: {save}", markup=False)
         if screenshot is not None:
             viewing.screenshot(rrd, screenshot)
-            _out.print(f"written: {screenshot}")
+            _out.print(f"written: {screenshot}", markup=False)
         if web:
             viewing.serve_web(rrd, on_ready=lambda address: _out.print(f"{address}\nCtrl-C stops it."))
         elif save is None and screenshot is None:
@@ -409,12 +429,13 @@ def demo(
         result = run_demo(
             loaded, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
         )  # fmt: skip
-    recording = Recording(result.recording)
-    estimates = {name: recording.estimates(name) for name in recording.estimators}
-    _out.print(tables.scores(tables.score_all(recording, estimates)))
+    if not stop():
+        recording = Recording(result.recording)
+        estimates = {name: recording.estimates(name) for name in recording.estimators}
+        _out.print(tables.scores(tables.score_all(recording, estimates)))
     _out.print(tables.session(result.report))
     for line in tables.demo_summary(result, _command()):
-        _out.print(line)
+        _out.print(line, markup=False)
     stop.exit_if_asked()
     if result.differences:
         raise typer.Exit(1)

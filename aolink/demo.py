@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import select
 import subprocess
 import sys
 import time
@@ -26,7 +27,8 @@ class DemoResult:
     """What the demo made."""
 
     recording: Path
-    rrd: Path
+    rrd: Path | None
+    """None if the demo was interrupted before."""
     picture: Path | None
     no_picture: str
     """Why there is no picture; empty where there is one."""
@@ -46,14 +48,16 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
     DeviceError
         The process does not start.
     """
-    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", *options]
+    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
     # A group of its own: Ctrl-C is for the session, which still has to park the mirror.
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, start_new_session=True)
+    # Its input is a pipe that ends with this process, and the rig with it, whatever ends this process.
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, start_new_session=True)
     try:
         assert process.stdout is not None
-        line = process.stdout.readline()
+        ready, _, _ = select.select([process.stdout], [], [], _RIG_START_S)
+        line = process.stdout.readline() if ready else b""
         if not line:
-            raise DeviceError(f"the simulated rig did not start: {' '.join(command)} ended with {process.wait()}")
+            raise DeviceError(f"the simulated rig did not start; try it by hand: {' '.join(command)}")
         ports = json.loads(line)
         yield ports["camera"], ports["mirror"]
     finally:
@@ -62,8 +66,9 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
             process.wait(5)
         process.kill()
         process.wait()
-        if process.stdout:
-            process.stdout.close()
+        for pipe in (process.stdin, process.stdout):
+            if pipe:
+                pipe.close()
 
 
 def new_folder(parent: Path) -> Path:
@@ -112,6 +117,11 @@ def run_demo(
         report = record(
             rig, camera, mirror, path, estimators=ESTIMATORS, exposures=exposures, note="aolink demo", stop=stop,
             progress=tell,
+        )  # fmt: skip
+    if stop():
+        return DemoResult(
+            recording=path, rrd=None, picture=None, no_picture="interrupted", report=report, differences={},
+            seconds=seconds,
         )  # fmt: skip
     with part("estimate again") as tell:
         recording = Recording(path)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,7 @@ _LATENCY_STEPS = (
     ("frame complete to estimated", "complete_ns", "estimated_ns"),
     ("estimated to next command sent", "estimated_ns", "command_sent_ns"),
     ("command sent to acknowledged", "command_sent_ns", "command_acknowledged_ns"),
+    ("command sent to applied", "command_sent_ns", "command_applied_ns"),
 )
 
 
@@ -46,12 +48,22 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
         "file": str(recording.path),
         "bytes": recording.path.stat().st_size,
         "complete": recording.complete,
+        "damage": recording.damage,
         "duration_s": duration_s,
         "messages": dict(sorted(recording.counts.items())),
         "truth": topics.TRUTH in recording.counts,
+        "session": {name: _typed(name, value) for name, value in recording.metadata.items()},
         "estimators": recording.estimators,
-        **recording.metadata,
     }
+
+
+def _typed(name: str, value: str) -> Any:
+    """A value of the metadata, which knows text only."""
+    if name in ("note", "rig", "rig_digest", "camera", "mirror"):
+        return value
+    with contextlib.suppress(ValueError):
+        return _without_nan(float(value) if not value.lstrip("-").isdigit() else int(value))
+    return {"True": True, "False": False}.get(value, value)
 
 
 def facts(values: Mapping[str, Any]) -> Table:
@@ -59,14 +71,15 @@ def facts(values: Mapping[str, Any]) -> Table:
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in values.items():
+    flat = {name: value for name, value in values.items() if name != "session"} | values["session"]
+    for name, value in flat.items():
+        if name in ("damage", "warnings") and not value:
+            continue
         if isinstance(value, Mapping):
             value = ", ".join(f"{key} {count}" for key, count in value.items())
         elif isinstance(value, list):
             value = " ".join(value) or "none"
         table.add_row(name, escape(str(value)))
-    if not values.get("complete", True):
-        table.add_row("note", "the file does not end as a recording should: it was cut off, this is what is whole")
     return table
 
 
@@ -75,7 +88,7 @@ def scores(by_name: Mapping[str, Score]) -> Table:
     counted = next((each.exposures for each in by_name.values()), 0)
     title = f"Estimates of {counted} exposures against the truth" if counted else "No truth in this recording: NIS only"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, caption_justify="left", pad_edge=False)
-    table.add_column("estimator")
+    table.add_column("estimator", no_wrap=True)
     columns: dict[str, Callable[[Score], str]] = {"NIS": lambda each: _consistency(each.nis)}
     if counted:
         columns = {
@@ -121,7 +134,21 @@ def scores_as_json(by_name: Mapping[str, Score]) -> dict[str, Any]:
 def _without_nan(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _without_nan(each) for key, each in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value
+    if isinstance(value, list):
+        return [_without_nan(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def session_as_json(report: Report) -> dict[str, Any]:
+    """What `session` says, for scripts."""
+    facts = asdict(replace(report, latencies=[]))
+    del facts["latencies"]
+    facts["latency_ms"] = {
+        name: dict(zip(("p50", "p99"), values, strict=True))
+        for name, since, until in _LATENCY_STEPS
+        if (values := _latency_ms(report.latencies, since, until)[1:])
+    }
+    return dict(_without_nan(facts))
 
 
 def session(report: Report) -> Table:
@@ -135,7 +162,8 @@ def session(report: Report) -> Table:
     table.add_row(
         "link",
         f"packets thrown away: {report.packets_bad_crc} for their checksum, {report.packets_bad_framing} for their"
-        f" framing; {report.packets_missing} missing by their numbers",
+        f" framing, {report.packets_bad_payload} for their content; {report.packets_duplicate} came twice;"
+        f" {report.packets_missing} missing by their numbers",
     )
     table.add_row(
         "commands",
@@ -156,19 +184,26 @@ def session(report: Report) -> Table:
 
 
 def _percentiles(latencies: Sequence[pb.Latency], since: str, until: str) -> str:
+    count, *percentiles = _latency_ms(latencies, since, until)
+    if not percentiles:
+        return "no sample"
+    return f"p50 {percentiles[0]:.2f} ms, p99 {percentiles[1]:.2f} ms ({count:.0f} frames)"
+
+
+def _latency_ms(latencies: Sequence[pb.Latency], since: str, until: str) -> list[float]:
+    """Number of frames, median and 99th percentile; the number alone where it is zero."""
     values = [
         (getattr(each, until) - getattr(each, since)) / 1e6
         for each in latencies
         if getattr(each, until) and getattr(each, since)
     ]
-    if not values:
-        return "no sample"
-    middle, high = np.percentile(values, [50, 99])
-    return f"p50 {middle:.2f} ms, p99 {high:.2f} ms ({len(values)} frames)"
+    return [len(values), *map(float, np.percentile(values, [50, 99]))] if values else [0.0]
 
 
 def demo_summary(result: DemoResult, command: str) -> list[str]:
     """What came of the demo, and what to run next with ``command``."""
+    if result.rrd is None:
+        return [f"interrupted; what was recorded is in {result.recording}"]
     if result.differences:
         lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
     else:

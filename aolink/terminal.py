@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import select
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class StopRequest:
-    """Ctrl-C and SIGTERM end a session in good order; a second one ends it at once."""
+    """Ctrl-C, SIGTERM and SIGHUP end a session in good order; a second one ends it at once."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -29,7 +31,8 @@ class StopRequest:
 
     @contextmanager
     def installed(self) -> Iterator[StopRequest]:
-        before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        before = {number: signal.signal(number, self._handle) for number in signals}
         try:
             yield self
         finally:
@@ -66,3 +69,9 @@ def ask(console: Console, question: str) -> str:
     """Put a question; gives the line that answers it. Raises EOFError if there is none."""
     console.print(question, end="", markup=False)
     return input()
+
+
+def input_ended() -> bool:
+    """Whether standard input is at its end; what comes on it otherwise is thrown away."""
+    readable, _, _ = select.select([0], [], [], 0)
+    return bool(readable) and not os.read(0, 4096)

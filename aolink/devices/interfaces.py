@@ -61,6 +61,10 @@ class Camera(Device, Protocol):
     def stop(self) -> None:
         """Take no more frames. Raises DeviceError."""
 
+    @property
+    def chunks_refused(self) -> int:
+        """Chunks that made no sense."""
+
     def flush(self) -> list[Frame]:
         """The frame that is still incomplete, as it is."""
 
@@ -73,6 +77,8 @@ class Mirror(Device, Protocol):
         """Blocks sent and not yet answered."""
 
     retransmits: int
+    queue_end_step: int
+    """First fast step that nothing is queued for on the device, as last heard."""
     round_trip_s: float
     """Of commands, smoothed; NaN before the first."""
 

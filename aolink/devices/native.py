@@ -22,7 +22,8 @@ from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
 _FIRST_TIMEOUT_S = 0.1
 _MIN_TIMEOUT_S = 0.02
 _MAX_TIMEOUT_S = 0.5
-_MAX_TRIES = 8
+_PATIENCE_S = 10.0
+"""A block that is not answered for so long, however often it was sent, means that the mirror is gone."""
 _MAX_QUERIES = 32
 
 
@@ -75,6 +76,10 @@ class NativeCamera(_NativeDevice):
     def flush(self) -> list[Frame]:
         return self._frames.flush()
 
+    @property
+    def chunks_refused(self) -> int:
+        return self._frames.refused
+
     def handle(self, received: Received) -> list[Event]:
         message = received.message
         if isinstance(message, pb.FrameChunk):
@@ -103,6 +108,7 @@ class NativeMirror(_NativeDevice):
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
         super().__init__(hub, link, identity)
         self.retransmits = 0
+        self.queue_end_step = 0
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
         # Smoothed round trip and its mean deviation, as TCP has them (RFC 6298).
@@ -144,18 +150,18 @@ class NativeMirror(_NativeDevice):
         for flight in self._flights.values():
             if flight.deadline_ns > now_ns:
                 continue
-            if flight.tries >= _MAX_TRIES:
+            if now_ns - flight.first_sent_ns > _PATIENCE_S * 1e9:
                 raise DeviceError(
                     f"the mirror has not acknowledged a command that was sent {flight.tries} times:"
                     " is it still connected?"
                 )
             flight.tries += 1
-            flight.deadline_ns = now_ns + self._timeout_ns() * (1 << min(flight.tries, 4))
+            backed_off_ns = self._timeout_ns() << min(flight.tries, 4)
+            flight.deadline_ns = now_ns + min(backed_off_ns, round(_MAX_TIMEOUT_S * 1e9))
             self.retransmits += 1
             self.link.send(flight.block)
 
     def park(self) -> None:
-        self._flights.clear()
         self._request(pb.Park(), "park")
 
     def handle(self, received: Received) -> list[Event]:
@@ -175,6 +181,7 @@ class NativeMirror(_NativeDevice):
         if ack.code == pb.QUEUE_FULL:  # not an answer to keep: it is sent again when its time-out comes
             return []
         del self._flights[ack.block_id]
+        self.queue_end_step = ack.queue_end_step
         if flight.tries == 1:  # otherwise nobody knows which of them was answered (Karn)
             self._measure(max(0, receive_ns - flight.first_sent_ns) / 1e9)
         if ack.code in (pb.OUT_OF_RANGE, pb.WRONG_SHAPE, pb.NOT_SUPPORTED):
@@ -213,7 +220,8 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
         heard = link.counts.bytes_received
         what = f"{heard} bytes came that are not aolink packets" if heard else "nothing came"
         raise DeviceError(
-            f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on?"
+            f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on,"
+            " does another host have it?"
         )
     else:
         found = identity.protocol_version
@@ -241,8 +249,11 @@ def check_kind(link: Link, identity: pb.Identity, kind: pb.Identity.Kind) -> Non
         )
 
 
-def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> None:
-    """Refuse devices that are not what the rig file says. Raises DeviceError naming the first difference."""
+def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> list[str]:
+    """Refuse devices that are not what the rig file says; gives what else is doubtful, in words.
+
+    Raises DeviceError naming the first difference.
+    """
     if camera.virtual_time != mirror.virtual_time or (
         camera.virtual_time and camera.serial_number != mirror.serial_number
     ):
@@ -270,3 +281,9 @@ def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> Non
                 f"the rig file {rig.name} does not match the device: {name} is {expected} in the file,"
                 f" {found} on the device; give the rig file of this device (--rig)"
             )
+    return [
+        f"the {line} was made from another rig file than {rig.name}: sizes agree, other numbers (noise, kernel, plant)"
+        " may not, and estimates may be wrong by it"
+        for line, identity in (("camera", camera), ("mirror", mirror))
+        if identity.rig_digest and identity.rig_digest != rig.digest
+    ][:1]

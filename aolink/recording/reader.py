@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
+import lz4.frame
+import zstandard
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
-from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from aolink.assembly import Assembler
 from aolink.errors import RecordingError, RigError
@@ -56,8 +58,8 @@ class Recording:
         """Facts about the session, from its start and its end."""
         self.counts: dict[str, int] = {}
         """Messages by topic."""
-        self.complete = False
-        """Whether the file ends as a recording should."""
+        self.damage = ""
+        """Why the file cannot be read to its end, in words; empty where it can."""
         self.start_ns = self.end_ns = 0
         """Log times of the first and of the last message."""
         rig_text = self._survey()
@@ -67,6 +69,11 @@ class Recording:
             self.rig: Rig = parse_rig(rig_text)
         except RigError as error:
             raise RecordingError(f"{self.path} holds a rig file that this aolink does not take: {error}") from None
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file ends as a recording should."""
+        return not self.damage
 
     @property
     def estimators(self) -> list[str]:
@@ -169,7 +176,7 @@ class Recording:
             elif isinstance(record, Channel):
                 names[record.id] = record.topic
             elif isinstance(record, Attachment) and record.name == topics.RIG_ATTACHMENT:
-                rig_text = record.data.decode()
+                rig_text = record.data.decode(errors="replace")
             elif isinstance(record, Metadata) and record.name in (topics.SESSION_METADATA, topics.END_METADATA):
                 self.metadata.update(record.metadata)
         return rig_text
@@ -179,14 +186,21 @@ class Recording:
         try:
             with self.path.open("rb") as file:
                 try:
-                    yield from StreamReader(file, validate_crcs=True, record_size_limit=_MAX_RECORD).records
-                    self.complete = True
+                    for record in StreamReader(file, emit_chunks=True, record_size_limit=_MAX_RECORD).records:
+                        if isinstance(record, Chunk):
+                            yield from breakup_chunk(_decompressed(record), validate_crc=True)
+                        else:
+                            yield record
                 except InvalidMagic:
                     if file.tell() <= _MAGIC_BYTES:
                         raise RecordingError(f"{self.path} is not a recording: it is not an MCAP file") from None
-                except _DAMAGE:
+                    self.damage = "it was cut off at its very end"
+                except EndOfFile:
                     if file.tell() < _MAGIC_BYTES:
                         raise RecordingError(f"{self.path} is empty or too short to be a recording") from None
+                    self.damage = f"it was cut off: it ends at byte {file.tell()}, in the middle of a record"
+                except _DAMAGE as error:
+                    self.damage = f"it is damaged before byte {file.tell()} ({error}): what comes after is not read"
         except OSError as error:
             raise RecordingError(f"cannot read {self.path}: {os.strerror(error.errno or 0).lower()}") from None
 
@@ -194,4 +208,28 @@ class Recording:
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
 _MAGIC_BYTES = 8
 # What the mcap library and the decompressors raise on a file that is cut off or damaged.
-_DAMAGE = (McapError, CRCValidationError, struct.error, RuntimeError, ValueError, EOFError, KeyError)
+_DAMAGE = (
+    McapError,
+    CRCValidationError,
+    struct.error,
+    RuntimeError,
+    ValueError,
+    EOFError,
+    KeyError,
+    zstandard.ZstdError,
+)
+
+
+def _decompressed(chunk: Chunk) -> Chunk:
+    """A chunk without compression. It may say one size and hold another: neither may fill the memory."""
+    if chunk.uncompressed_size > _MAX_RECORD:
+        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+    if chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
+    elif chunk.compression == "zstd":
+        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(chunk.uncompressed_size + 1)
+    else:
+        return chunk
+    if len(data) != chunk.uncompressed_size:
+        raise ValueError("a chunk that is not of the size that it says")
+    return replace(chunk, compression="", data=data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import fields
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,14 @@ def write_reestimated(
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
     driver, done = Driver(recording.rig, names), 0
-    metadata = recording.metadata | {"estimators": " ".join(names)}
+    metadata = recording.metadata | {
+        "aolink_version": version("aolink"),
+        "estimators": " ".join(names),
+        "estimated_from": recording.path.name,
+        "recorded_with": recording.metadata.get("aolink_version", "unknown"),
+    }
+    if recording.damage:
+        metadata["damage"] = recording.damage
     with RecordingWriter(
         path, recording.rig, metadata, recording.start_ns, overwrite=overwrite, deterministic=True
     ) as writer:

@@ -62,7 +62,7 @@ class ClockSample(_message.Message):
     def __init__(self, device: _Optional[str] = ..., host_send_ns: _Optional[int] = ..., device_receive_ns: _Optional[int] = ..., device_send_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., round_trip_ns: _Optional[int] = ..., accepted: _Optional[bool] = ..., offset_ns: _Optional[float] = ..., frequency_ppm: _Optional[float] = ..., sigma_ns: _Optional[float] = ...) -> None: ...
 
 class LinkStatistics(_message.Message):
-    __slots__ = ("device", "packets_received", "bytes_received", "packets_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s")
+    __slots__ = ("device", "packets_received", "bytes_received", "packets_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s", "queue_end_step")
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     PACKETS_RECEIVED_FIELD_NUMBER: _ClassVar[int]
     BYTES_RECEIVED_FIELD_NUMBER: _ClassVar[int]
@@ -76,6 +76,7 @@ class LinkStatistics(_message.Message):
     RETRANSMITS_FIELD_NUMBER: _ClassVar[int]
     COMMANDS_IN_FLIGHT_FIELD_NUMBER: _ClassVar[int]
     ROUND_TRIP_S_FIELD_NUMBER: _ClassVar[int]
+    QUEUE_END_STEP_FIELD_NUMBER: _ClassVar[int]
     device: str
     packets_received: int
     bytes_received: int
@@ -89,10 +90,11 @@ class LinkStatistics(_message.Message):
     retransmits: int
     commands_in_flight: int
     round_trip_s: float
-    def __init__(self, device: _Optional[str] = ..., packets_received: _Optional[int] = ..., bytes_received: _Optional[int] = ..., packets_sent: _Optional[int] = ..., bytes_sent: _Optional[int] = ..., bad_crc: _Optional[int] = ..., bad_framing: _Optional[int] = ..., bad_payload: _Optional[int] = ..., sequence_gaps: _Optional[int] = ..., duplicates: _Optional[int] = ..., retransmits: _Optional[int] = ..., commands_in_flight: _Optional[int] = ..., round_trip_s: _Optional[float] = ...) -> None: ...
+    queue_end_step: int
+    def __init__(self, device: _Optional[str] = ..., packets_received: _Optional[int] = ..., bytes_received: _Optional[int] = ..., packets_sent: _Optional[int] = ..., bytes_sent: _Optional[int] = ..., bad_crc: _Optional[int] = ..., bad_framing: _Optional[int] = ..., bad_payload: _Optional[int] = ..., sequence_gaps: _Optional[int] = ..., duplicates: _Optional[int] = ..., retransmits: _Optional[int] = ..., commands_in_flight: _Optional[int] = ..., round_trip_s: _Optional[float] = ..., queue_end_step: _Optional[int] = ...) -> None: ...
 
 class Latency(_message.Message):
-    __slots__ = ("frame_id", "exposure_end_ns", "first_byte_ns", "complete_ns", "estimated_ns", "command_sent_ns", "command_acknowledged_ns")
+    __slots__ = ("frame_id", "exposure_end_ns", "first_byte_ns", "complete_ns", "estimated_ns", "command_sent_ns", "command_acknowledged_ns", "command_applied_ns")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     EXPOSURE_END_NS_FIELD_NUMBER: _ClassVar[int]
     FIRST_BYTE_NS_FIELD_NUMBER: _ClassVar[int]
@@ -100,6 +102,7 @@ class Latency(_message.Message):
     ESTIMATED_NS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_SENT_NS_FIELD_NUMBER: _ClassVar[int]
     COMMAND_ACKNOWLEDGED_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_APPLIED_NS_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     exposure_end_ns: int
     first_byte_ns: int
@@ -107,7 +110,8 @@ class Latency(_message.Message):
     estimated_ns: int
     command_sent_ns: int
     command_acknowledged_ns: int
-    def __init__(self, frame_id: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., first_byte_ns: _Optional[int] = ..., complete_ns: _Optional[int] = ..., estimated_ns: _Optional[int] = ..., command_sent_ns: _Optional[int] = ..., command_acknowledged_ns: _Optional[int] = ...) -> None: ...
+    command_applied_ns: int
+    def __init__(self, frame_id: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., first_byte_ns: _Optional[int] = ..., complete_ns: _Optional[int] = ..., estimated_ns: _Optional[int] = ..., command_sent_ns: _Optional[int] = ..., command_acknowledged_ns: _Optional[int] = ..., command_applied_ns: _Optional[int] = ...) -> None: ...
 
 class Estimate(_message.Message):
     __slots__ = ("estimator", "frame_id", "first_step", "n_steps", "status", "reason", "axes", "n_states", "n_coefficients", "n_measurements", "end_state", "end_covariance", "coefficients", "coefficient_covariance", "innovation", "innovation_covariance", "nis")

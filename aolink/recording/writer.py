@@ -33,9 +33,10 @@ FLUSH_S = 0.1
 FSYNC_S = 1.0
 """How often the file goes to the disk: a power cut loses no more than that and twice FLUSH_S."""
 CHUNK_BYTES = 128 << 10
-_QUEUE_MESSAGES = 50_000
-_QUEUE_WAIT_S = 5.0
-"""A disk that stalls for longer stops the session."""
+_QUEUE_BYTES = 256 << 20
+"""What may wait for the disk."""
+_STALL_S = 5.0
+"""A disk that takes longer over one write stops the session."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,8 @@ class _File:
     """A file that writes all or raises, and can be cut back to its last whole part."""
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
+        if path.is_dir():
+            raise RecordingError(f"{path} is a folder: give the name of a file in it")
         flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL)
         try:
             self.descriptor = os.open(path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
@@ -127,7 +130,10 @@ class RecordingWriter:
         self._end_metadata: dict[str, str] = {}
         self._error: RecordingError | None = None
         self._closed = False
-        self._queue: queue.Queue[_Item | None] = queue.Queue(_QUEUE_MESSAGES)
+        self._queue: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
+        self._put_bytes = self._taken_bytes = 0
+        self._busy_since: float | None = None
+        """When the thread began what it is doing with the file."""
         try:
             self._begin(rig, metadata, start_ns)
         except OSError as error:
@@ -142,12 +148,18 @@ class RecordingWriter:
         if self._error:
             raise self._error
         item = _Item(topic, type(message), message.SerializeToString(deterministic=True), log_time_ns)
-        try:
-            self._queue.put(item, timeout=_QUEUE_WAIT_S)
-        except queue.Full:
-            raise RecordingError(
-                f"the disk of {self.path} has been too slow for {_QUEUE_WAIT_S:g} s: record to a faster one"
-            ) from None
+        while self._is_stalled() or self._put_bytes - self._taken_bytes > _QUEUE_BYTES:
+            if self._error:
+                raise self._error
+            if self._is_stalled() or not self._deterministic:  # who has time to wait, waits
+                raise RecordingError(f"the disk of {self.path} is too slow for this session: record to a faster one")
+            time.sleep(0.01)
+        self._put_bytes += len(item.data)
+        self._queue.put(item)
+
+    def _is_stalled(self) -> bool:
+        since = self._busy_since
+        return since is not None and time.monotonic() - since > _STALL_S
 
     def close(self, end_metadata: dict[str, str] | None = None) -> None:
         """Write what is queued, the index and ``end_metadata``. Raises RecordingError as `write` does."""
@@ -156,7 +168,10 @@ class RecordingWriter:
         self._closed = True
         self._end_metadata = end_metadata or {}
         self._queue.put(None)
-        self._thread.join()
+        while self._thread.is_alive() and not self._is_stalled():
+            self._thread.join(0.1)
+        if self._thread.is_alive():
+            raise RecordingError(f"the disk of {self.path} does not answer: the end of the recording may be missing")
         if self._error:
             raise self._error
 
@@ -190,25 +205,24 @@ class RecordingWriter:
                 item = self._queue.get(timeout=None if self._deterministic else FLUSH_S)
             except queue.Empty:
                 item = _NOTHING
-            if self._error:
-                if item is None:
-                    return
-                continue  # take what still comes, so that nobody waits
+            self._busy_since = time.monotonic()
             try:
                 if item is None:
                     self._finish()
                     return
                 if item is not _NOTHING:
                     self._add(item)
+                    self._taken_bytes += len(item.data)
                 elif self._chunk_start_ns is not None:
                     self._flush()
                 if not self._deterministic and time.monotonic() - last_sync > FSYNC_S:
                     os.fsync(self._file.descriptor)
                     last_sync = time.monotonic()
-            except OSError as error:
+            except Exception as error:  # whatever it is, the session must hear of it
                 self._give_up(error)
-                if item is None:
-                    return
+                return
+            finally:
+                self._busy_since = None
 
     def _add(self, item: _Item) -> None:
         channel = self._channels.get(item.topic)
@@ -245,14 +259,16 @@ class RecordingWriter:
             os.fsync(self._file.descriptor)
         self._file.close()
 
-    def _give_up(self, error: OSError) -> None:
+    def _give_up(self, error: Exception) -> None:
         """The disk is full or gone: leave a file that ends with its last whole part."""
         with contextlib.suppress(OSError):
             os.ftruncate(self._file.descriptor, self._whole)
         with contextlib.suppress(OSError):
             self._file.close()
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        what = "the disk is full" if full else os.strerror(error.errno or 0).lower()
+        what = repr(error)
+        if isinstance(error, OSError):
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+            what = "the disk is full" if full else os.strerror(error.errno or 0).lower()
         self._error = RecordingError(
             f"cannot write {self.path}: {what}; what was recorded until then is in it and can be read"
         )

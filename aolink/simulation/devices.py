@@ -92,10 +92,7 @@ class SimulatedDevices:
     def handle(self, line: Line, message: Message, sequence: int) -> None:
         """Act on a message from the host; the answers are in the outbox."""
         if isinstance(message, pb.Identify):
-            self.outbox = [o for o in self.outbox if o.line != line]
-            if line == "mirror":
-                self._acks.clear()
-            self._say(line, self._identity(line, message.nonce))
+            self._begin_session(line, message.nonce)
         elif isinstance(message, pb.CommandBlock) and line == "mirror":
             self._say(line, self._take_block(message))
         elif isinstance(message, pb.Park) and line == "mirror":
@@ -107,6 +104,20 @@ class SimulatedDevices:
         else:
             name = type(message).__name__
             self._say(line, pb.Ack(sequence=sequence, code=pb.NOT_SUPPORTED, text=f"a {line} does not take {name}"))
+
+    def _begin_session(self, line: Line, nonce: int) -> None:
+        """Whatever a host before left behind is over."""
+        self.outbox = [o for o in self.outbox if o.line != line]
+        identity = self._identity(line, nonce)
+        if line == "mirror":
+            self.park()
+            self._acks.clear()
+            self._reporting = False
+            identity.next_step = self.queue_end
+        else:
+            self._model.stop_camera()
+            self._camera_start = None
+        self._say(line, identity)
 
     def park(self, why: str = "") -> None:
         """Put the mirror into its safe state and empty the queue."""
@@ -152,6 +163,7 @@ class SimulatedDevices:
             next_step=self.queue_end,
             step_zero_ns=self._step_zero_ns,
             virtual_time=self._virtual_time,
+            rig_digest=rig.digest,
         )
         if line == "camera":
             identity.kind = pb.Identity.CAMERA
@@ -228,6 +240,8 @@ class SimulatedDevices:
         if not control.run:
             self._model.stop_camera()
             self._camera_start = None
+        elif control.first_step == self._camera_start:
+            pass  # asked again: the answer was lost
         elif control.first_step < self.step:
             text = f"fast step {control.first_step} has gone by, the next is {self.step}"
             return pb.Ack(sequence=sequence, code=pb.TOO_LATE, text=text)

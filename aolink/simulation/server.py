@@ -35,7 +35,7 @@ _TURNAROUND_NS = 5_000
 _IDLE_S = 0.5
 """Longest sleep in real time: the plant is never further behind than this."""
 _UNREAD_LIMIT = 16 << 20
-"""Bytes that wait for a host that does not read; in real time, frames beyond it are dropped."""
+"""Bytes that wait for a host that does not read; in real time, what is beyond it is dropped."""
 
 
 class Stream(Protocol):
@@ -92,11 +92,15 @@ class TcpStream:
         return (self._peer or self._listener).fileno()
 
     def read(self) -> bytes:
-        if self._peer is None:
-            with contextlib.suppress(BlockingIOError):
-                self._peer, _ = self._listener.accept()
+        with contextlib.suppress(BlockingIOError):
+            peer, _ = self._listener.accept()
+            if self._peer is not None:  # busy: say so at once
+                peer.close()
+            else:
+                self._peer = peer
                 self._peer.setblocking(False)
                 self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        if self._peer is None:
             return b""
         with contextlib.suppress(BlockingIOError):
             try:
@@ -320,7 +324,7 @@ class RigServer:
                     left = max(left, self._start_ns + math.ceil(elapsed / self._clock_rate))
                 self._now_ns = max(self._now_ns, left + self._latency_ns)
                 self._tell_time(line)
-            elif len(line.unsent) > _UNREAD_LIMIT and isinstance(out.message, pb.FrameChunk | pb.TruthChunk):
+            elif len(line.unsent) > _UNREAD_LIMIT:
                 continue
             line.put(out.message)
         outbox.clear()

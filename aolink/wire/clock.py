@@ -23,7 +23,7 @@ _SLOW_FACTOR = 4.0
 """A round trip longer than this many times the shortest says too little to be used."""
 _GATE_SIGMA = 6.0
 _STEP_AFTER = 4
-"""So many outliers in a row are no outliers: the device's clock was set."""
+"""So many refused in a row are right: the device's clock was set, or the line has become slower for good."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class ClockRegression:
 
     def __init__(self) -> None:
         self._samples: deque[ClockExchange] = deque(maxlen=_WINDOW)
-        self._outliers: list[ClockExchange] = []
+        self._refused: list[ClockExchange] = []
         self._reference: ClockExchange | None = None
         self._solution = np.zeros(2)
         self._covariance = np.full((2, 2), np.nan)
@@ -76,17 +76,16 @@ class ClockRegression:
             return False
         if self._samples:
             shortest = min(s.round_trip_ns for s in self._samples)
-            if exchange.round_trip_ns > _SLOW_FACTOR * max(shortest, _RESOLUTION_NS):
-                return False
+            slow = exchange.round_trip_ns > _SLOW_FACTOR * max(shortest, _RESOLUTION_NS)
             predicted, sigma = self.device_ns(exchange.host_ns)
             slack = _GATE_SIGMA * math.hypot(sigma, _RESOLUTION_NS) + exchange.round_trip_ns / 2
-            if abs(exchange.device_ns - predicted) > slack:
-                self._outliers.append(exchange)
-                if len(self._outliers) < _STEP_AFTER:
+            if slow or abs(exchange.device_ns - predicted) > slack:
+                self._refused.append(exchange)
+                if len(self._refused) < _STEP_AFTER:
                     return False
                 self._samples.clear()
-                self._samples.extend(self._outliers[:-1])
-        self._outliers.clear()
+                self._samples.extend(self._refused[:-1])
+        self._refused.clear()
         self._samples.append(exchange)
         self._solve()
         return True

@@ -30,9 +30,13 @@ AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 
 class Hub:
-    """The host's clock and the links of one session."""
+    """The host's clock and the links of one session.
 
-    def __init__(self) -> None:
+    Once ``stop()`` says so, nobody is waited for longer than for one answer.
+    """
+
+    def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
+        self._stop = stop
         self.links: list[Link] = []
         self.virtual = False
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
@@ -82,7 +86,9 @@ class Hub:
 
         ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number.
         """
-        for _ in range(TRIES):
+        for attempt in range(TRIES):
+            if attempt and self._stop():
+                break
             sequence = link.send(request)
             deadline = time.monotonic() + ANSWER_S
             while True:
@@ -128,10 +134,8 @@ class Hub:
             total = sum(link.counts.bytes_received for link in self.links)
             if total != heard:
                 heard, last_heard = total, time.monotonic()
-            elif time.monotonic() - last_heard > _VIRTUAL_SILENCE_S:
-                raise DeviceError(
-                    f"the rig on virtual time has said nothing for {_VIRTUAL_SILENCE_S:g} s: is it stopped?"
-                )
+            elif (silence := time.monotonic() - last_heard) > (ANSWER_S if self._stop() else _VIRTUAL_SILENCE_S):
+                raise DeviceError(f"the rig on virtual time has said nothing for {silence:.0f} s: is it stopped?")
             wait_readable(waiting, _SLICE_S)
         return received
 

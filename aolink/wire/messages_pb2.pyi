@@ -29,7 +29,7 @@ class Identify(_message.Message):
     def __init__(self, nonce: _Optional[int] = ...) -> None: ...
 
 class Identity(_message.Message):
-    __slots__ = ("nonce", "kind", "model", "serial_number", "firmware", "protocol_version", "schema_hash", "fast_step_ns", "next_step", "step_zero_ns", "virtual_time", "camera", "mirror")
+    __slots__ = ("nonce", "kind", "model", "serial_number", "firmware", "protocol_version", "schema_hash", "fast_step_ns", "next_step", "step_zero_ns", "virtual_time", "rig_digest", "camera", "mirror")
     class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
         __slots__ = ()
         UNKNOWN: _ClassVar[Identity.Kind]
@@ -49,6 +49,7 @@ class Identity(_message.Message):
     NEXT_STEP_FIELD_NUMBER: _ClassVar[int]
     STEP_ZERO_NS_FIELD_NUMBER: _ClassVar[int]
     VIRTUAL_TIME_FIELD_NUMBER: _ClassVar[int]
+    RIG_DIGEST_FIELD_NUMBER: _ClassVar[int]
     CAMERA_FIELD_NUMBER: _ClassVar[int]
     MIRROR_FIELD_NUMBER: _ClassVar[int]
     nonce: int
@@ -62,9 +63,10 @@ class Identity(_message.Message):
     next_step: int
     step_zero_ns: int
     virtual_time: bool
+    rig_digest: str
     camera: CameraGeometry
     mirror: MirrorLimits
-    def __init__(self, nonce: _Optional[int] = ..., kind: _Optional[_Union[Identity.Kind, str]] = ..., model: _Optional[str] = ..., serial_number: _Optional[str] = ..., firmware: _Optional[str] = ..., protocol_version: _Optional[int] = ..., schema_hash: _Optional[bytes] = ..., fast_step_ns: _Optional[int] = ..., next_step: _Optional[int] = ..., step_zero_ns: _Optional[int] = ..., virtual_time: _Optional[bool] = ..., camera: _Optional[_Union[CameraGeometry, _Mapping]] = ..., mirror: _Optional[_Union[MirrorLimits, _Mapping]] = ...) -> None: ...
+    def __init__(self, nonce: _Optional[int] = ..., kind: _Optional[_Union[Identity.Kind, str]] = ..., model: _Optional[str] = ..., serial_number: _Optional[str] = ..., firmware: _Optional[str] = ..., protocol_version: _Optional[int] = ..., schema_hash: _Optional[bytes] = ..., fast_step_ns: _Optional[int] = ..., next_step: _Optional[int] = ..., step_zero_ns: _Optional[int] = ..., virtual_time: _Optional[bool] = ..., rig_digest: _Optional[str] = ..., camera: _Optional[_Union[CameraGeometry, _Mapping]] = ..., mirror: _Optional[_Union[MirrorLimits, _Mapping]] = ...) -> None: ...
 
 class CameraGeometry(_message.Message):
     __slots__ = ("width", "height", "bit_depth", "exposure_steps", "frame_period_steps")

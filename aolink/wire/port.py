@@ -46,6 +46,12 @@ class SerialPort:
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise _open_error(url, error) from None
+        try:
+            self._serial.fileno()
+        except (OSError, AttributeError):
+            raise PortError(
+                f"{url} is a port that cannot be waited on: use a device path or socket://host:port"
+            ) from None
         # in_waiting of a socket is only ever 0 or 1: read those with a size.
         self._is_device = type(self._serial) is serial.Serial
         if self._is_device:

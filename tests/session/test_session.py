@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import json
 import subprocess
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +20,7 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
 from aolink.rig import load_rig
-from aolink.session import record
+from aolink.session import Report, open_devices, record
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
 
@@ -180,13 +182,14 @@ def test_a_bad_link_loses_frames_and_nothing_else(tmp_path: Path) -> None:
     assert np.isfinite(sd).all()
 
 
-def test_real_time_has_latencies_and_no_late_step(tmp_path: Path) -> None:
+def test_real_time_has_latencies_and_accounts_for_every_step(tmp_path: Path) -> None:
     """The clock runs here, so nothing is said about how fast; only that order and counts are right."""
     path = tmp_path / "real.mcap"
     with simulated_rig("section-vi-lively", "--real-time") as (camera, mirror):
         report = record(load_rig("section-vi-lively"), camera, mirror, path, estimators=["o3"], exposures=4)
     assert (report.ended, report.exposures, report.virtual_time) == ("complete", 4, False)
-    assert report.steps_applied + report.steps_parked == 800
+    assert report.steps_commanded == report.steps_applied + report.steps_parked == 800
+    assert report.steps_late == report.steps_parked
     assert len(report.latencies) == 4
     for latency in report.latencies:
         assert 0 < latency.first_byte_ns <= latency.complete_ns <= latency.estimated_ns
@@ -197,6 +200,54 @@ def test_real_time_has_latencies_and_no_late_step(tmp_path: Path) -> None:
         assert 0 < exposure.clock_sigma_ns < 10_000_000
     recording = Recording(path)
     assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"])["o3"]) is None
+
+
+def stopped_host(path: Path, seconds: float) -> Report:
+    """A session in real time whose host is held up after its first exposure."""
+    held_up = []
+
+    def progress(exposures: int) -> None:
+        if exposures and not held_up:
+            held_up.append(time.sleep(seconds))  # the fault itself, not a wait for something
+
+    with simulated_rig("section-vi-lively", "--real-time") as (camera, mirror):
+        return record(load_rig("section-vi-lively"), camera, mirror, path, exposures=8, progress=progress)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.0])
+def test_a_host_that_is_held_up_has_every_step_accounted_for(tmp_path: Path, seconds: float) -> None:
+    report = stopped_host(tmp_path / "a.mcap", seconds)
+    assert report.ended == "complete"
+    assert report.frames_received + report.frames_lost == 8
+    assert report.steps_applied + report.steps_parked == 1600
+    assert report.steps_late == report.steps_parked > 0
+
+
+def test_what_a_killed_host_left_behind_is_not_in_the_next_session(tmp_path: Path) -> None:
+    """The camera still runs and commands are queued, with a gap before them; the next session knows nothing of it."""
+    rig = load_rig("section-vi-lively")
+    for how in ([], ["--real-time"]):
+        path = tmp_path / f"{len(how)}.mcap"
+        with simulated_rig("section-vi-lively", *how) as ports:
+            with open_devices(rig, *ports) as (hub, camera, mirror, _):
+                first = mirror.identity.next_step + 300
+                camera.start(first, 0)
+                mirror.send_block(first + 50, np.full((50, 1), 0.01), 0, hub.now_ns())
+                mirror.send_block(first + 100, np.full((50, 1), 0.01), 0, hub.now_ns())
+                hub.wait(0.1)
+            report = record(rig, *ports, path, estimators=["o3"], exposures=3)
+        assert (report.ended, report.exposures, report.frames_received) == ("complete", 3, 3)
+        exposures = list(Recording(path).exposures())
+        assert [e.first_step - exposures[0].first_step for e in exposures] == [0, 200, 400]
+        assert np.abs(exposures[0].inputs[0]).max() < 1e-5
+
+
+def test_a_rig_file_with_other_numbers_is_a_warning(tmp_path: Path) -> None:
+    with simulated_rig("section-vi") as (camera, mirror):
+        report = record(load_rig("section-vi-lively"), camera, mirror, tmp_path / "a.mcap", exposures=2)
+    (warning,) = report.warnings
+    assert "was made from another rig file than section-vi-lively" in warning
+    assert Recording(tmp_path / "a.mcap").metadata["warnings"] == warning
 
 
 def test_the_demo_does_the_main_job(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
@@ -219,10 +270,23 @@ def test_by_hand(aolink: Callable[..., subprocess.CompletedProcess[str]], argume
         assert "1 inputs" in listed.stdout
         result = aolink(
             "record", "--camera", camera, "--mirror", mirror, "--rig", "section-vi", "--estimator", "o3", *arguments,
-            "--note", "by hand", "-o", "a.mcap",
+            "--estimator", "o3", "--note", "by hand", "-o", "a.mcap",
+        )  # fmt: skip
+        again = aolink(
+            "record", "--camera", camera, "--mirror", mirror, "--rig", "section-vi", *arguments,
+            "-o", "c.mcap", "--json",
         )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert "a.mcap: 3 exposures, complete" in result.stdout
+    assert json.loads(again.stdout)["frames_received"] == 3
+    facts = json.loads(aolink("info", "a.mcap", "--json").stdout)
+    assert facts["session"]["exposures"] == 3
+    assert facts["session"]["virtual_time"] is True
+    assert facts["estimators"] == ["o3"]
+    assert facts["messages"]["/estimate/o3"] == 3
+    scored = json.loads(aolink("estimate", "a.mcap", "--json").stdout)
+    assert scored["differs_from_recorded"] == {"o3": None}
+    assert scored["o3"]["exposures"] == 3
     info = aolink("info", "a.mcap")
     assert "by hand" in info.stdout
     assert "/camera/image 3" in info.stdout

@@ -7,32 +7,27 @@ real time and on virtual time; on virtual time it sends whenever the rig waits.
 
 from __future__ import annotations
 
-import contextlib
-import secrets
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from importlib.metadata import version
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from functools import partial
 
-import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from aolink.assembly import Assembler, Frame
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
-from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig, check_kind, identify
-from aolink.errors import AolinkError, DeviceError
+from aolink.errors import DeviceError
 from aolink.estimation import Driver
 from aolink.exposure import Exposure
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
-from aolink.rig import Drive, Rig
+from aolink.rig import Rig
+from aolink.session.report import LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.clock import QUERY_PERIOD_S, WARM_UP_QUERIES
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
-from aolink.wire.port import SerialPort
 
 LEAD_BLOCKS = 3
 """Command blocks that are queued on the device ahead of time."""
@@ -43,147 +38,11 @@ _ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """Real time: how long a frame may take after its exposure's end before it counts as lost."""
+_NOT_YET = 1 << 63
+"""The first fast step of a session that has not begun."""
 
 
-@dataclass(kw_only=True)
-class Report:
-    """What a session did: its counts, and its latencies where time was real."""
-
-    ended: str = "running"
-    """complete, interrupted, or error: and what it was."""
-    virtual_time: bool = False
-    exposures: int = 0
-    frames_received: int = 0
-    frames_incomplete: int = 0
-    """Received with chunks missing; their pixels are masked."""
-    frames_lost: int = 0
-    """Never received at all."""
-    packets_bad_crc: int = 0
-    packets_bad_framing: int = 0
-    packets_missing: int = 0
-    """Gaps in the sequence numbers of either device."""
-    steps_commanded: int = 0
-    steps_applied: int = 0
-    steps_parked: int = 0
-    """Steps of the session in which the mirror was parked for want of a command."""
-    steps_late: int = 0
-    steps_superseded: int = 0
-    steps_clipped: int = 0
-    blocks_retransmitted: int = 0
-    clock_offset_ns: float = float("nan")
-    clock_frequency_ppm: float = float("nan")
-    clock_sigma_ns: float = float("nan")
-    latencies: list[pb.Latency] = field(default_factory=list)
-
-    def counts(self) -> dict[str, str]:
-        """Everything but the latencies, as text, for the recording's metadata."""
-        facts = asdict(self)
-        del facts["latencies"]
-        return {name: str(value) for name, value in facts.items()}
-
-
-@contextlib.contextmanager
-def open_devices(rig: Rig, camera_port: str, mirror_port: str) -> Iterator[tuple[Hub, NativeCamera, NativeMirror]]:
-    """Open both ports, identify what is behind them, and check it against the rig file.
-
-    Raises
-    ------
-    PortError
-        A port cannot be opened.
-    DeviceError
-        No device answers, it is another one, speaks another protocol, or is not what the rig file says.
-    """
-    hub = Hub()
-    try:
-        camera_link = hub.connect("camera", SerialPort(camera_port))
-        mirror_link = hub.connect("mirror", SerialPort(mirror_port))
-        camera_identity = identify(hub, camera_link, secrets.randbits(48))
-        check_kind(camera_link, camera_identity, wire.Identity.CAMERA)
-        mirror_identity = identify(hub, mirror_link, secrets.randbits(48))
-        check_kind(mirror_link, mirror_identity, wire.Identity.MIRROR)
-        check_against_rig(rig, camera_identity, mirror_identity)
-        if camera_identity.virtual_time:
-            hub.go_virtual()
-        for link in hub.links:
-            link.reset_counts()
-        yield hub, NativeCamera(hub, camera_link, camera_identity), NativeMirror(hub, mirror_link, mirror_identity)
-    finally:
-        hub.close()
-
-
-def record(
-    rig: Rig,
-    camera_port: str,
-    mirror_port: str,
-    path: str | Path,
-    *,
-    estimators: Sequence[str] = (),
-    exposures: int = 0,
-    note: str = "",
-    calibration: str = "",
-    overwrite: bool = False,
-    stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[int], None] = lambda exposures: None,
-) -> Report:
-    """Record a session: play the rig's drive, record everything, run estimators on the way.
-
-    Parameters
-    ----------
-    rig:
-        What the devices are; checked against what they say of themselves.
-    camera_port, mirror_port:
-        Anything that pyserial opens: a device path, or an address such as socket://host:port.
-    path:
-        The recording; must not exist unless ``overwrite``.
-    estimators:
-        Names of estimators to run online; their results go into the recording.
-    exposures:
-        How many; 0 means until ``stop()``.
-    calibration:
-        What the camera is shown, of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
-        mirror then holds its parked input, whatever the rig's drive.
-    stop, progress:
-        Asked, and told the number of exposures so far, at least ten times a second.
-
-    Raises
-    ------
-    AolinkError
-        Of the kind that says what went wrong. The mirror is parked if it can be reached, and the
-        recording is closed with what there is.
-    """
-    driver = Driver(rig, estimators)
-    if calibration:
-        rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
-        rig = replace(rig, drive=rest)
-    with open_devices(rig, camera_port, mirror_port) as (hub, camera, mirror):
-        facts = {
-            "aolink_version": version("aolink"),
-            "rig": rig.name,
-            "rig_digest": rig.digest,
-            "camera": f"{camera.identity.model} {camera.identity.serial_number} ({camera.identity.firmware})",
-            "mirror": f"{mirror.identity.model} {mirror.identity.serial_number} ({mirror.identity.firmware})",
-            "virtual_time": str(hub.virtual),
-            "estimators": " ".join(estimators),
-            "note": note,
-        }
-        if calibration:
-            facts[topics.CALIBRATION] = calibration
-        writer = RecordingWriter(path, rig, facts, hub.now_ns(), overwrite=overwrite, deterministic=hub.virtual)
-        session = _Session(rig, hub, camera, mirror, writer, driver)
-        try:
-            session.run(exposures, stop, progress)
-        except BaseException as error:
-            session.report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
-            with contextlib.suppress(AolinkError):
-                session.make_safe()
-            with contextlib.suppress(AolinkError):
-                writer.close(session.report.counts())
-            raise
-        writer.close(session.report.counts())
-    return session.report
-
-
-class _Session:
+class SessionLoop:
     """One session, from the first command to the last frame."""
 
     def __init__(
@@ -194,7 +53,7 @@ class _Session:
         self._writer, self._driver = writer, driver
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
-        self._first_step = 0
+        self._first_step = _NOT_YET
         self._queued_until = 0
         """First fast step that no command was sent for."""
         self._newest_frame = 0
@@ -202,32 +61,37 @@ class _Session:
         """Whose clock is asked next."""
         self._next_query_ns = self._next_link_ns = 0
         self._last_frame_ns = 0
-        self._latencies: dict[int, pb.Latency] = {}
-        """Of frames whose first command is not acknowledged yet, by frame."""
+        self._end_step: int | None = None
+        """First fast step after the session; None if it goes on until it is stopped."""
+        self._is_safe = False
+        self._latencies = LatencyBook(self.report, partial(self._record, topics.LATENCY))
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
         self._warm_up_clocks()
         timing, hub = self._rig.timing, self._hub
         self._first_step = self._queued_until = self._choose_first_step()
-        end = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
-        end_step = end if exposures else None
+        if exposures:
+            self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
         self._camera.start(self._first_step, exposures)
-        self._send_commands(end_step, self._first_step)  # queued before the first step is due
+        self._send_commands(self._first_step)  # queued before the first step is due
         self._receive(0.0)
         self._last_frame_ns = hub.now_ns()
         self._log(Log.INFO, f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
         self.report.ended = "interrupted"
         while not stop():
-            self._receive(self._send_due(end_step))
+            self._receive(self._send_due())
             progress(self.report.exposures)
-            if end_step is not None and self._is_over(exposures, end_step):
+            if self._is_over(exposures):
                 self.report.ended = "complete"
                 break
         self.make_safe()
         self._finish(exposures)
 
     def make_safe(self) -> None:
-        """Park the mirror and stop the camera; try both even if one cannot be reached."""
+        """Park the mirror and stop the camera, once; try both even if one cannot be reached."""
+        if self._is_safe:
+            return
+        self._is_safe = True
         try:
             self._mirror.park()
         finally:
@@ -274,7 +138,7 @@ class _Session:
         device_ns, _ = self._mirror.clock.device_ns(self._hub.now_ns())
         return (device_ns - self._mirror.identity.step_zero_ns) // self._step_ns
 
-    def _send_due(self, end_step: int | None) -> float:
+    def _send_due(self) -> float:
         """Send what is due; gives the time until the next thing is, s."""
         hub, now = self._hub, self._hub.now_ns()
         timeout_ns = self._mirror.next_timeout_ns()
@@ -289,7 +153,7 @@ class _Session:
             self._record_links(now)
             self._next_link_ns = now + round(_LINK_PERIOD_S * 1e9)
         if not (hub.virtual and self._mirror.in_flight):
-            self._send_commands(end_step, self._device_step())
+            self._send_commands(self._device_step())
         if hub.virtual:
             return 0.0
         ahead = self._queued_until - self._device_step() - LEAD_BLOCKS * self._rig.mirror.block_steps
@@ -298,8 +162,8 @@ class _Session:
             due.append(timeout_ns - now)
         return max(0, min(due)) / 1e9
 
-    def _send_commands(self, end_step: int | None, device_step: int) -> None:
-        block_steps = self._rig.mirror.block_steps
+    def _send_commands(self, device_step: int) -> None:
+        block_steps, end_step = self._rig.mirror.block_steps, self._end_step
         horizon = device_step + LEAD_BLOCKS * block_steps
         while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
             n_steps = block_steps if end_step is None else min(block_steps, end_step - self._queued_until)
@@ -309,18 +173,18 @@ class _Session:
             block = self._mirror.send_block(self._queued_until, u, self._newest_frame, now)
             self._assembler.add_command(block)
             self._record(topics.COMMAND, block, now)
-            for frame_id, latency in self._latencies.items():
-                if frame_id <= block.cause_frame_id and not latency.command_sent_ns:
-                    latency.command_sent_ns = self._hub.now_ns()
+            self._latencies.sent(block, self._hub.now_ns())
             self._queued_until += n_steps
             self.report.steps_commanded += n_steps
 
-    def _is_over(self, exposures: int, end_step: int) -> bool:
+    def _is_over(self, exposures: int) -> bool:
         if self._hub.virtual:
-            return self._queued_until >= end_step and not self._mirror.in_flight
+            return self._end_step is not None and self._queued_until >= self._end_step and not self._mirror.in_flight
         now, timing = self._hub.now_ns(), self._rig.timing
-        if self.report.exposures >= exposures or self._device_step() > end_step + _GRACE_S * 1e9 / self._step_ns:
-            return True
+        if self._end_step is not None:
+            late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
+            if self.report.exposures >= exposures or self._device_step() > late_step:
+                return True
         patience_ns = 3 * timing.frame_period_steps * self._step_ns + (_GRACE_S + _START_DELAY_S) * 1e9
         if now - self._last_frame_ns > patience_ns:
             raise DeviceError(
@@ -334,9 +198,7 @@ class _Session:
         self._receive(0.0)
         self._take(self._camera.link, list(self._camera.flush()), now)
         self._estimate(self._assembler.flush(), now)
-        for latency in self._latencies.values():
-            self._record(topics.LATENCY, latency, now)
-        self.report.latencies.extend(self._latencies.values())
+        self._latencies.close(now)
         if exposures and self.report.ended == "complete":
             self.report.frames_lost = exposures - self.report.frames_received
         self._record_links(now)
@@ -345,11 +207,10 @@ class _Session:
     def _take(self, link: Link, events: Sequence[Event], receive_ns: int) -> None:
         for event in events:
             if isinstance(event, Frame):
-                self._take_frame(event, receive_ns)
+                if event.first_step >= self._first_step:  # not one of a session before
+                    self._take_frame(event, receive_ns)
             elif isinstance(event, wire.Applied):
-                self._record(topics.APPLIED, event, receive_ns)
-                self._count_applied(event)
-                self._estimate(self._assembler.add_applied(event), receive_ns)
+                self._take_applied(event, receive_ns)
             elif isinstance(event, wire.Truth):
                 self._record(topics.TRUTH, event, receive_ns)
             elif isinstance(event, ClockSampled):
@@ -373,11 +234,13 @@ class _Session:
         self._last_frame_ns = receive_ns
         if not self._hub.virtual:
             host_end_ns, _ = self._camera.clock.host_ns(frame.device_end_ns)
-            self._latencies[frame.frame_id] = pb.Latency(
-                frame_id=frame.frame_id,
-                exposure_end_ns=host_end_ns,
-                first_byte_ns=frame.host_first_byte_ns,
-                complete_ns=frame.host_receive_ns,
+            self._latencies.frame(
+                pb.Latency(
+                    frame_id=frame.frame_id,
+                    exposure_end_ns=host_end_ns,
+                    first_byte_ns=frame.host_first_byte_ns,
+                    complete_ns=frame.host_receive_ns,
+                )
             )
         self._estimate(self._assembler.add_frame(frame), receive_ns)
 
@@ -387,11 +250,15 @@ class _Session:
                 self._record(topics.estimate_topic(estimate.estimator), convert.estimate_message(estimate), log_time_ns)
             self.report.exposures += 1
             self._newest_frame = exposure.frame_id
-            if latency := self._latencies.get(exposure.frame_id):
-                latency.estimated_ns = self._hub.now_ns()
+            self._latencies.estimated(exposure.frame_id, self._hub.now_ns())
 
-    def _count_applied(self, applied: wire.Applied) -> None:
-        report, end = self.report, min(applied.first_step + applied.n_steps, self._queued_until)
+    def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
+        self._record(topics.APPLIED, applied, receive_ns)
+        if applied.block_id and not self._hub.virtual:
+            first_ns, _ = self._mirror.clock.host_ns(applied.device_ns - applied.n_steps * self._step_ns)
+            self._latencies.applied(applied.block_id, first_ns, receive_ns)
+        report, end = self.report, applied.first_step + applied.n_steps
+        end = end if self._end_step is None else min(end, self._end_step)
         n_steps = max(0, end - max(applied.first_step, self._first_step))  # of this session
         if applied.source == wire.Applied.PARKED:
             report.steps_parked += n_steps
@@ -399,16 +266,12 @@ class _Session:
             report.steps_applied += n_steps
         if applied.source == wire.Applied.CLIPPED:
             report.steps_clipped += n_steps
+        self._estimate(self._assembler.add_applied(applied), receive_ns)
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:
         self.report.steps_late += answer.ack.late_steps
         self.report.steps_superseded += answer.ack.superseded_steps
-        informed = [i for i, v in self._latencies.items() if i <= answer.block.cause_frame_id and v.command_sent_ns]
-        for frame_id in informed:
-            latency = self._latencies.pop(frame_id)
-            latency.command_acknowledged_ns = receive_ns
-            self.report.latencies.append(latency)
-            self._record(topics.LATENCY, latency, receive_ns)
+        self._latencies.acknowledged(answer.block.block_id, receive_ns)
 
     def _take_clock(self, device: str, sampled: ClockSampled) -> None:
         clock = (self._camera if device == "camera" else self._mirror).clock
@@ -433,16 +296,20 @@ class _Session:
     def _record_links(self, now: int) -> None:
         report = self.report
         report.blocks_retransmitted = self._mirror.retransmits
-        report.packets_bad_crc = report.packets_bad_framing = report.packets_missing = 0
+        counts = [link.counts for link in self._hub.links]
+        report.packets_bad_crc = sum(each.bad_crc for each in counts)
+        report.packets_bad_framing = sum(each.bad_framing for each in counts)
+        report.packets_bad_payload = sum(each.bad_payload for each in counts)
+        report.packets_duplicate = sum(each.duplicates for each in counts)
+        report.packets_missing = sum(each.sequence_gaps for each in counts)
+        report.chunks_refused = self._camera.chunks_refused
         for link in self._hub.links:
             statistics = pb.LinkStatistics(device=link.name, **asdict(link.counts))
             if link is self._mirror.link:
                 statistics.retransmits = self._mirror.retransmits
                 statistics.commands_in_flight = self._mirror.in_flight
                 statistics.round_trip_s = self._mirror.round_trip_s
-            report.packets_bad_crc += link.counts.bad_crc
-            report.packets_bad_framing += link.counts.bad_framing
-            report.packets_missing += link.counts.sequence_gaps
+                statistics.queue_end_step = self._mirror.queue_end_step
             self._record(topics.LINK, statistics, now)
 
     def _log(self, level: Log.Level.ValueType, text: str) -> None:

@@ -1,0 +1,100 @@
+"""What a session did: counts, and how long each frame took on its way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+
+from aolink.recording import schemas_pb2 as pb
+from aolink.wire import messages_pb2 as wire
+
+_KEPT_LATENCIES = 10_000
+
+
+@dataclass(kw_only=True)
+class Report:
+    """What a session did: its counts, and its latencies where time was real."""
+
+    ended: str = "running"
+    """complete, interrupted, or error: and what it was."""
+    virtual_time: bool = False
+    exposures: int = 0
+    frames_received: int = 0
+    frames_incomplete: int = 0
+    """Received with chunks missing; their pixels are masked."""
+    frames_lost: int = 0
+    """Never received at all."""
+    packets_bad_crc: int = 0
+    packets_bad_framing: int = 0
+    packets_bad_payload: int = 0
+    packets_duplicate: int = 0
+    packets_missing: int = 0
+    """Gaps in the sequence numbers of either device."""
+    chunks_refused: int = 0
+    """Pieces of frames that made no sense."""
+    steps_commanded: int = 0
+    steps_applied: int = 0
+    steps_parked: int = 0
+    """Steps of the session in which the mirror was parked for want of a command."""
+    steps_late: int = 0
+    steps_superseded: int = 0
+    steps_clipped: int = 0
+    blocks_retransmitted: int = 0
+    clock_offset_ns: float = float("nan")
+    clock_frequency_ppm: float = float("nan")
+    clock_sigma_ns: float = float("nan")
+    warnings: list[str] = field(default_factory=list)
+    latencies: list[pb.Latency] = field(default_factory=list)
+    """The newest ones, `_KEPT_LATENCIES` at most; all of them are in the recording."""
+
+    def counts(self) -> dict[str, str]:
+        """Everything but the latencies, as text, for the recording's metadata."""
+        facts = asdict(self)
+        del facts["latencies"], facts["warnings"]
+        return {name: str(value) for name, value in facts.items()} | {"warnings": "; ".join(self.warnings)}
+
+
+class LatencyBook:
+    """The way of each frame from the end of its exposure to the command that knew it. Real time only."""
+
+    def __init__(self, report: Report, record: Callable[[pb.Latency, int], None]) -> None:
+        self._report, self._record = report, record
+        self._open: dict[int, pb.Latency] = {}
+        self._blocks: dict[int, int] = {}
+        """First command block that knew a frame, by frame."""
+
+    def frame(self, latency: pb.Latency) -> None:
+        """A frame is complete."""
+        self._open[latency.frame_id] = latency
+
+    def estimated(self, frame_id: int, now_ns: int) -> None:
+        if latency := self._open.get(frame_id):
+            latency.estimated_ns = now_ns
+
+    def sent(self, block: wire.CommandBlock, now_ns: int) -> None:
+        for frame_id, latency in self._open.items():
+            if frame_id <= block.cause_frame_id and not latency.command_sent_ns:
+                latency.command_sent_ns = now_ns
+                self._blocks[frame_id] = block.block_id
+
+    def acknowledged(self, block_id: int, receive_ns: int) -> None:
+        for frame_id in [frame_id for frame_id, block in self._blocks.items() if block == block_id]:
+            self._open[frame_id].command_acknowledged_ns = receive_ns
+
+    def applied(self, block_id: int, applied_ns: int, receive_ns: int) -> None:
+        """The device reports the first steps of a block: the way is over."""
+        for frame_id in [frame_id for frame_id, block in self._blocks.items() if block == block_id]:
+            self._open[frame_id].command_applied_ns = applied_ns
+            self._close(frame_id, receive_ns)
+
+    def close(self, now_ns: int) -> None:
+        """Frames that no command followed."""
+        for frame_id in list(self._open):
+            self._close(frame_id, now_ns)
+
+    def _close(self, frame_id: int, now_ns: int) -> None:
+        latency = self._open.pop(frame_id)
+        self._blocks.pop(frame_id, None)
+        self._record(latency, now_ns)
+        self._report.latencies.append(latency)
+        del self._report.latencies[:-_KEPT_LATENCIES]
