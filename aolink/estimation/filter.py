@@ -81,7 +81,9 @@ class BlurFilter:
         self.plant, self.observation = plant, observation
         self._process_noise, self._predict = process_noise, predict or predicted
         prior = Belief(stacked.tile(plant.initial_mean, plant.axes), stacked.tile(plant.initial_covariance, plant.axes))
-        self.belief = self._unseen = prior  # with, and without what the camera said
+        self.belief = prior
+        # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
+        self._unseen = Belief(prior.mean, prior.covariance[:1])
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
         self._gate = float(stats.chi2.ppf(_GATE_PROBABILITY, degrees)) if gate and degrees else np.inf
@@ -157,8 +159,6 @@ def _numbers(values: FloatArray) -> FloatArray:
 
 def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
     """Axis by axis, the first belief where chosen."""
-    if chosen.all():
-        return first
     if not chosen.any():
         return second
     mean, covariance = second.mean.copy("K"), second.covariance.copy("K")
