@@ -7,7 +7,6 @@ from aolink.estimation.filter import BlurFilter
 from aolink.estimation.moments import Measurement, measure_moments
 from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.observation import PathMoments
-from aolink.estimation.passive import PassiveOutput, passive_output
 from aolink.estimation.score import Consistency, Score, score
 from aolink.estimation.windowed import Profile, WindowedMoments
 
@@ -21,7 +20,6 @@ __all__ = [
     "ExposureModel",
     "Measurement",
     "Options",
-    "PassiveOutput",
     "PathMoments",
     "Profile",
     "Score",
@@ -31,7 +29,6 @@ __all__ = [
     "make_estimator",
     "measure_moments",
     "measure_moments_2d",
-    "passive_output",
     "path_from_coefficients",
     "run",
     "score",
