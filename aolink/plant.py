@@ -19,6 +19,7 @@ from aolink.rig import Plant, Rig
 FloatArray = NDArray[np.float64]
 
 _BLOCK_STEPS = 32
+_SMALL_PRODUCT = 100_000
 _LARGEST_CHECK = 200_000
 # A mode that shrinks to this over one exposure is gone before the next, whatever the camera saw of it.
 _FORGOTTEN = 1e-3
@@ -103,16 +104,22 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
     n_blocks = -(-k // length)
     padded = np.zeros((axes, n_blocks * length, n_u))
     padded[:, n_blocks * length - k :] = u
-    blocks = padded.reshape(axes, n_blocks, 1, length * n_u)
-    # One product a block: so small, BLAS uses one thread, and no axis depends on its neighbours.
-    pushed = (blocks @ kicks)[:, :, 0]
-    starts = np.empty((axes, n_blocks, 1, plant.n_states))
+    blocks = padded.reshape(axes, n_blocks, length * n_u)
+    pushed = _times(blocks, kicks)
+    starts = np.empty((axes, n_blocks, plant.n_states))
     state = np.zeros((axes, 1, plant.n_states))
     for b in range(n_blocks):
-        starts[:, b] = state
+        starts[:, b] = state[:, 0]
         state = state @ transition + pushed[:, b, None]
-    path = (blocks @ toeplitz + starts @ rows).reshape(axes, n_blocks * length, plant.n_outputs)
+    path = (_times(blocks, toeplitz) + _times(starts, rows)).reshape(axes, n_blocks * length, plant.n_outputs)
     return np.ascontiguousarray(path[:, n_blocks * length - k :].transpose(0, 2, 1)), state[:, 0]
+
+
+def _times(blocks: FloatArray, matrix: FloatArray) -> FloatArray:
+    """blocks @ matrix, axis by axis in pieces so small that BLAS uses one thread: no bit depends on their number."""
+    piece = max(1, _SMALL_PRODUCT // matrix.size)
+    products = [blocks[:, k : k + piece] @ matrix for k in range(0, max(1, blocks.shape[1]), piece)]
+    return products[0] if len(products) == 1 else np.concatenate(products, axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,20 +3,32 @@
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.estimators import ESTIMATOR_NAMES, Driver, Estimator, Options, make_estimator, run
 from aolink.estimation.exposure_model import ExposureModel, exposure_model, path_from_coefficients
+from aolink.estimation.filter import BlurFilter
+from aolink.estimation.moments import Measurement, measure_moments
+from aolink.estimation.moments2d import measure_moments_2d
+from aolink.estimation.observation import PathMoments
 from aolink.estimation.score import Consistency, Score, score
+from aolink.estimation.windowed import Profile, WindowedMoments
 
 __all__ = [
     "ESTIMATOR_NAMES",
+    "BlurFilter",
     "Consistency",
     "Driver",
     "Estimate",
     "Estimator",
     "ExposureModel",
+    "Measurement",
     "Options",
+    "PathMoments",
+    "Profile",
     "Score",
     "Status",
+    "WindowedMoments",
     "exposure_model",
     "make_estimator",
+    "measure_moments",
+    "measure_moments_2d",
     "path_from_coefficients",
     "run",
     "score",

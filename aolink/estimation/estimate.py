@@ -42,7 +42,7 @@ class Estimate:
     n_steps: int
     status: Status
     reason: str
-    """Why the status is not OK; empty otherwise."""
+    """Why the status is not OK, or what an estimate had to do without; empty where there is nothing to say."""
     start_state: FloatArray
     """State at the exposure's first fast step, (axes, n_states)."""
     start_covariance: FloatArray

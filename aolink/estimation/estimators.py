@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.exposure_model import exposure_model
+from aolink.estimation.exposure_model import InputResponse, exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
 from aolink.estimation.filterpy_engine import FilterpyMoments
 from aolink.estimation.moments import (
@@ -85,11 +85,14 @@ class Estimator:
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
 
-    def step(self, exposure: Exposure) -> Estimate:
-        """The estimate of an exposure, from it and from all that came before."""
+    def step(self, exposure: Exposure, response: InputResponse | None = None) -> Estimate:
+        """The estimate of an exposure, from it and from all that came before.
+
+        ``response``, to the exposure's inputs, saves computing it again.
+        """
         model = exposure_model(self.rig.plant, exposure.n_steps)
         reasons = self._bridge(exposure)
-        response = model.response(exposure.inputs)
+        response = response or model.response(exposure.inputs)
         measured, remark = measure(self.rig, exposure, self._observation, self.options)
         posterior = self._filter.step(model, response, measured)
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
@@ -207,11 +210,13 @@ class Driver:
     """Several estimators side by side, exposure by exposure."""
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
+        self.rig = rig
         self.estimators = [make_estimator(rig, name) for name in names]
 
     def step(self, exposure: Exposure) -> list[Estimate]:
         """What each of them says about an exposure, in the order of the names."""
-        return [estimator.step(exposure) for estimator in self.estimators]
+        response = exposure_model(self.rig.plant, exposure.n_steps).response(exposure.inputs)
+        return [estimator.step(exposure, response) for estimator in self.estimators]
 
 
 def run(rig: Rig, exposures: Iterable[Exposure], names: Sequence[str]) -> dict[str, list[Estimate]]:

@@ -106,12 +106,13 @@ class ExposureModel:
     def response(self, inputs: FloatArray) -> InputResponse:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
-        rows = stacked.transpose(self.state_rows)
+        # Column by column, so that the products lie in memory as they are summed.
+        slope = [stacked.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
         return InputResponse(
             path=path,
             end=stacked.batch_last(end),
             mean=stacked.mean_over_path(path),
-            slope=stacked.mean_over_path(path[:, :, None, :] * rows),
+            slope=np.stack(slope, axis=-1),
             square=stacked.mean_over_path(path * path),
         )
 

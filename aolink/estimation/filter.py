@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from aolink.estimation import stacked
 from aolink.estimation.estimate import Status
@@ -21,9 +21,9 @@ FloatArray = NDArray[np.float64]
 Noise = Literal["lifted", "printed"]
 Predict = Callable[[Belief, FloatArray, FloatArray, FloatArray], Belief]
 
-# A measurement beyond this quantile of chi-square is not used. It is wide: the paper's filters leave the
+# A measurement that chi-square makes less likely than this is not used. It is wide: the paper's filters leave the
 # process noise inside an exposure out, and have every right to innovations larger than they expect.
-_GATE_PROBABILITY = 1 - 1e-9
+_GATE_PROBABILITY = 1e-9
 _PATIENCE = 3
 
 
@@ -81,10 +81,12 @@ class BlurFilter:
         self.plant, self.observation = plant, observation
         self._process_noise, self._predict = process_noise, predict or predicted
         prior = Belief(stacked.tile(plant.initial_mean, plant.axes), stacked.tile(plant.initial_covariance, plant.axes))
-        self.belief = self._unseen = prior  # with, and without what the camera said
+        self.belief = prior
+        # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
+        self._unseen = Belief(prior.mean, prior.covariance[:1])
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
-        self._gate = float(stats.chi2.ppf(_GATE_PROBABILITY, degrees)) if gate and degrees else np.inf
+        self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
 
     def bridge(self, inputs: FloatArray) -> None:
         """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
@@ -157,8 +159,6 @@ def _numbers(values: FloatArray) -> FloatArray:
 
 def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
     """Axis by axis, the first belief where chosen."""
-    if chosen.all():
-        return first
     if not chosen.any():
         return second
     mean, covariance = second.mean.copy("K"), second.covariance.copy("K")

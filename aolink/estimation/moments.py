@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -130,7 +131,7 @@ def measure_moments(
         raw[:, 0] = 1.0
         covariance = np.array([known_flux_covariance(total_noise, integrals, everything)])
         covariance[:, 0] = covariance[:, :, 0] = 0.0
-    unmix = without_kernel(kernel_moments(sensor.kernel, sensor.pixel_width, highest), highest)[p]
+    unmix = _unmixing(sensor, highest)[p]
     covariance = unmix @ covariance @ unmix.T
     return Measurement(
         value=_recombine(raw, unmix),
@@ -144,6 +145,11 @@ def spot_significance(sensor: Sensor, density: FloatArray) -> float:
     lengths = [2**k for k in range(sensor.pixels.bit_length())]
     sd = math.sqrt(effective_noise_density(sensor) * sensor.pixel_width)
     return max(float((light[n:] - light[:-n]).max()) / (sd * math.sqrt(n)) for n in lengths if n <= sensor.pixels)
+
+
+@lru_cache(maxsize=16)
+def _unmixing(sensor: Sensor, highest: int) -> FloatArray:
+    return without_kernel(kernel_moments(sensor.kernel, sensor.pixel_width, highest), highest)
 
 
 def _shift(centre: float, highest: int) -> FloatArray:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from aolink.estimation.estimate import Estimate
 from aolink.exposure import Exposure
@@ -95,5 +95,5 @@ def _consistency(values: Sequence[FloatArray], degrees: int) -> Consistency:
     if not values:
         return Consistency(mean=math.nan, low=math.nan, high=math.nan)
     samples = sum(len(v) for v in values)
-    low, high = (float(stats.chi2.ppf(p, degrees)) / samples for p in (0.025, 0.975))
+    low, high = (2 * float(special.gammaincinv(degrees / 2, p)) / samples for p in (0.025, 0.975))
     return Consistency(mean=float(np.concatenate(values).mean()), low=low, high=high)

@@ -56,10 +56,16 @@ def dot(x: FloatArray, y: FloatArray) -> FloatArray:
 
 def _sum_of_products(left: list[FloatArray], right: list[FloatArray]) -> FloatArray:
     """left[0] * right[0] + left[1] * right[1] + ..., in this order."""
-    shape = np.broadcast_shapes(left[0].shape, right[0].shape)
+    shape = np.broadcast(left[0], right[0]).shape
+    if len(shape) == 0 or shape[0] == 1:
+        out: FloatArray = left[0] * right[0]
+        for a, b in zip(left[1:], right[1:], strict=True):
+            out = out + a * b
+        return out
     # NumPy would put the small axes innermost where it cannot tell; long batches want the batch there.
     order = (len(shape) - 1, *range(len(shape) - 1))
-    out, product = (np.empty((*shape[1:], *shape[:1])).transpose(order) for _ in range(2))
+    out = np.empty((*shape[1:], shape[0])).transpose(order)
+    product = np.empty((*shape[1:], shape[0])).transpose(order)
     np.multiply(left[0], right[0], out=out)
     for a, b in zip(left[1:], right[1:], strict=True):
         np.multiply(a, b, out=product)

@@ -37,11 +37,14 @@ FloatArray = NDArray[np.float64]
 Basis = Literal["monomial", "legendre", "fourier"]
 
 _PASSES = 3
-# Half width of the window beyond the path's mean: so many standard deviations of the path, and of the kernel.
-_REACH = 2.5
+# Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
+_PATH_REACH = 3.0
+_KERNEL_REACH = 2.0
 # The path is averaged over blocks of steps so that there are no more than this; a mean over it stays exact.
 _MOST_NODES = 100
 _MOST_MEMORY = 1e3
+# Axes together: more of them do not fit into the processor's cache.
+_AT_ONCE = 8
 # NIS of a ratio to light that is lost in its noise.
 _NOT_BELIEVED = 1e12
 
@@ -100,6 +103,24 @@ class WindowedMoments:
         """Iterated statistical linearisation, from the prior to the posterior."""
         first, basis, weights = _nodes(model)
         inputs = np.add.reduceat(response.path[:, 0], first, axis=1) / (weights * model.n_steps)
+        parts = [
+            self._correct(
+                model,
+                (basis, weights, inputs[s]),
+                Belief(prior.mean[s], prior.covariance[s]),
+                Profile(density=measured.density[s], mask=measured.mask[s]),
+            )
+            for s in (slice(k, k + _AT_ONCE) for k in range(0, len(inputs), _AT_ONCE))
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
+        return Correction(Belief(joined[0], joined[1]), *joined[2:])
+
+    def _correct(
+        self, model: ExposureModel, nodes: tuple[FloatArray, FloatArray, FloatArray], prior: Belief, measured: Profile
+    ) -> Correction:
+        basis, weights, inputs = nodes
         memory = _memory(model)
         about = prior
         for _ in range(_PASSES):
@@ -126,11 +147,11 @@ class WindowedMoments:
         """Weights of the pixels about a path, (axes, m, pixels), from its mean and variance, both (axes, nodes)."""
         sensor = self.sensor
         sd = np.sqrt(np.maximum(variance, 0.0))
-        margin = _REACH * math.sqrt(sensor.kernel.variance + sensor.pixel_width**2 / 12)
+        margin = _KERNEL_REACH * math.sqrt(sensor.kernel.variance + sensor.pixel_width**2 / 12)
         # A window needs room on the sensor, wherever the path is believed to be.
         room = max(margin, 2 * sensor.pixel_width)
-        low = np.minimum((mean - _REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
-        high = np.maximum((mean + _REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
+        low = np.minimum((mean - _PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
+        high = np.maximum((mean + _PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
         low, high = np.maximum(low, sensor.field[0]), np.minimum(high, sensor.field[1])
         edges = sensor.edges
         inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
@@ -202,6 +223,12 @@ def _nodes(model: ExposureModel) -> tuple[NDArray[np.intp], FloatArray, FloatArr
     first = np.arange(0, model.n_steps, length)
     sizes = np.diff(np.append(first, model.n_steps))
     return first, np.add.reduceat(model.basis[0], first, axis=0) / sizes[:, None], sizes / model.n_steps
+
+
+def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
+    after = correction.posterior
+    rest = correction.innovation, correction.innovation_covariance, correction.nis
+    return (after.mean, after.covariance, *rest)
 
 
 def _memory(model: ExposureModel) -> float:

@@ -290,3 +290,17 @@ def test_an_axis_does_not_depend_on_those_beside_it(axes, flux):
         np.testing.assert_array_equal(few.end.covariance, many.end.covariance[:axes])
         np.testing.assert_array_equal(few.nis, many.nis[:axes])
         np.testing.assert_array_equal(few.status, many.status[:axes])
+
+
+def test_lost_frames_and_dead_time_are_bridged():
+    timing = dataclasses.replace(RIG.timing, frame_period_steps=230)
+    rig = dataclasses.replace(RIG, timing=timing)
+    exposures = simulate(rig, 120, seed=7)
+    lost = exposures[40]
+    lead = np.concatenate([lost.lead_inputs, lost.inputs, exposures[41].lead_inputs])
+    series = [*exposures[:40], dataclasses.replace(exposures[41], lead_inputs=lead), *exposures[42:]]
+    estimates = run(rig, series, ["moments", "o1"])
+    assert {(e.status, e.reason) for e in estimates["moments"]} == {(Status.OK, "")}
+    ours, o1 = (score(series, estimates[name], 10) for name in ("moments", "o1"))
+    assert ours.path_rmse < 0.5 * o1.path_rmse
+    assert ours.end_nees.mean == pytest.approx(2.0, abs=0.5)

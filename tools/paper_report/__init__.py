@@ -1,0 +1,1 @@
+"""What `tools/paper` makes: the figures, the numbers and the claims of Mishra & Wen, from our own runs."""
