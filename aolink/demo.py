@@ -18,7 +18,7 @@ from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import Rig
 from aolink.session import Report, record
 
-ESTIMATORS = ("open-loop", "o1", "o2", "o3")
+ESTIMATORS = ("open-loop", "o1", "o2", "o3", "moments")
 _RIG_START_S = 20.0
 
 

@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
+import tracemalloc
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf import descriptor_pb2
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 import aolink
 from aolink.assembly import Frame
+from aolink.errors import RecordingError
 from aolink.estimation import exposure_model
 from aolink.recording import convert, topics
 from aolink.recording.reader import Recording
+from aolink.recording.reestimate import write_reestimated
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
@@ -175,3 +185,72 @@ def test_the_generated_classes_are_those_of_the_proto_files(room: str, tmp_path:
         for field in message.field:
             field.ClearField("json_name")
     assert generated == compiled, "run tools/protocol"
+
+
+def test_one_flipped_bit_is_noticed_and_said(recorded: Session, tmp_path: Path) -> None:
+    data = bytearray(recorded.path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    (path := tmp_path / "flipped.mcap").write_bytes(data)
+    recording = Recording(path)
+    assert "it is damaged before byte" in recording.damage
+    assert 0 < len(list(recording.exposures())) < EXPOSURES
+    write_reestimated(recording, ["o3"], tmp_path / "again.mcap")
+    assert Recording(tmp_path / "again.mcap").metadata["damage"] == recording.damage
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+def test_a_chunk_that_would_fill_the_memory_is_refused(tmp_path: Path, compression: str) -> None:
+    """300 MB of zeros in a few kB: as said, and behind a size that is a lie."""
+    zeros = bytes(300 << 20)
+    data = lz4.frame.compress(zeros) if compression == "lz4" else zstandard.compress(zeros)
+    for said in (len(zeros), 1000):
+        with (path := tmp_path / f"{said}.mcap").open("wb") as file:
+            writer = Writer(file)
+            writer.start()
+            builder = RecordBuilder()
+            Chunk(compression, data, 0, 0, 0, said).write(builder)
+            file.write(builder.end())
+            writer.finish()
+        tracemalloc.start()
+        with pytest.raises(RecordingError, match="holds no rig file"):
+            Recording(path)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 20 << 20, peak
+
+
+def test_a_file_without_text_where_the_rig_should_be(tmp_path: Path) -> None:
+    with (path := tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_attachment(0, 0, "rig.toml", "application/toml", b"\xff\xfe")
+        writer.finish()
+    with pytest.raises(RecordingError, match="holds a rig file that this aolink does not take: not valid TOML"):
+        Recording(path)
+
+
+def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0)
+    writer.write(topics.LOG, Log(message="before the epoch"), -1)  # not a time that the format knows
+    with pytest.raises(RecordingError, match=r"cannot write .*a.mcap: error\("):
+        writer.close({"ended": "complete"})
+    assert Recording(tmp_path / "a.mcap").metadata.get("ended") is None
+
+
+def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A write that blocks: a FIFO whose reader has stopped reading stands for the disk."""
+    monkeypatch.setattr("aolink.recording.writer._STALL_S", 0.2)
+    os.mkfifo(fifo := tmp_path / "disk")
+    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
+    writer = RecordingWriter(fifo, load_rig("section-vi"), {}, 0, overwrite=True)
+    os.read(reader, 1 << 20)
+
+    def record_much() -> None:
+        for k in range(1_000_000):
+            writer.write(topics.LOG, Log(message=os.urandom(50_000).hex()), k * 200_000_000)
+
+    with pytest.raises(RecordingError, match="is too slow for this session"):
+        record_much()
+    with pytest.raises(RecordingError, match="does not answer"):
+        writer.close()
+    os.close(reader)  # lets the thread go

@@ -85,3 +85,27 @@ def test_a_clock_that_was_set_is_followed_after_some_refusals() -> None:
 
 def test_a_reply_from_before_its_query_is_refused() -> None:
     assert not ClockRegression().add(ClockExchange(START, 0, 10_000, START + 5000))
+
+
+def test_a_line_that_has_become_slower_for_good_is_taken_as_it_is() -> None:
+    line = Line(7, drift_ppm=10.0)
+    clock, _ = settled(line)
+    slow = []
+    for k in range(8):
+        exchange = line.exchange(60 + k)
+        late = 2_000_000  # there and back alike
+        slow.append(
+            clock.add(
+                ClockExchange(
+                    exchange.host_send_ns - late,
+                    exchange.device_receive_ns,
+                    exchange.device_send_ns,
+                    exchange.host_receive_ns + late,
+                )
+            )
+        )
+    assert slow == [False, False, False, True, True, True, True, True]
+    now = START + 68 * 10**9
+    device_ns, sigma = clock.device_ns(now)
+    assert abs(device_ns - line.device_ns(now)) < 2 * sigma
+    assert 1e6 < sigma < 2e6
