@@ -45,3 +45,9 @@ class ViewerError(AolinkError):
     """A viewer or a picture of it that this machine cannot give."""
 
     exit_code = 7
+
+
+class CalibrationError(AolinkError):
+    """Frames that are not what a calibration needs."""
+
+    exit_code = 8

@@ -109,6 +109,8 @@ class Sensor:
     """Counts of a pixel that sees nothing."""
     counts_per_density: float
     """Counts for a density of one (one over the slope unit)."""
+    photoelectrons: float = 0.0
+    """Photo-electrons of the whole spot in one exposure; 0 means so many that shot noise does not matter."""
 
     @property
     def pixel_width(self) -> float:
@@ -199,10 +201,22 @@ class Faults:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Light:
+    """What the simulated camera looks at, from one start of it to the next."""
+
+    kind: Literal["dark", "flat", "still", "moving"]
+    """Nothing; the same density everywhere; the spot held where it is when the camera starts; the spot."""
+    level: float | None = None
+    """Density of a flat, one over slope units; None: halfway from the black level to the full scale."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Simulation:
     """What only the simulated rig needs to know."""
 
     seed: int = 1
+    light: tuple[Light, ...] = (Light(kind="moving"),)
+    """Each start of the camera takes the next one; the last one stays."""
     clock_offset_s: float = 0.0
     """Device clock minus host clock at the start, s."""
     clock_drift_ppm: float = 0.0
@@ -210,6 +224,25 @@ class Simulation:
     latency_s: float = 100e-6
     """Median one-way latency of the link on virtual time, s."""
     faults: Faults = Faults()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationTable:
+    """How well the sensor's values are known, as `aolink calibrate` wrote it: standard deviations, and from what.
+
+    A standard deviation is None where its value was not measured.
+    """
+
+    black_level_sd: float | None = None
+    noise_density_sd: float | None = None
+    counts_per_density_sd: float | None = None
+    photoelectrons_sd: float | None = None
+    kernel_sigma_sd: float | None = None
+    dark_frames: int = 0
+    flat_frames: int = 0
+    still_frames: int = 0
+    sources: tuple[str, ...] = ()
+    """Kind, name and SHA-256 of each recording that was used."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -224,6 +257,8 @@ class Rig:
     mirror: MirrorDriver
     drive: Drive
     simulation: Simulation
+    calibration: CalibrationTable | None
+    """None where the sensor's values were not measured."""
     toml: str
     """The file's text, as read."""
 
@@ -253,6 +288,10 @@ class _Table:
 
     def key(self, name: str) -> str:
         return f"{self._path}.{name}" if self._path else name
+
+    def has(self, name: str) -> bool:
+        self._asked.add(name)
+        return name in self._values
 
     def get(self, name: str, default: Any = None) -> Any:
         self._asked.add(name)
@@ -287,6 +326,15 @@ class _Table:
             bound = f"at least {low:g}" if value < low else f"above {above:g}"
             raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
         return float(value)
+
+    def optional_number(self, name: str, *, low: float) -> float | None:
+        return self.number(name, low=low) if self.has(name) else None
+
+    def texts(self, name: str) -> tuple[str, ...]:
+        values = self.get(name, [])
+        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+            raise RigError(f"{self.key(name)}: expected a list of texts, found {_shown(values)}")
+        return tuple(values)
 
     def rate(self, name: str) -> float:
         value = self.number(name, 0.0, low=0.0)
@@ -395,10 +443,12 @@ def parse_rig(text: str) -> Rig:
     mirror = _mirror(root.table("mirror"), n_inputs, timing)
     drive = _drive(root.table("drive", optional=True), n_inputs, mirror)
     simulation = _simulation(root.table("simulation", optional=True))
+    calibration = _calibration(root.table("calibration")) if root.has("calibration") else None
     root.finish()
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
-        mirror=mirror, drive=drive, simulation=simulation, toml=text,
+        mirror=mirror, drive=drive, simulation=simulation,
+        calibration=calibration, toml=text,
     )  # fmt: skip
 
 
@@ -477,6 +527,7 @@ def _sensor(table: _Table, plant: Plant) -> Sensor:
         bit_depth=table.integer("bit_depth", 16, low=1, high=16),
         black_level=table.number("black_level", 0.0, low=0.0),
         counts_per_density=table.number("counts_per_density", above=0.0),
+        photoelectrons=table.number("photoelectrons", 0.0, low=0.0),
     )
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
@@ -533,6 +584,7 @@ def _simulation(table: _Table) -> Simulation:
     faults_table.finish()
     simulation = Simulation(
         seed=table.integer("seed", 1, low=0),
+        light=parse_light(table.text("light", "moving"), table.key("light")),
         clock_offset_s=table.number("clock_offset_s", 0.0),
         clock_drift_ppm=table.number("clock_drift_ppm", 0.0),
         latency_s=table.number("latency_s", 100e-6, low=0.0),
@@ -540,6 +592,39 @@ def _simulation(table: _Table) -> Simulation:
     )
     table.finish()
     return simulation
+
+
+def parse_light(text: str, name: str) -> tuple[Light, ...]:
+    """Lights in a row, ``dark,flat:4,still``; ``name`` is what an error calls them. Raises RigError."""
+    lights = []
+    for word in text.split(","):
+        kind, colon, level = word.strip().partition(":")
+        if kind not in ("dark", "flat", "still", "moving") or (colon and kind != "flat"):
+            raise RigError(f"{name}: {word.strip()!r} is not known: use dark, flat, flat:DENSITY, still, moving")
+        try:
+            density = float(level) if colon else None
+        except ValueError:
+            density = math.nan
+        if density is not None and not 0 < density < math.inf:
+            raise RigError(f"{name}: the density of {word.strip()!r} must be a number above 0")
+        lights.append(Light(kind=kind, level=density))  # type: ignore[arg-type] # one of the four, as checked
+    return tuple(lights)
+
+
+def _calibration(table: _Table) -> CalibrationTable:
+    calibration = CalibrationTable(
+        black_level_sd=table.optional_number("black_level_sd", low=0.0),
+        noise_density_sd=table.optional_number("noise_density_sd", low=0.0),
+        counts_per_density_sd=table.optional_number("counts_per_density_sd", low=0.0),
+        photoelectrons_sd=table.optional_number("photoelectrons_sd", low=0.0),
+        kernel_sigma_sd=table.optional_number("kernel_sigma_sd", low=0.0),
+        dark_frames=table.integer("dark_frames", 0, low=0),
+        flat_frames=table.integer("flat_frames", 0, low=0),
+        still_frames=table.integer("still_frames", 0, low=0),
+        sources=table.texts("sources"),
+    )
+    table.finish()
+    return calibration
 
 
 def _shape(array: FloatArray) -> str:

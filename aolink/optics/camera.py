@@ -33,6 +33,17 @@ def pixel_noise_sd(sensor: Sensor) -> float:
     return math.sqrt(sensor.noise_density / sensor.pixel_width)
 
 
+def pixel_noise_variance(sensor: Sensor, density: FloatArray) -> FloatArray:
+    """Variance of pixels' densities by read-out and shot noise, one over slope units squared, shape of ``density``.
+
+    V/D + Y/(photoelectrons D): a pixel of density Y holds photoelectrons D Y electrons, Poisson distributed.
+    """
+    read = np.full_like(density, sensor.noise_density / sensor.pixel_width)
+    if sensor.photoelectrons:
+        read += np.maximum(density, 0) / (sensor.photoelectrons * sensor.pixel_width)
+    return read
+
+
 def effective_noise_density(sensor: Sensor) -> float:
     """V with the rounding to whole counts added (variance 1/12 of a count), so that it is never zero."""
     return sensor.noise_density + sensor.pixel_width / (12 * sensor.counts_per_density**2)

@@ -35,8 +35,8 @@ class RigModel:
     """Plant, mirror and camera of a rig, advanced in fast steps.
 
     What comes out depends on the rig, the seed, the inputs and when the camera was started, and not on
-    how the steps are cut into calls of `advance`: initial state, process noise and pixel noise have
-    random streams of their own, drawn in the order of time.
+    how the steps are cut into calls of `advance`: initial state, process noise, read-out noise and
+    photo-electrons have random streams of their own, drawn in the order of time.
     """
 
     def __init__(self, rig: Rig, seed: int | None = None) -> None:
@@ -44,8 +44,8 @@ class RigModel:
         self.rig = rig
         self.step = 0
         """The next fast step."""
-        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(3)
-        initial, self._process_noise, self._pixel_noise = (np.random.default_rng(s) for s in seeds)
+        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(4)
+        initial, self._process_noise, self._pixel_noise, self._electrons = (np.random.default_rng(s) for s in seeds)
         scatter = initial.standard_normal((plant.axes, plant.n_states, 1))
         self._state = plant.initial_mean + (psd_root(plant.initial_covariance) @ scatter)[..., 0]
         self._noise_input = plant.B_w @ psd_root(plant.process_noise)
@@ -54,12 +54,16 @@ class RigModel:
         self._exposures_left = 0
         self._start_state = self._state
         self._pieces: list[FloatArray] = []  # outputs of the exposure that runs
+        self._lights = iter(rig.simulation.light)
+        self._light = rig.simulation.light[0]
+        self._rest: FloatArray | None = None  # where a still spot is held
 
     def start_camera(self, first_step: int, exposures: int = 0) -> None:
         """Expose from ``first_step`` on, ``exposures`` times (0: until stopped); what ran before is dropped."""
         if first_step < self.step:
             raise ValueError(f"fast step {first_step} has gone by, the next one is {self.step}")
         self._exposure, self._exposures_left = first_step, exposures
+        self._light, self._rest = next(self._lights, self._light), None
 
     def stop_camera(self) -> None:
         """Expose no more; an exposure that runs gives no frame."""
@@ -103,8 +107,12 @@ class RigModel:
         sensor = self.rig.sensor
         path = np.concatenate(self._pieces).T.copy()
         self._frames += 1
+        path, density = self._illuminate(path)
+        if sensor.photoelectrons:
+            electrons_per_density = sensor.photoelectrons * sensor.pixel_width
+            density = self._electrons.poisson(electrons_per_density * density) / electrons_per_density
         noise = self._pixel_noise.standard_normal(sensor.shape)
-        density = exposure_density(sensor.kernel, sensor.edges, path) + pixel_noise_sd(sensor) * noise
+        density = density + pixel_noise_sd(sensor) * noise
         return CameraFrame(
             frame_id=self._frames,
             first_step=first_step,
@@ -112,6 +120,19 @@ class RigModel:
             pixels=to_counts(sensor, density),
             truth=Truth(start_state=self._start_state.copy(), end_state=end_state.copy(), path=path),
         )
+
+    def _illuminate(self, path: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The path that the camera sees and the mean densities, (n_outputs, steps) and (rows, columns)."""
+        sensor, light = self.rig.sensor, self._light
+        if light.kind == "dark":
+            return path, np.zeros(sensor.shape)
+        if light.kind == "flat":
+            middle = (sensor.full_scale - sensor.black_level) / (2 * sensor.counts_per_density)
+            return path, np.full(sensor.shape, middle if light.level is None else light.level)
+        if light.kind == "still":
+            self._rest = path[:, :1] if self._rest is None else self._rest
+            path = np.repeat(self._rest, path.shape[1], axis=1)
+        return path, exposure_density(sensor.kernel, sensor.edges, path)
 
 
 def simulate(
