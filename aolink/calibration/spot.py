@@ -1,0 +1,219 @@
+"""The resting spot of a calibration: its position, width and light, and whether it is at rest at all."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from aolink.errors import CalibrationError
+from aolink.optics.kernel import pixel_mass, pixel_mass_slope
+from aolink.rig import Kernel, Sensor
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_SURE = 1e-6
+_NOT_GAUSSIAN = 1e-4
+"""Probability of the fit's chi-square by chance below which the kernel is not called Gaussian."""
+_FAINT = 10.0
+"""Standard deviations of its light from which on there is a spot."""
+_LEAST_MASS = 0.99
+"""Share of the spot's light that must fall on the sensor."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spot:
+    """Least-squares fit of the Gaussian kernel, integrated over the pixels, to the mean profile of resting spots."""
+
+    positions: tuple[float, ...]
+    """Slope units, one for each recording."""
+    position_sds: tuple[float, ...]
+    sigma: float
+    """Slope units."""
+    sigma_sd: float
+    counts_per_density: float
+    """By the fit's amplitude where the kernel is Gaussian, by the spot's total where it is not."""
+    counts_per_density_sd: float
+    chi_square: float
+    freedom: int
+    """Degrees of freedom."""
+    largest_residual: float
+    """Over the profile's peak."""
+    noise: tuple[float, float]
+    """Variance of a dark pixel in one frame, counts squared, and counts per electron."""
+
+    @property
+    def gaussian(self) -> bool:
+        """Whether the profile is that of a Gaussian within the noise."""
+        return bool(stats.chi2.sf(self.chi_square, self.freedom) >= _NOT_GAUSSIAN)
+
+    @property
+    def complaint(self) -> str:
+        """What to say of a kernel that is not Gaussian."""
+        return (
+            f"the spot is not a Gaussian: chi-square {self.chi_square:.0f} for {self.freedom} degrees of freedom, largest"
+            f" residual {self.largest_residual:.1%} of the peak; kernel.sigma is that of the nearest Gaussian,"
+            " counts_per_density comes from the total"
+        )
+
+
+def fit_spots(
+    sensor: Sensor,
+    signals: Sequence[tuple[str, int, FloatArray]],
+    good: BoolArray,
+    noise: tuple[float, float],
+    dark_frames: int,
+) -> Spot:
+    """Fit one width and one scale to the spots of several recordings, each at its own position.
+
+    Parameters
+    ----------
+    signals:
+        Name, number of frames, and mean counts above the dark level, (pixels,), of each recording.
+    good:
+        Pixels to use, (pixels,).
+    noise:
+        Variance of a dark pixel in one frame, counts squared, and counts per electron.
+
+    Raises
+    ------
+    CalibrationError
+        There is no spot, or not the whole of it, or light everywhere.
+    """
+    read, gain = noise
+    means = np.array([mean[good] for _, _, mean in signals])
+    # All recordings have the dark frames' error in common: as if each had its own, but that many times larger.
+    over_dark = read * len(signals) / dark_frames
+    frames = np.array([[n] for _, n, _ in signals])
+    start = [_first_guess(sensor, *each, good, read / each[1] + read / dark_frames) for each in signals]
+    width, scale = sensor.pixel_width, float(np.mean([s[0] for s in start]))
+    unit = np.array([scale, 1.0, *[width] * len(signals)])
+    p = np.array([scale, math.log(float(np.median([s[2] for s in start]))), *[s[1] for s in start]]) / unit
+    variance = read / frames + over_dark + gain * np.maximum(means, 0) / frames
+
+    def model(p: FloatArray) -> FloatArray:
+        kernel = Kernel(shape="gaussian", sigma=math.exp(min(max(p[1], -30.0), 30.0)))
+        return p[0] * scale * pixel_mass(kernel, sensor.edges, p[2:] * width)[:, good] / width
+
+    for _ in range(3):  # the noise depends on the profile
+        sd = np.sqrt(variance)
+        fit = optimize.least_squares(lambda q: ((means - model(q)) / sd).ravel(), p, jac="3-point")
+        p = fit.x
+        variance = read / frames + over_dark + gain * np.maximum(model(p), 0) / frames
+    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * np.outer(unit, unit)
+    p, chi_square, freedom = p * unit, float(2 * fit.cost), means.size - len(p)
+    sigma = math.exp(p[1])
+    inside = pixel_mass(Kernel(shape="gaussian", sigma=sigma), sensor.edges, p[2:])
+    for (source, _, _), position, share in zip(signals, p[2:], inside.sum(axis=1), strict=True):
+        if share < _LEAST_MASS:
+            raise CalibrationError(
+                f"{source}: the spot (at {position:.3g}) is not whole on the sensor, {1 - share:.0%} of it falls beside:"
+                " move it inward, and record it again"
+            )
+    sds = np.sqrt(np.diag(covariance))
+    amplitude, amplitude_sd = p[0], sds[0]
+    if stats.chi2.sf(chi_square, freedom) < _NOT_GAUSSIAN:
+        # The model is wrong rather than the noise large; the total needs no model, and the rest is uncertain by as much.
+        sds = sds * math.sqrt(chi_square / freedom)
+        share = inside[:, good].sum()
+        amplitude, amplitude_sd = width * means.sum() / share, width * math.sqrt(variance.sum()) / share
+    return Spot(
+        positions=tuple(map(float, p[2:])),
+        position_sds=tuple(map(float, sds[2:])),
+        sigma=sigma,
+        sigma_sd=float(sigma * sds[1]),
+        counts_per_density=float(amplitude),
+        counts_per_density_sd=float(amplitude_sd),
+        chi_square=chi_square,
+        freedom=freedom,
+        largest_residual=float(np.abs(fit.fun * sd.ravel()).max() / means.max()),
+        noise=noise,
+    )
+
+
+def _first_guess(
+    sensor: Sensor, source: str, frames: int, mean: FloatArray, good: BoolArray, variance: float
+) -> tuple[float, float, float]:
+    """Scale, position and width of the Gaussian on a grid that fits best. Raises CalibrationError without a spot."""
+    best = (0.0, 0.0, 0.0, 0.0)
+    sigma = sensor.pixel_width / 4
+    while sigma < (sensor.field[1] - sensor.field[0]) / 3:
+        profiles = pixel_mass(Kernel(shape="gaussian", sigma=sigma), sensor.edges, sensor.centres)[:, good]
+        power = (profiles**2).sum(axis=1)
+        amplitude = profiles @ mean[good] / power
+        gained = np.where(amplitude > 0, amplitude**2 * power, 0.0)
+        k = int(gained.argmax())
+        best = max(best, (float(gained[k]), float(amplitude[k]), float(sensor.centres[k]), sigma))
+        sigma *= 1.5
+    gained_most, amplitude_best, position, sigma = best
+    if gained_most < _FAINT**2 * variance:
+        raise CalibrationError(
+            f"{source} is said to show a resting spot, but there is none: is the light on, and does it meet the sensor?"
+            " Record it again"
+        )
+    if np.median(mean[good]) > 0.2 * mean[good].max():
+        raise CalibrationError(
+            f"{source} is said to show a resting spot, but there is light everywhere: shield the sensor from other"
+            " light, and record it again"
+        )
+    return amplitude_best * sensor.pixel_width, position, sigma
+
+
+def check_at_rest(
+    sensor: Sensor,
+    source: str,
+    counts: NDArray[np.uint16],
+    variance: FloatArray,
+    good: BoolArray,
+    spot: Spot,
+    number: int,
+) -> list[str]:
+    """Whether position and light of a spot stay the same from frame to frame; gives notes.
+
+    Parameters
+    ----------
+    counts:
+        (frames, pixels)
+    variance:
+        Of each pixel over time, (pixels,).
+    number:
+        Which of the fit's spots it is.
+
+    Raises
+    ------
+    CalibrationError
+        It moves.
+    """
+    kernel = Kernel(shape="gaussian", sigma=spot.sigma)
+    position = np.array([spot.positions[number]])
+    scale = spot.counts_per_density / sensor.pixel_width
+    profile = scale * pixel_mass(kernel, sensor.edges, position)[0, good]
+    slope = scale * pixel_mass_slope(kernel, sensor.edges, position)[0, good]
+    read, gain = spot.noise
+    weight = 1 / (read + gain * profile)
+    # Independent pixels scatter by their own variances; a motion moves both flanks together, against each other.
+    notes = []
+    for pattern, moves in ((slope, True), (profile, False)):
+        filtered = counts[:, good] @ (pattern * weight) / float((pattern**2 * weight).sum())
+        alone = (pattern * weight / (pattern**2 * weight).sum()) ** 2 * variance[good]
+        scatter, expected = float(filtered.var(ddof=1)), float(alone.sum())
+        n = len(counts)
+        freedom = 2 / ((3 * n - 4) / (n - 1) ** 2) * expected**2 / float((alone**2).sum())
+        if stats.f.sf(scatter / expected, n - 1, freedom) > _SURE:
+            continue
+        excess = math.sqrt(scatter - expected)
+        if moves:
+            raise CalibrationError(
+                f"{source} is said to show a resting spot, but the spot moves by {excess:.2g} (standard deviation, slope"
+                " units) from frame to frame: park the mirror, keep the bench still, and record it again"
+            )
+        notes.append(
+            f"{source}: the light of the spot flickers by {excess:.1%}: photoelectrons comes out too low where no"
+            " flat tells better"
+        )
+    return notes
