@@ -6,22 +6,21 @@ import json
 import math
 import os
 import shutil
-import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from dataclasses import replace
+from enum import StrEnum
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from aolink.errors import AolinkError, RigError
-from aolink.rig import Rig, load_rig
+from aolink.rig import Rig, load_rig, parse_light
+from aolink.terminal import StopRequest, ask, progress_bar
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -40,6 +39,14 @@ EstimatorOption = Annotated[
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+
+class Light(StrEnum):
+    """What a recording for a calibration shows."""
+
+    DARK = "dark"
+    FLAT = "flat"
+    STILL = "still"
 
 
 def _print_version(wanted: bool) -> None:
@@ -88,55 +95,6 @@ def _command() -> str:
     return "aolink" if shutil.which("aolink") else str(Path(sys.executable).with_name("aolink"))
 
 
-class _StopRequest:
-    """Ctrl-C and SIGTERM end a session in good order; a second one ends it at once."""
-
-    def __init__(self) -> None:
-        self.signal = 0
-
-    def __call__(self) -> bool:
-        return self.signal != 0
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.signal:
-            raise KeyboardInterrupt
-        self.signal = number
-
-    @contextmanager
-    def installed(self) -> Iterator[_StopRequest]:
-        before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def exit_if_asked(self) -> None:
-        """Exit as a command does that a signal ended."""
-        if self.signal:
-            raise typer.Exit(128 + self.signal)
-
-
-@contextmanager
-def _progress(total: int | None) -> Iterator[Callable[[str, int], None]]:
-    """A progress bar on a terminal; gives ``tell(what, done)``."""
-    columns = (TextColumn("{task.description:>14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=_err, transient=not _err.is_terminal, disable=not _err.is_terminal) as bar:
-        tasks: dict[str, Any] = {}
-
-        def tell(what: str, done: int) -> None:
-            if what not in tasks:
-                for task in bar.tasks:
-                    bar.update(task.id, completed=task.total or task.completed)
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done)
-
-        yield tell
-        for task in bar.tasks:
-            if task.total is None or not task.completed:
-                bar.update(task.id, total=task.completed or 1, completed=task.completed or 1)
-
-
 @app.command(epilog="Example: aolink rig section-vi --check")
 def rig(
     rig: RigArgument,
@@ -144,6 +102,13 @@ def rig(
     real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not with the commands.")] = False,
     seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
     listen: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, not terminals.")] = None,
+    light: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND,...",
+            help="What the camera sees, start after start: dark, flat, flat:DENSITY, still, moving; the last stays.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
@@ -151,10 +116,12 @@ def rig(
         _print_findings(load_rig(rig), as_json)
         return
     loaded = _load_checked(rig)
+    if light is not None:
+        loaded = replace(loaded, simulation=replace(loaded.simulation, light=parse_light(light, "--light")))
     from aolink.simulation.server import RigServer, open_streams
 
     streams = open_streams(listen)
-    with _StopRequest().installed() as stop:
+    with StopRequest().installed() as stop:
         server = RigServer(loaded, streams, seed=seed, real_time=real_time)
         ports = {line: stream.name for line, stream in streams.items()}
         if as_json:
@@ -237,6 +204,10 @@ def record(
     exposures: Annotated[int | None, typer.Option(min=1, help="How many exposures.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="How long, in seconds of device time.")] = None,
     note: Annotated[str, typer.Option(metavar="TEXT", help="Goes into the recording.")] = "",
+    calibration: Annotated[
+        Light | None,
+        typer.Option(help="Frames of this for `aolink calibrate`: the mirror stays parked, whatever the rig's drive."),
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Record a session: play the rig's drive, record everything, estimate on the way.
@@ -252,7 +223,7 @@ def record(
         if not duration > 0:
             raise typer.BadParameter("--duration must be above zero")
         exposures = max(1, math.ceil(duration / (loaded.timing.frame_period_steps * loaded.timing.fast_step_s)))
-    with _StopRequest().installed() as stop, _progress(exposures) as tell:
+    with StopRequest().installed() as stop, progress_bar(_err, exposures) as tell:
         report = session.record(
             loaded,
             camera,
@@ -261,6 +232,7 @@ def record(
             estimators=estimator or [],
             exposures=exposures or 0,
             note=note,
+            calibration=calibration or "",
             overwrite=overwrite,
             stop=stop,
             progress=lambda done: tell("exposures", done),
@@ -270,6 +242,58 @@ def record(
     _out.print(tables.session(report))
     _out.print(f"{output}: {report.exposures} exposures, {report.ended}; look at it: aolink view {output}")
     stop.exit_if_asked()
+
+
+@app.command(epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml")
+def calibrate(
+    rig: Annotated[str, typer.Option(metavar="RIG.toml", help="The rig file to begin with, or the name of one.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The rig file to write.")],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[FILE]...", help="Recordings made with `aolink record --calibration`."),
+    ] = None,
+    camera: Annotated[str | None, typer.Option(metavar="PORT", help="Record from this camera instead.")] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror driver.")] = None,
+    frames: Annotated[int, typer.Option(help="How many of each kind to record.")] = 100,
+    keep: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the recordings in this folder.")] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
+
+    From recordings of dark, flat and still light; or with --camera and --mirror, asking for each in turn.
+    """
+    from tempfile import TemporaryDirectory
+
+    from aolink import calibrating, tables
+
+    loaded = load_rig(rig)
+    if bool(files) == bool(camera) or bool(camera) != bool(mirror):
+        raise typer.BadParameter("give recordings, or --camera and --mirror")
+    calibrating.check_target(output, overwrite=overwrite)
+    with TemporaryDirectory(prefix="aolink-") as temporary:
+        if camera and mirror:
+            folder = keep or Path(temporary)
+            with progress_bar(_err, frames) as tell:
+                files = calibrating.record_frames(
+                    loaded,
+                    camera,
+                    mirror,
+                    folder,
+                    frames=frames,
+                    overwrite=overwrite,
+                    ask=partial(ask, _err),
+                    progress=tell,
+                )
+        result = calibrating.calibrate_recordings(loaded, calibrating.rig_text(rig, loaded), files or [])
+    calibrating.write_text(output, result.text, overwrite=overwrite)
+    if as_json:
+        print(json.dumps(tables.calibration_as_json(result)))
+        return
+    _out.print(tables.calibration(result))
+    for note in result.calibration.notes:
+        _out.print(f"note: {escape(note)}")
+    _out.print(f"written: {output}")
 
 
 @app.command(epilog="Example: aolink info session.mcap --json")
@@ -305,12 +329,12 @@ def estimate(
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     total = recording.counts.get("/camera/image", 0)
     if output is not None:
-        with _progress(total) as tell:
+        with progress_bar(_err, total) as tell:
             write_reestimated(recording, names, output, overwrite=overwrite, progress=lambda n: tell("estimate", n))
         recording = Recording(output)
         estimates = {name: recording.estimates(name) for name in names}
     else:
-        with _progress(total) as tell:
+        with progress_bar(_err, total) as tell:
             estimates = reestimate(recording, names, lambda n: tell("estimate", n))
     scores = tables.score_all(recording, estimates)
     if as_json:
@@ -381,7 +405,7 @@ def demo(
 
     loaded = _load_checked(rig)
     folder = new_folder(out)
-    with _StopRequest().installed() as stop, _progress(exposures) as tell:
+    with StopRequest().installed() as stop, progress_bar(_err, exposures) as tell:
         result = run_demo(
             loaded, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
         )  # fmt: skip

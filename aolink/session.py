@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 
+import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
@@ -26,7 +27,7 @@ from aolink.exposure import Exposure
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
-from aolink.rig import Rig
+from aolink.rig import Drive, Rig
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.clock import QUERY_PERIOD_S, WARM_UP_QUERIES
 from aolink.wire.hub import Hub
@@ -119,6 +120,7 @@ def record(
     estimators: Sequence[str] = (),
     exposures: int = 0,
     note: str = "",
+    calibration: str = "",
     overwrite: bool = False,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
@@ -137,6 +139,9 @@ def record(
         Names of estimators to run online; their results go into the recording.
     exposures:
         How many; 0 means until ``stop()``.
+    calibration:
+        What the camera is shown, of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
+        mirror then holds its parked input, whatever the rig's drive.
     stop, progress:
         Asked, and told the number of exposures so far, at least ten times a second.
 
@@ -147,6 +152,9 @@ def record(
         recording is closed with what there is.
     """
     driver = Driver(rig, estimators)
+    if calibration:
+        rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
+        rig = replace(rig, drive=rest)
     with open_devices(rig, camera_port, mirror_port) as (hub, camera, mirror):
         facts = {
             "aolink_version": version("aolink"),
@@ -158,6 +166,8 @@ def record(
             "estimators": " ".join(estimators),
             "note": note,
         }
+        if calibration:
+            facts[topics.CALIBRATION] = calibration
         writer = RecordingWriter(path, rig, facts, hub.now_ns(), overwrite=overwrite, deterministic=hub.virtual)
         session = _Session(rig, hub, camera, mirror, writer, driver)
         try:

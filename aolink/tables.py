@@ -12,6 +12,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from aolink.calibration.rig_text import written
 from aolink.estimation import Estimate
 from aolink.estimation.score import Consistency, Score, score
 from aolink.recording import schemas_pb2 as pb
@@ -20,6 +21,7 @@ from aolink.recording.reader import Recording
 from aolink.session import Report
 
 if TYPE_CHECKING:
+    from aolink.calibrating import Calibrated
     from aolink.demo import DemoResult
 
 _LATENCY_STEPS = (
@@ -179,3 +181,80 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
     lines.append(f"          {command} info {result.recording}")
     lines.append(f"          {command} estimate {result.recording} --estimator o3")
     return lines
+
+
+def calibration(result: Calibrated) -> Table:
+    """Value in the file, measured value, standard deviation, and by how many of them the file is off."""
+    counts = ", ".join(f"{n} {kind}" for kind, n in result.calibration.frames.items())
+    table = Table(
+        title=f"Calibration from frames: {counts}", title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False,
+        caption="\n".join(_calibration_facts(result)), caption_justify="left",
+    )  # fmt: skip
+    table.add_column("key", no_wrap=True)
+    for name in ("in the file", "measured", "sd", "pull"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for key, row in calibration_as_json(result)["values"].items():
+        shown = (
+            "-" if row["measured"] is None else row["written"],
+            _number(row["sd"], ".2g"),
+            _number(row["pull"], "+.1f"),
+        )
+        table.add_row(key, f"{row['file']:g}", *shown)
+    return table
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _calibration_facts(result: Calibrated) -> list[str]:
+    found = result.calibration
+    lines = [f"read noise {found.read_noise.value:.4g} counts (sd {found.read_noise.sd:.2g})"]
+    if found.gain is not None:
+        lines[0] += f", {found.gain.value:.4g} counts per photo-electron (sd {found.gain.sd:.2g})"
+    if found.spot is not None:
+        where = ", ".join(f"{x:.4g}" for x in found.spot.positions)
+        verdict = "" if found.spot.gaussian else ": not a Gaussian"
+        lines.append(
+            f"spot at {where}; fit of the kernel: chi-square {found.spot.chi_square:.0f}"
+            f" for {found.spot.freedom} degrees of freedom{verdict}"
+        )
+    if found.hot_pixels:
+        lines.append(f"hot or noisy pixels, left out: {', '.join(map(str, found.hot_pixels))}")
+    return lines
+
+
+def calibration_as_json(result: Calibrated) -> dict[str, Any]:
+    """The same for scripts; what is not known is null."""
+    found, sensor = result.calibration, result.rig.sensor
+    before = {
+        "sensor.black_level": sensor.black_level,
+        "sensor.noise_density": sensor.noise_density,
+        "sensor.counts_per_density": sensor.counts_per_density,
+        "sensor.photoelectrons": sensor.photoelectrons,
+        "sensor.kernel.sigma": sensor.kernel.sigma,
+    }
+    values = {}
+    for key, value in before.items():
+        measured = found.values.get(key)
+        values[key] = {
+            "file": value,
+            "measured": measured and measured.value,
+            "written": measured and written(measured),
+            "sd": measured and measured.sd,
+            "pull": measured and (value - measured.value) / (measured.sd or math.nan),
+        }
+    spot = found.spot
+    return dict(
+        _without_nan(
+            {
+                "values": values,
+                "read_noise_counts": asdict(found.read_noise),
+                "counts_per_photoelectron": found.gain and asdict(found.gain),
+                "spot": spot and {**asdict(spot), "gaussian": spot.gaussian},
+                "frames": found.frames,
+                "hot_pixels": found.hot_pixels,
+                "notes": found.notes,
+            }
+        )
+    )

@@ -174,10 +174,10 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     spot = None
     if stills:
         noise = (read.value, max(gain.value, 0.0) if gain else 0.0)
-        signals = [(each.source, curve.frames, curve.mean) for each, curve in zip(stills, curves[len(flats) :], strict=True)]
-        spot = fit_spots(rig.sensor, signals, good, noise, dark.frames)
-        for k, each in enumerate(stills):
-            notes += check_at_rest(rig.sensor, each.source, each.counts, curves[len(flats) + k].variance, good, spot, k)
+        lit = list(zip(stills, curves[len(flats) :], strict=True))
+        spot = fit_spots(rig.sensor, [(each.source, s.frames, s.mean) for each, s in lit], good, noise, dark.frames)
+        for k, (each, s) in enumerate(lit):
+            notes += check_at_rest(rig.sensor, each.source, each.counts, s.variance, good, spot, k)
         if not spot.gaussian:
             notes.append(spot.complaint)
     return _result(rig, recordings, black, read, gain, spot, good, notes)
@@ -247,7 +247,9 @@ def _black_level(
     levels = np.concatenate([each.counts[:, good].mean(axis=1) for each in darks])
     wander, expected = float(levels.var(ddof=1)), read.value / pixels
     if stats.chi2.sf((dark.frames - 1) * wander / max(expected, 1e-12), dark.frames - 1) < _SURE:
-        notes.append(f"the black level wanders by {math.sqrt(wander):.2g} counts from frame to frame, more than its noise")
+        notes.append(
+            f"the black level wanders by {math.sqrt(wander):.2g} counts from frame to frame, more than its noise"
+        )
         sd = math.sqrt(wander / dark.frames)
     # A fixed pattern is an error of every single density, so it is worth a word.
     pattern = float(dark.mean[good].var(ddof=1)) - read.value / dark.frames

@@ -13,7 +13,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from aolink.calibration.measure import Calibration, Measured
@@ -62,7 +62,9 @@ def _updated_table(rig: Rig, calibration: Calibration, sources: Sequence[str]) -
     """What is known now; of what was not measured this time, what was known before."""
     table = rig.calibration or CalibrationTable()
     sds = {
-        key.removeprefix("sensor.").replace(".", "_") + "_sd": float(f"{value.sd:.3g}") if value.sd == value.sd else None
+        key.removeprefix("sensor.").replace(".", "_") + "_sd": float(f"{value.sd:.3g}")
+        if value.sd == value.sd
+        else None
         for key, value in calibration.values.items()
     }
     frames = {f"{kind}_frames": n for kind, n in calibration.frames.items() if n}
@@ -157,5 +159,3 @@ def _line_end(text: str, position: int) -> int:
 
 def _newline(text: str) -> str:
     return "\r\n" if "\r\n" in text else "\n"
-
-

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +57,8 @@ class Spot:
     def complaint(self) -> str:
         """What to say of a kernel that is not Gaussian."""
         return (
-            f"the spot is not a Gaussian: chi-square {self.chi_square:.0f} for {self.freedom} degrees of freedom, largest"
-            f" residual {self.largest_residual:.1%} of the peak; kernel.sigma is that of the nearest Gaussian,"
+            f"the spot is not a Gaussian: chi-square {self.chi_square:.0f} for {self.freedom} degrees of freedom,"
+            f" largest residual {self.largest_residual:.1%} of the peak; kernel.sigma is that of the nearest Gaussian,"
             " counts_per_density comes from the total"
         )
 
@@ -85,45 +86,38 @@ def fit_spots(
     CalibrationError
         There is no spot, or not the whole of it, or light everywhere.
     """
-    read, gain = noise
     means = np.array([mean[good] for _, _, mean in signals])
-    # All recordings have the dark frames' error in common: as if each had its own, but that many times larger.
-    over_dark = read * len(signals) / dark_frames
+    dark_variance = noise[0] / dark_frames
+    start = [_first_guess(sensor, *each, good, noise[0] / each[1] + dark_variance) for each in signals]
+    scale, sigma = float(np.mean([s[0] for s in start])), float(np.median([s[2] for s in start]))
+    p = np.array([scale, math.log(sigma), *[s[1] for s in start]])
+    unit = np.array([scale, 1.0, *[sigma] * len(signals)])
+    model = partial(_mean_counts, sensor, good)
     frames = np.array([[n] for _, n, _ in signals])
-    start = [_first_guess(sensor, *each, good, read / each[1] + read / dark_frames) for each in signals]
-    width, scale = sensor.pixel_width, float(np.mean([s[0] for s in start]))
-    unit = np.array([scale, 1.0, *[width] * len(signals)])
-    p = np.array([scale, math.log(float(np.median([s[2] for s in start]))), *[s[1] for s in start]]) / unit
-    variance = read / frames + over_dark + gain * np.maximum(means, 0) / frames
-
-    def model(p: FloatArray) -> FloatArray:
-        kernel = Kernel(shape="gaussian", sigma=math.exp(min(max(p[1], -30.0), 30.0)))
-        return p[0] * scale * pixel_mass(kernel, sensor.edges, p[2:] * width)[:, good] / width
-
+    expected = np.maximum(means, 0.0)
     for _ in range(3):  # the noise depends on the profile
-        sd = np.sqrt(variance)
-        fit = optimize.least_squares(lambda q: ((means - model(q)) / sd).ravel(), p, jac="3-point")
-        p = fit.x
-        variance = read / frames + over_dark + gain * np.maximum(model(p), 0) / frames
-    covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * np.outer(unit, unit)
-    p, chi_square, freedom = p * unit, float(2 * fit.cost), means.size - len(p)
-    sigma = math.exp(p[1])
-    inside = pixel_mass(Kernel(shape="gaussian", sigma=sigma), sensor.edges, p[2:])
-    for (source, _, _), position, share in zip(signals, p[2:], inside.sum(axis=1), strict=True):
+        # All recordings share the dark frames' error: as if each had its own, but that many times larger.
+        variance = (noise[0] + noise[1] * expected) / frames + dark_variance * len(signals)
+        p, covariance, residuals = _weighted_fit(model, means, variance, p, unit)
+        expected = model(p)
+    sigma, positions = math.exp(p[1]), p[2:]
+    inside = pixel_mass(Kernel(shape="gaussian", sigma=sigma), sensor.edges, positions)
+    for (source, _, _), position, share in zip(signals, positions, inside.sum(axis=1), strict=True):
         if share < _LEAST_MASS:
             raise CalibrationError(
-                f"{source}: the spot (at {position:.3g}) is not whole on the sensor, {1 - share:.0%} of it falls beside:"
-                " move it inward, and record it again"
+                f"{source}: the spot (at {position:.3g}) is not whole on the sensor, {1 - share:.0%} of it falls"
+                " beside: move it inward, and record it again"
             )
+    chi_square, freedom = float((residuals**2 / variance).sum()), means.size - len(p)
     sds = np.sqrt(np.diag(covariance))
     amplitude, amplitude_sd = p[0], sds[0]
     if stats.chi2.sf(chi_square, freedom) < _NOT_GAUSSIAN:
-        # The model is wrong rather than the noise large; the total needs no model, and the rest is uncertain by as much.
+        # The model is wrong rather than the noise large: the total needs no model, the rest is as uncertain as that.
         sds = sds * math.sqrt(chi_square / freedom)
-        share = inside[:, good].sum()
-        amplitude, amplitude_sd = width * means.sum() / share, width * math.sqrt(variance.sum()) / share
+        total = inside[:, good].sum() / sensor.pixel_width
+        amplitude, amplitude_sd = means.sum() / total, math.sqrt(variance.sum()) / total
     return Spot(
-        positions=tuple(map(float, p[2:])),
+        positions=tuple(map(float, positions)),
         position_sds=tuple(map(float, sds[2:])),
         sigma=sigma,
         sigma_sd=float(sigma * sds[1]),
@@ -131,9 +125,31 @@ def fit_spots(
         counts_per_density_sd=float(amplitude_sd),
         chi_square=chi_square,
         freedom=freedom,
-        largest_residual=float(np.abs(fit.fun * sd.ravel()).max() / means.max()),
+        largest_residual=float(np.abs(residuals).max() / means.max()),
         noise=noise,
     )
+
+
+def _mean_counts(sensor: Sensor, good: BoolArray, p: FloatArray) -> FloatArray:
+    """Counts above the dark level of scale, log sigma and positions in ``p``, (positions, good pixels)."""
+    kernel = Kernel(shape="gaussian", sigma=math.exp(min(max(float(p[1]), -30.0), 30.0)))
+    return np.asarray(p[0] / sensor.pixel_width * pixel_mass(kernel, sensor.edges, p[2:])[:, good])
+
+
+def _weighted_fit(
+    model: Callable[[FloatArray], FloatArray], target: FloatArray, variance: FloatArray, p: FloatArray, unit: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Least squares from ``p`` on, in steps of the order of ``unit``: parameters, covariance, residuals."""
+    sd = np.sqrt(variance)
+
+    def normed(q: FloatArray) -> FloatArray:
+        return np.asarray((target - model(q * unit)) / sd).ravel()
+
+    fit = optimize.least_squares(normed, p / unit, jac="3-point")
+    jacobian: FloatArray = np.asarray(fit.jac)
+    covariance = np.linalg.pinv(jacobian.T @ jacobian) * np.outer(unit, unit)
+    p = np.asarray(fit.x * unit)
+    return p, covariance, target - model(p)
 
 
 def _first_guess(
@@ -209,8 +225,8 @@ def check_at_rest(
         excess = math.sqrt(scatter - expected)
         if moves:
             raise CalibrationError(
-                f"{source} is said to show a resting spot, but the spot moves by {excess:.2g} (standard deviation, slope"
-                " units) from frame to frame: park the mirror, keep the bench still, and record it again"
+                f"{source} is said to show a resting spot, but the spot moves by {excess:.2g} (standard deviation,"
+                " slope units) from frame to frame: park the mirror, keep the bench still, and record it again"
             )
         notes.append(
             f"{source}: the light of the spot flickers by {excess:.1%}: photoelectrons comes out too low where no"

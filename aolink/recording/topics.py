@@ -42,6 +42,8 @@ RIG_ATTACHMENT = "rig.toml"
 BASIS_ATTACHMENT = "exposure_basis.npy"
 SESSION_METADATA = "aolink"
 """Written at the start: versions, rig, devices, note."""
+CALIBRATION = "calibration"
+"""Key in the metadata of a session that recorded frames for a calibration: what they show."""
 END_METADATA = "aolink/end"
 """Written at the end: how the session ended, and its counts."""
 

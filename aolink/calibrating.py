@@ -1,0 +1,175 @@
+"""The job of `aolink calibrate`: frames from recordings, made on the spot or before, into a rig file."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
+from aolink.calibration.measure import LEAST_FRAMES
+from aolink.errors import AolinkError, CalibrationError, RigError
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.rig import Rig
+from aolink.session import record
+
+_ASKED = (
+    ("dark", "dark", "cover the camera"),
+    ("flat-1", "flat", "light the sensor evenly, without the spot, to about half of full scale"),
+    ("flat-2", "flat", "change that light by a factor of two or so"),
+    ("still", "still", "let the spot rest, with nothing else that shines"),
+)
+"""Name, kind, and what to do before; in this order."""
+_SAME = ("kind", "pixels", "field", "bit_depth")
+"""What recordings must share with the rig file's sensor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Calibrated:
+    """A calibration and the text of the rig file that it makes."""
+
+    rig: Rig
+    """As it was before."""
+    calibration: Calibration
+    text: str
+
+
+def calibrate_recordings(rig: Rig, text: str, paths: Sequence[Path]) -> Calibrated:
+    """Calibrate from recordings that were made with ``aolink record --calibration``.
+
+    Parameters
+    ----------
+    text:
+        The rig file's text with its own line ends, for the new one.
+
+    Raises
+    ------
+    RecordingError
+        One cannot be read.
+    CalibrationError
+        One is of another sensor, is not marked, or its frames are not what they are said to be.
+    """
+    frames = [read_frames(path, rig) for path in paths]
+    calibration = calibrate(rig, frames)
+    order = sorted(range(len(paths)), key=lambda k: KINDS.index(frames[k].kind))
+    sources = [f"{frames[k].kind} {paths[k].name} sha256:{_digest(paths[k])}" for k in order]
+    return Calibrated(rig=rig, calibration=calibration, text=calibrated_text(text, rig, calibration, sources))
+
+
+def read_frames(path: Path, rig: Rig) -> Frames:
+    """The whole frames of a recording that is marked as one for calibration."""
+    recording = Recording(path)
+    kind = next((each for each in KINDS if each == recording.metadata.get(topics.CALIBRATION)), None)
+    if kind is None:
+        raise CalibrationError(
+            f"{path} is not marked as a recording for calibration: make one with `aolink record --calibration"
+            " dark|flat|still`"
+        )
+    ours, theirs = rig.sensor, recording.rig.sensor
+    pairs = [(f"sensor.{name}", getattr(ours, name), getattr(theirs, name)) for name in _SAME]
+    for name in ("exposure_steps", "fast_step_s"):
+        pairs.append((f"timing.{name}", getattr(rig.timing, name), getattr(recording.rig.timing, name)))
+    for key, mine, found in pairs:
+        if mine != found:
+            raise CalibrationError(
+                f"{path} is of another rig: its {key} is {found}, the rig file has {mine}; give that rig's file"
+                " (--rig), or record it again"
+            )
+    whole = [exposure.pixels.ravel() for exposure in recording.exposures() if exposure.complete]
+    counts = np.array(whole, dtype=np.uint16).reshape(len(whole), rig.sensor.pixels)
+    return Frames(kind=kind, counts=counts, source=str(path))
+
+
+def record_frames(
+    rig: Rig,
+    camera: str,
+    mirror: str,
+    folder: Path,
+    *,
+    frames: int,
+    overwrite: bool,
+    ask: Callable[[str], str],
+    progress: Callable[[str, int], None],
+) -> list[Path]:
+    """Ask for each kind of light in turn and record it.
+
+    Parameters
+    ----------
+    folder:
+        Where the recordings go.
+    ask:
+        Puts a question; gives the answer: nothing to go on, "s" to skip. EOFError if nobody is there.
+
+    Raises
+    ------
+    AolinkError
+        A recording failed, or nobody answers.
+    """
+    if frames < LEAST_FRAMES:
+        raise CalibrationError(f"--frames {frames} is too few: at least {LEAST_FRAMES} are needed, better 100")
+    folder.mkdir(parents=True, exist_ok=True)
+    paths: list[Path] = []
+    skipped = ""
+    for name, kind, what in _ASKED:
+        if kind == skipped:
+            continue
+        try:
+            skip = "" if kind == "dark" else "; s to skip"
+            answer = ask(f"{kind}: {what}, then press Enter{skip}: ").strip().lower()
+        except EOFError:
+            raise CalibrationError(
+                "nobody answers: run `aolink calibrate` on a terminal, or give it recordings made with"
+                " `aolink record --calibration`"
+            ) from None
+        if answer == "s" and kind != "dark":  # nothing can be known without the dark frames
+            skipped = kind
+            continue
+        path = folder / f"{name}.mcap"
+        record(
+            rig, camera, mirror, path, exposures=frames, calibration=kind, overwrite=overwrite,
+            progress=partial(progress, name),
+        )  # fmt: skip
+        paths.append(path)
+    return paths
+
+
+def rig_text(path_or_name: str, rig: Rig) -> str:
+    """The text of the file that ``rig`` was loaded from, with the line ends that it has. Raises RigError."""
+    path = Path(path_or_name)
+    if not path.exists():  # one that comes with aolink
+        return rig.toml
+    try:
+        with path.open(newline="") as file:
+            return file.read()
+    except OSError as error:
+        raise RigError(f"cannot read the rig file {path}: {error.strerror}") from None
+
+
+def check_target(path: Path, *, overwrite: bool) -> None:
+    """Refuse a target that must not be replaced, before any work. Raises AolinkError."""
+    if path.exists() and not overwrite:
+        raise AolinkError(f"{path} exists and is not overwritten: give another name, or --overwrite to replace it")
+
+
+def write_text(path: Path, text: str, *, overwrite: bool) -> None:
+    """Write a rig file whole or not at all. Raises AolinkError."""
+    check_target(path, overwrite=overwrite)
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with part.open("w", newline="") as file:
+            file.write(text)
+        os.replace(part, path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise AolinkError(f"cannot write {path}: {(error.strerror or str(error)).lower()}; give another -o") from None
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
