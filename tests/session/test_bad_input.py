@@ -292,7 +292,7 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
 
 
 def test_help_has_an_example_for_every_command(aolink: Run) -> None:
-    for command in ("rig", "devices", "record", "info", "estimate", "view", "demo"):
+    for command in ("rig", "devices", "record", "calibrate", "info", "estimate", "view", "demo"):
         result = aolink(command, "--help")
         assert result.returncode == 0
         assert f"Example: aolink {command}" in result.stdout
