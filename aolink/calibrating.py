@@ -84,7 +84,7 @@ def read_frames(path: Path, rig: Rig) -> Frames:
             )
     whole = [exposure.pixels.ravel() for exposure in recording.exposures() if exposure.complete]
     counts = np.array(whole, dtype=np.uint16).reshape(len(whole), rig.sensor.pixels)
-    return Frames(kind=kind, counts=counts, source=str(path))
+    return Frames(kind=kind, counts=counts, source=path.name)
 
 
 def record_frames(
@@ -161,7 +161,9 @@ def rig_text(path_or_name: str, rig: Rig) -> str:
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Refuse a target that must not be replaced, before any work. Raises AolinkError."""
+    """Refuse a target that must not be replaced or cannot be, before any work. Raises AolinkError."""
+    if not path.parent.is_dir():
+        raise AolinkError(f"cannot write {path}: there is no folder {path.parent}; make it, or give another name")
     if path.exists() and not overwrite:
         raise AolinkError(f"{path} exists and is not overwritten: give another name, or --overwrite to replace it")
 

@@ -453,6 +453,14 @@ def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path
         assert (alone.returncode, "nobody answers: run `aolink calibrate` on a terminal" in alone.stderr) == (8, True)
         few = aolink("calibrate", *devices, *common[:2], "-o", "b.toml", "--frames", "3", input="\n\n\n\n")
         assert (few.returncode, "--frames 3 is too few: at least 10" in few.stderr) == (8, True)
+        unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n")
+        assert unlit.returncode == 8
+        assert unlit.stderr.endswith(
+            "aolink: flat-1.mcap is said to be flat, but is no brighter than the dark frames:"
+            " is the light on? Record both again\n"
+        )
+    nowhere = aolink("calibrate", "--camera", "x", "--mirror", "x", *common, "-o", "no/b.toml")
+    assert (nowhere.returncode, "there is no folder no; make it" in nowhere.stderr) == (1, True)
     assert not (tmp_path / "b.toml").exists()
     assert aolink("calibrate", *common[:2], "-o", "b.toml").returncode == 2
 

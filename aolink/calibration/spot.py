@@ -105,13 +105,7 @@ def fit_spots(
         expected = model(p)
     sigma, positions = _width(p), p[2:]
     inside = pixel_mass(Kernel(shape="gaussian", sigma=sigma), sensor.edges, positions)
-    for (source, _, _), position, share in zip(signals, positions, inside.sum(axis=1), strict=True):
-        # In the outermost pixel it could as well be the skirt of one that is not on the sensor at all.
-        if share < _LEAST_MASS or min(position - sensor.field[0], sensor.field[1] - position) < sensor.pixel_width:
-            raise CalibrationError(
-                f"{source}: the spot is at the edge of the sensor or beyond (at {position:.3g}): move it inward, and"
-                " record it again"
-            )
+    _check_inside(sensor, [source for source, _, _ in signals], positions, inside.sum(axis=1))
     chi_square, freedom = float((residuals**2 / variance).sum()), means.size - len(p)
     sds = np.sqrt(np.diag(covariance))
     amplitude, amplitude_sd = p[0], sds[0]
@@ -132,6 +126,16 @@ def fit_spots(
         largest_residual=float(np.abs(residuals).max() / means.max()),
         noise=noise,
     )
+
+
+def _check_inside(sensor: Sensor, sources: Sequence[str], positions: FloatArray, shares: FloatArray) -> None:
+    for source, position, share in zip(sources, positions, shares, strict=True):
+        # In the outermost pixel it could as well be the skirt of one that is not on the sensor at all.
+        if share < _LEAST_MASS or min(position - sensor.field[0], sensor.field[1] - position) < sensor.pixel_width:
+            raise CalibrationError(
+                f"{source}: the spot is at the edge of the sensor or beyond (at {position:.3g}): move it inward, and"
+                " record it again"
+            )
 
 
 def _mean_counts(sensor: Sensor, good: BoolArray, p: FloatArray) -> FloatArray:
