@@ -220,7 +220,9 @@ def test_what_was_not_shown_is_not_known_and_said_so() -> None:
     assert set(calibrate(rig, [dark, flat]).values) == {
         "sensor.black_level", "sensor.noise_density", "sensor.photoelectrons",
     }  # fmt: skip
-    assert len(calibrate(rig, [dark, still]).values) == 5
+    alone = calibrate(rig, [dark, still])
+    assert len(alone.values) == 5
+    assert "photoelectrons comes from the still spot's own pixels" in alone.notes[0]
 
 
 def test_shot_noise_that_is_not_seen_takes_only_an_impossible_value_out() -> None:

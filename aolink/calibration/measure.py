@@ -178,6 +178,11 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     # A spot that trembles unseen looks like shot noise, so flats go before it.
     curves = flat_signals or still_signals
     gain = _photon_transfer(curves, dark, good, read, notes) if curves else None
+    if gain and not flats and gain.value > _SEEN * gain.sd:
+        notes.append(
+            "photoelectrons comes from the still spot's own pixels: a tremble or a flicker too small to be seen makes"
+            " it too low (several times, at a tenth of a pixel); flats would be sure"
+        )
     spot = None
     if stills:
         noise = (read.value, max(gain.value, 0.0) if gain else 0.0)

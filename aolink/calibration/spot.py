@@ -242,7 +242,9 @@ def check_at_rest(
         freedom = 2 * expected**2 / max(spread * float((shares**2).sum()), 1e-9 * expected**2)
         if stats.f.sf(scatter / expected, len(counts) - 1, freedom) > _UNSTEADY:
             continue
-        excess = math.sqrt(scatter - expected)
+        # Where the pixels' own variances were measured, the motion is in them as well.
+        own = float(((gains * pattern) ** 2).sum()) if spread else 0.0
+        excess = math.sqrt((scatter - expected) / max(1 - own, 1e-3))
         if moves:
             raise CalibrationError(
                 f"{source} is said to show a resting spot, but the spot moves by"
