@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -83,7 +84,7 @@ def read_frames(path: Path, rig: Rig) -> Frames:
             )
     whole = [exposure.pixels.ravel() for exposure in recording.exposures() if exposure.complete]
     counts = np.array(whole, dtype=np.uint16).reshape(len(whole), rig.sensor.pixels)
-    return Frames(kind=kind, counts=counts, source=str(path))
+    return Frames(kind=kind, counts=counts, source=path.name)
 
 
 def record_frames(
@@ -95,7 +96,7 @@ def record_frames(
     frames: int,
     overwrite: bool,
     ask: Callable[[str], str],
-    progress: Callable[[str, int], None],
+    progress: Callable[[], AbstractContextManager[Callable[[str, int], None]]],
 ) -> list[Path]:
     """Ask for each kind of light in turn and record it.
 
@@ -105,6 +106,8 @@ def record_frames(
         Where the recordings go.
     ask:
         Puts a question; gives the answer: nothing to go on, "s" to skip. EOFError if nobody is there.
+    progress:
+        For each recording, takes its name and the number of frames so far.
 
     Raises
     ------
@@ -113,7 +116,12 @@ def record_frames(
     """
     if frames < LEAST_FRAMES:
         raise CalibrationError(f"--frames {frames} is too few: at least {LEAST_FRAMES} are needed, better 100")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AolinkError(f"cannot create {folder}: {(error.strerror or '').lower()}; give another --keep") from None
+    for name, _, _ in _ASKED:
+        check_target(folder / f"{name}.mcap", overwrite=overwrite)
     paths: list[Path] = []
     skipped = ""
     for name, kind, what in _ASKED:
@@ -131,10 +139,11 @@ def record_frames(
             skipped = kind
             continue
         path = folder / f"{name}.mcap"
-        record(
-            rig, camera, mirror, path, exposures=frames, calibration=kind, overwrite=overwrite,
-            progress=partial(progress, name),
-        )  # fmt: skip
+        with progress() as tell:  # not while it asks
+            record(
+                rig, camera, mirror, path, exposures=frames, calibration=kind, overwrite=overwrite,
+                progress=partial(tell, name),
+            )  # fmt: skip
         paths.append(path)
     return paths
 
@@ -152,7 +161,9 @@ def rig_text(path_or_name: str, rig: Rig) -> str:
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Refuse a target that must not be replaced, before any work. Raises AolinkError."""
+    """Refuse a target that must not be replaced or cannot be, before any work. Raises AolinkError."""
+    if not path.parent.is_dir():
+        raise AolinkError(f"cannot write {path}: there is no folder {path.parent}; make it, or give another name")
     if path.exists() and not overwrite:
         raise AolinkError(f"{path} exists and is not overwritten: give another name, or --overwrite to replace it")
 

@@ -294,18 +294,10 @@ def calibrate(
     calibrating.check_target(output, overwrite=overwrite)
     with TemporaryDirectory(prefix="aolink-") as temporary:
         if camera and mirror:
-            folder = keep or Path(temporary)
-            with progress_bar(_err, frames) as tell:
-                files = calibrating.record_frames(
-                    loaded,
-                    camera,
-                    mirror,
-                    folder,
-                    frames=frames,
-                    overwrite=overwrite,
-                    ask=partial(ask, _err),
-                    progress=tell,
-                )
+            files = calibrating.record_frames(
+                loaded, camera, mirror, keep or Path(temporary), frames=frames, overwrite=overwrite,
+                ask=partial(ask, _err), progress=partial(progress_bar, _err, frames),
+            )  # fmt: skip
         result = calibrating.calibrate_recordings(loaded, calibrating.rig_text(rig, loaded), files or [])
     calibrating.write_text(output, result.text, overwrite=overwrite)
     if as_json:

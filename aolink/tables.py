@@ -244,9 +244,12 @@ def _number(value: float | None, form: str) -> str:
 
 def _calibration_facts(result: Calibrated) -> list[str]:
     found = result.calibration
-    lines = [f"read noise {found.read_noise.value:.4g} counts (sd {found.read_noise.sd:.2g})"]
+    lines = [
+        "pull: what the file says less what was measured, in standard deviations",
+        f"read noise {found.read_noise.value:.4g} counts (sd {found.read_noise.sd:.2g})",
+    ]
     if found.gain is not None:
-        lines[0] += f", {found.gain.value:.4g} counts per photo-electron (sd {found.gain.sd:.2g})"
+        lines[-1] += f", {found.gain.value:.4g} counts per photo-electron (sd {found.gain.sd:.2g})"
     if found.spot is not None:
         where = ", ".join(f"{x:.4g}" for x in found.spot.positions)
         verdict = "" if found.spot.gaussian else ": not a Gaussian"

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.errors import RigError
-from aolink.rig import builtin_rigs, load_rig, parse_rig
+from aolink.rig import CalibrationTable, builtin_rigs, load_rig, parse_rig
 
 TEXT = load_rig("section-vi").toml
 A = "[[1.0000, 0.0010], [-0.0197, 0.9704]]"
@@ -87,6 +87,26 @@ def changed(old: str, new: str) -> str:
             "[simulation.faults]\nbit_flip_rate = 2\n[simulation]",
             "simulation.faults.bit_flip_rate = 2",
         ),
+        ("photoelectrons = 0 ", "photoelectrons = -1 ", "sensor.photoelectrons = -1 must be at least 0"),
+        (
+            "[simulation]",
+            '[simulation]\nlight = "dim"',
+            "simulation.light: 'dim' is not known: use dark, flat, flat:DEN",
+        ),
+        ("[simulation]", '[simulation]\nlight = "dark:3"', "simulation.light: 'dark:3' is not known"),
+        (
+            "[simulation]",
+            '[simulation]\nlight = "flat:x"',
+            "simulation.light: the density of 'flat:x' must be a number",
+        ),
+        ("[simulation]", "[calibration]\nsd = 1\n[simulation]", "calibration.sd is not a key that aolink knows"),
+        (
+            "[simulation]",
+            "[calibration]\nkernel_sigma_sd = -1\n[simulation]",
+            "calibration.kernel_sigma_sd = -1 must be",
+        ),
+        ("[simulation]", "[calibration]\ndark_frames = 0.5\n[simulation]", "calibration.dark_frames: expected a whole"),
+        ("[simulation]", "[calibration]\nsources = [1]\n[simulation]", "calibration.sources: expected a list of texts"),
         ("[simulation]", "[simulation", "not valid TOML"),
     ],
 )
@@ -122,6 +142,16 @@ def test_a_file_goes_before_a_name_and_is_named_in_errors(tmp_path: Path) -> Non
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RigError, match="is not a rig file: it is not text"):
         load_rig(path)
+
+
+def test_lights_and_calibration_are_read() -> None:
+    text = changed(
+        "[simulation]", '[calibration]\nblack_level_sd = 2\nsources = ["a"]\n[simulation]\nlight = "dark, flat:4"'
+    )
+    rig = parse_rig(text)
+    assert [(light.kind, light.level) for light in rig.simulation.light] == [("dark", None), ("flat", 4.0)]
+    assert rig.calibration == CalibrationTable(black_level_sd=2.0, sources=("a",))
+    assert parse_rig(TEXT).calibration is None
 
 
 def test_the_stationary_covariance_is_stationary() -> None:

@@ -36,6 +36,10 @@ _MOST_CLIPPED = 0.01
 """Share of a pixel's frames that may be at an end of the scale."""
 _UNEVEN = 0.3
 """Scatter over the mean from which on a flat is none."""
+_ROUNDING = 1 / 12
+"""Variance of rounding to whole counts."""
+_VAGUE = 0.3
+"""Share of the kernel's width that its standard deviation may be."""
 _SEEN = 3.0
 """Standard deviations from which on shot noise counts as seen."""
 
@@ -167,17 +171,29 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
         _check_clipping(rig, each, good)
     read = _mean_variance(dark.variance[good], dark.spread)
     black = _black_level(dark, darks, good, read, notes)
-    curves = [_signal(pixel_statistics([each.counts], steady=each.kind != "flat"), dark) for each in (*flats, *stills)]
-    for each, curve in zip(flats, curves, strict=False):
-        _check_flat(each, curve, good)
+    flat_signals = [_signal(pixel_statistics([each.counts], steady=False), dark) for each in flats]
+    still_signals = [_signal(pixel_statistics([each.counts]), dark) for each in stills]
+    for each, signal in zip(flats, flat_signals, strict=True):
+        _check_flat(each, signal, good)
+    # A spot that trembles unseen looks like shot noise, so flats go before it.
+    curves = flat_signals or still_signals
     gain = _photon_transfer(curves, dark, good, read, notes) if curves else None
+    if gain and not flats and gain.value > _SEEN * gain.sd:
+        notes.append(
+            "photoelectrons comes from the still spot's own pixels: a tremble or a flicker too small to be seen makes"
+            " it too low (several times, at a tenth of a pixel); flats would be sure"
+        )
     spot = None
     if stills:
         noise = (read.value, max(gain.value, 0.0) if gain else 0.0)
-        lit = list(zip(stills, curves[len(flats) :], strict=True))
+        lit = list(zip(stills, still_signals, strict=True))
         spot = fit_spots(rig.sensor, [(each.source, s.frames, s.mean) for each, s in lit], good, noise, dark.frames)
-        for k, (each, s) in enumerate(lit):
-            notes += check_at_rest(rig.sensor, each.source, each.counts, s.variance, good, spot, k)
+        for k, (each, signal) in enumerate(lit):
+            alone, spread = signal.variance, signal.spread
+            if flats and gain:  # then what a pixel does by itself is known apart from this spot
+                alone = read.value + max(gain.value + 2 * gain.sd, 0.0) * np.maximum(signal.mean, 0.0)
+                spread = 0.0
+            notes += check_at_rest(rig.sensor, each.source, each.counts[:, good], (alone[good], spread), good, spot, k)
         if not spot.gaussian:
             notes.append(spot.complaint)
     return _result(rig, recordings, black, read, gain, spot, good, notes)
@@ -191,13 +207,14 @@ def _signal(lit: PixelStatistics, dark: PixelStatistics) -> PixelStatistics:
 def _mean_variance(variances: FloatArray, spread: float) -> Measured:
     """Mean variance of pixels, which need not be alike."""
     # E[s^4] = sigma^4 (1 + spread)
-    sd = math.sqrt(spread / (1 + spread) * float((variances**2).sum())) / len(variances)
-    return Measured(float(variances.mean()), sd)
+    mean, sd = float(variances.mean()), math.sqrt(spread / (1 + spread) * float((variances**2).sum())) / len(variances)
+    # Noise under half a count comes and goes with where the level lies between two counts.
+    return Measured(mean, sd) if mean > 0.25 else Measured(max(mean, _ROUNDING), _ROUNDING)
 
 
 def _good_pixels(dark: PixelStatistics, source: str) -> BoolArray:
     """Pixels that are neither hot nor noisy. Raises CalibrationError if light falls on the dark frames."""
-    typical = max(float(np.median(dark.variance)), 1 / 12)
+    typical = max(float(np.median(dark.variance)), _ROUNDING)
     level = float(np.median(dark.mean))
     scatter = max(1.4826 * float(np.median(np.abs(dark.mean - level))), math.sqrt(typical / dark.frames))
     hot = np.abs(dark.mean - level) > _HOT * scatter
@@ -246,7 +263,7 @@ def _black_level(
     sd = math.sqrt(read.value / (pixels * dark.frames))
     levels = np.concatenate([each.counts[:, good].mean(axis=1) for each in darks])
     wander, expected = float(levels.var(ddof=1)), read.value / pixels
-    if stats.chi2.sf((dark.frames - 1) * wander / max(expected, 1e-12), dark.frames - 1) < _SURE:
+    if stats.chi2.sf((dark.frames - 1) * wander / expected, dark.frames - 1) < _SURE:
         notes.append(
             f"the black level wanders by {math.sqrt(wander):.2g} counts from frame to frame, more than its noise"
         )
@@ -325,19 +342,26 @@ def _result(
         )
     known = (rig.calibration and rig.calibration.counts_per_density_sd) or 0.0
     used = scale or Measured(sensor.counts_per_density, known)
-    variance = max(0.0, read.value - 1 / 12)  # less the rounding
-    if variance < 0.25:
+    density_per_variance = sensor.pixel_width / used.value**2
+    density = density_per_variance * max(0.0, read.value - _ROUNDING)
+    density_sd = math.hypot(density_per_variance * read.sd, 2 * density * used.sd / used.value)
+    if read.value <= 0.25:
         notes.append("the read noise is under half a count: rounding hides it, noise_density is uncertain")
-    density = sensor.pixel_width * variance / used.value**2
-    relative = math.hypot(read.sd / max(variance, 1 / 12), 2 * used.sd / used.value)
+    sigma = Measured(spot.sigma, spot.sigma_sd) if spot else None
+    if sigma and sigma.sd > _VAGUE * sigma.value:
+        notes.append(
+            "the spot is too narrow for the pixels to tell its width, kernel.sigma stays as the file has it:"
+            " record still spots elsewhere, on the border of two pixels"
+        )
+        sigma = None
     return Calibration(
         black_level=black,
-        read_noise=Measured(math.sqrt(read.value), read.sd / max(2 * math.sqrt(read.value), 1e-12)),
-        noise_density=Measured(density, density * relative),
+        read_noise=Measured(math.sqrt(read.value), read.sd / (2 * math.sqrt(read.value))),
+        noise_density=Measured(density, density_sd),
         gain=gain,
         photoelectrons=_photoelectrons(rig, gain, used, notes),
         counts_per_density=scale,
-        kernel_sigma=Measured(spot.sigma, spot.sigma_sd) if spot else None,
+        kernel_sigma=sigma,
         spot=spot,
         frames={kind: sum(len(each.counts) for each in recordings if each.kind == kind) for kind in KINDS},
         hot_pixels=tuple(map(int, np.flatnonzero(~good))),

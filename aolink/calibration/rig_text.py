@@ -89,7 +89,7 @@ def _with_value(text: str, path: tuple[str, ...], value: str) -> str:
         before, end = text[: anchor[1]], anchor[1]
         line_start = before.rfind("\n") + 1
         line_end = _line_end(text, end)
-        prefix = before[line_start : anchor[0]].split(_SIBLING)[0]  # indent, or the first part of a dotted key
+        prefix = before[line_start : anchor[0]].split(_SIBLING)[0].rstrip("\"'")  # indent, first part of a dotted key
         wanted = _changed(text, path, float(value))
         for candidate in (
             f"{text[:line_end]}{_newline(text)}{prefix}{path[-1]} = {value}{text[line_end:]}",

@@ -18,11 +18,14 @@ from aolink.rig import Kernel, Sensor
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_SURE = 1e-6
+_UNSTEADY = 1e-5
+"""Probability by chance below which a spot counts as moving or flickering."""
 _NOT_GAUSSIAN = 1e-4
 """Probability of the fit's chi-square by chance below which the kernel is not called Gaussian."""
 _FAINT = 10.0
 """Standard deviations of its light from which on there is a spot."""
+_BACKGROUND = 0.05
+"""Light away from the spot over the spot's own that is let pass."""
 _LEAST_MASS = 0.99
 """Share of the spot's light that must fall on the sensor."""
 
@@ -100,14 +103,9 @@ def fit_spots(
         variance = (noise[0] + noise[1] * expected) / frames + dark_variance * len(signals)
         p, covariance, residuals = _weighted_fit(model, means, variance, p, unit)
         expected = model(p)
-    sigma, positions = math.exp(p[1]), p[2:]
+    sigma, positions = _width(p), p[2:]
     inside = pixel_mass(Kernel(shape="gaussian", sigma=sigma), sensor.edges, positions)
-    for (source, _, _), position, share in zip(signals, positions, inside.sum(axis=1), strict=True):
-        if share < _LEAST_MASS:
-            raise CalibrationError(
-                f"{source}: the spot (at {position:.3g}) is not whole on the sensor, {1 - share:.0%} of it falls"
-                " beside: move it inward, and record it again"
-            )
+    _check_inside(sensor, [source for source, _, _ in signals], positions, inside.sum(axis=1))
     chi_square, freedom = float((residuals**2 / variance).sum()), means.size - len(p)
     sds = np.sqrt(np.diag(covariance))
     amplitude, amplitude_sd = p[0], sds[0]
@@ -130,10 +128,24 @@ def fit_spots(
     )
 
 
+def _check_inside(sensor: Sensor, sources: Sequence[str], positions: FloatArray, shares: FloatArray) -> None:
+    for source, position, share in zip(sources, positions, shares, strict=True):
+        # In the outermost pixel it could as well be the skirt of one that is not on the sensor at all.
+        if share < _LEAST_MASS or min(position - sensor.field[0], sensor.field[1] - position) < sensor.pixel_width:
+            raise CalibrationError(
+                f"{source}: the spot is at the edge of the sensor or beyond (at {position:.3g}): move it inward, and"
+                " record it again"
+            )
+
+
 def _mean_counts(sensor: Sensor, good: BoolArray, p: FloatArray) -> FloatArray:
     """Counts above the dark level of scale, log sigma and positions in ``p``, (positions, good pixels)."""
-    kernel = Kernel(shape="gaussian", sigma=math.exp(min(max(float(p[1]), -30.0), 30.0)))
+    kernel = Kernel(shape="gaussian", sigma=_width(p))
     return np.asarray(p[0] / sensor.pixel_width * pixel_mass(kernel, sensor.edges, p[2:])[:, good])
+
+
+def _width(p: FloatArray) -> float:
+    return math.exp(min(max(float(p[1]), -30.0), 30.0))
 
 
 def _weighted_fit(
@@ -147,7 +159,8 @@ def _weighted_fit(
 
     fit = optimize.least_squares(normed, p / unit, jac="3-point")
     jacobian: FloatArray = np.asarray(fit.jac)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * np.outer(unit, unit)
+    # What the data say nothing about gets a huge variance, not none.
+    covariance = np.linalg.inv(jacobian.T @ jacobian + 1e-12 * np.eye(len(p))) * np.outer(unit, unit)
     p = np.asarray(fit.x * unit)
     return p, covariance, target - model(p)
 
@@ -172,10 +185,14 @@ def _first_guess(
             f"{source} is said to show a resting spot, but there is none: is the light on, and does it meet the sensor?"
             " Record it again"
         )
-    if np.median(mean[good]) > 0.2 * mean[good].max():
+    away = good & (np.abs(sensor.centres - position) > 2.5 * sigma + 1.5 * sensor.pixel_width)
+    beside, pixels = float(mean[away].sum()), int(away.sum())
+    everywhere = np.median(mean[good]) > 0.2 * mean[good].max()
+    if everywhere or abs(beside) > max(_BACKGROUND * amplitude_best, 6 * math.sqrt(variance * pixels)):
+        what = "light everywhere" if everywhere or beside > 0 else "less than the dark level away from the spot"
         raise CalibrationError(
-            f"{source} is said to show a resting spot, but there is light everywhere: shield the sensor from other"
-            " light, and record it again"
+            f"{source} is said to show a resting spot, but there is {what}: shield the sensor from other light, let the"
+            " camera warm up, and record this and the dark frames again"
         )
     return amplitude_best * sensor.pixel_width, position, sigma
 
@@ -184,7 +201,7 @@ def check_at_rest(
     sensor: Sensor,
     source: str,
     counts: NDArray[np.uint16],
-    variance: FloatArray,
+    alone: tuple[FloatArray, float],
     good: BoolArray,
     spot: Spot,
     number: int,
@@ -194,9 +211,9 @@ def check_at_rest(
     Parameters
     ----------
     counts:
-        (frames, pixels)
-    variance:
-        Of each pixel over time, (pixels,).
+        Of the good pixels, (frames, good pixels).
+    alone:
+        Variance of each good pixel by itself, (good pixels,), and the variance of that over its square.
     number:
         Which of the fit's spots it is.
 
@@ -214,22 +231,28 @@ def check_at_rest(
     weight = 1 / (read + gain * profile)
     # Independent pixels scatter by their own variances; a motion moves both flanks together, against each other.
     notes = []
-    for pattern, moves in ((slope, True), (profile, False)):
-        filtered = counts[:, good] @ (pattern * weight) / float((pattern**2 * weight).sum())
-        alone = (pattern * weight / (pattern**2 * weight).sum()) ** 2 * variance[good]
-        scatter, expected = float(filtered.var(ddof=1)), float(alone.sum())
-        n = len(counts)
-        freedom = 2 / ((3 * n - 4) / (n - 1) ** 2) * expected**2 / float((alone**2).sum())
-        if stats.f.sf(scatter / expected, n - 1, freedom) > _SURE:
+    variance, spread = alone
+    for pattern, moves in ((slope * sensor.pixel_width, True), (profile, False)):
+        power = float((pattern**2 * weight).sum())
+        if power < 1e-6 * float((profile**2 * weight).sum()):  # within one pixel: nobody sees it move
             continue
-        excess = math.sqrt(scatter - expected)
+        gains = pattern * weight / power
+        shares = gains**2 * variance
+        scatter, expected = float((counts @ gains).var(ddof=1)), float(shares.sum())
+        freedom = 2 * expected**2 / max(spread * float((shares**2).sum()), 1e-9 * expected**2)
+        if stats.f.sf(scatter / expected, len(counts) - 1, freedom) > _UNSTEADY:
+            continue
+        # Where the pixels' own variances were measured, the motion is in them as well.
+        own = float(((gains * pattern) ** 2).sum()) if spread else 0.0
+        excess = math.sqrt((scatter - expected) / max(1 - own, 1e-3))
         if moves:
             raise CalibrationError(
-                f"{source} is said to show a resting spot, but the spot moves by {excess:.2g} (standard deviation,"
+                f"{source} is said to show a resting spot, but the spot moves by"
+                f" {excess * sensor.pixel_width:.2g} (standard deviation,"
                 " slope units) from frame to frame: park the mirror, keep the bench still, and record it again"
             )
         notes.append(
-            f"{source}: the light of the spot flickers by {excess:.1%}: photoelectrons comes out too low where no"
-            " flat tells better"
+            f"{source}: the light of the spot flickers by {excess:.1%} from frame to frame: without flats,"
+            " photoelectrons comes out too low"
         )
     return notes

@@ -33,15 +33,14 @@ def pixel_noise_sd(sensor: Sensor) -> float:
     return math.sqrt(sensor.noise_density / sensor.pixel_width)
 
 
-def pixel_noise_variance(sensor: Sensor, density: FloatArray) -> FloatArray:
-    """Variance of pixels' densities by read-out and shot noise, one over slope units squared, shape of ``density``.
+def shot_gain(sensor: Sensor) -> float:
+    """Variance of a pixel's density by shot noise for each unit of density, 1/(photoelectrons D); 0 if negligible."""
+    return 1 / (sensor.photoelectrons * sensor.pixel_width) if sensor.photoelectrons else 0.0
 
-    V/D + Y/(photoelectrons D): a pixel of density Y holds photoelectrons D Y electrons, Poisson distributed.
-    """
-    read = np.full_like(density, sensor.noise_density / sensor.pixel_width)
-    if sensor.photoelectrons:
-        read += np.maximum(density, 0) / (sensor.photoelectrons * sensor.pixel_width)
-    return read
+
+def pixel_noise_variance(sensor: Sensor, density: FloatArray) -> FloatArray:
+    """Variance of pixels' densities by read-out and shot noise, V/D + Y/(photoelectrons D), shape of ``density``."""
+    return sensor.noise_density / sensor.pixel_width + shot_gain(sensor) * np.maximum(density, 0.0)
 
 
 def effective_noise_density(sensor: Sensor) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.exposure import Exposure, Truth
-from aolink.optics.camera import pixel_noise_sd, to_counts
+from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.kernel import exposure_density
 from aolink.plant import psd_root
 from aolink.rig import Rig, load_rig
@@ -109,8 +109,8 @@ class RigModel:
         self._frames += 1
         path, density = self._illuminate(path)
         if sensor.photoelectrons:
-            electrons_per_density = sensor.photoelectrons * sensor.pixel_width
-            density = self._electrons.poisson(electrons_per_density * density) / electrons_per_density
+            density_of_one = shot_gain(sensor)
+            density = np.asarray(self._electrons.poisson(density / density_of_one) * density_of_one)
         noise = self._pixel_noise.standard_normal(sensor.shape)
         density = density + pixel_noise_sd(sensor) * noise
         return CameraFrame(

@@ -397,7 +397,7 @@ def test_a_tcp_port_that_another_host_has(aolink: Run) -> None:
 
 
 def test_help_has_an_example_for_every_command(aolink: Run) -> None:
-    for command in ("rig", "devices", "record", "info", "estimate", "view", "demo"):
+    for command in ("rig", "devices", "record", "calibrate", "info", "estimate", "view", "demo"):
         result = aolink(command, "--help")
         assert result.returncode == 0
         assert f"Example: aolink {command}" in result.stdout

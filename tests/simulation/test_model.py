@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aolink.optics.camera import to_density
+from aolink.optics.camera import pixel_noise_variance, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.plant import lift
-from aolink.rig import load_rig
+from aolink.rig import load_rig, parse_light
 from aolink.simulation.model import CameraFrame, RigModel, simulate
 
 RIG = load_rig("section-vi")
@@ -176,3 +176,64 @@ def test_many_copies_are_as_independent_as_their_noise():
     states = RigModel(rig, 1)._run(np.zeros((5, 3)))
     assert states.shape == (6, 3, 2)
     assert len(np.unique(states[5])) == 6
+
+
+def with_light(rig, lights: str, **sensor: float):
+    simulation = dataclasses.replace(rig.simulation, light=parse_light(lights, "lights"))
+    return dataclasses.replace(rig, simulation=simulation, sensor=dataclasses.replace(rig.sensor, **sensor))
+
+
+def shots(rig, starts: int, frames: int):
+    """Densities and paths under each light, (starts, frames, pixels) and (starts, frames, steps)."""
+    model, taken = RigModel(rig, 11), []
+    for _ in range(starts):
+        model.start_camera(model.step, frames)
+        taken.append(model.advance(np.zeros((frames * rig.timing.frame_period_steps, 1))))
+    densities = [[to_density(rig.sensor, f.pixels)[0] for f in row] for row in taken]
+    return np.array(densities), np.array([[f.truth.path[0] for f in row] for row in taken])
+
+
+def test_each_start_of_the_camera_takes_the_next_light():
+    rig = with_light(with_timing(RIG, 50, 60), "dark,flat:4,still,moving", noise_density=1e-6)
+    densities, paths = shots(rig, 5, 3)
+    np.testing.assert_allclose(densities[0], 0, atol=0.05)
+    np.testing.assert_allclose(densities[1], 4, atol=0.05)
+    assert np.ptp(paths[2]) == 0
+    assert np.ptp(paths[3]) > 0
+    assert np.ptp(paths[4]) > 0
+    for k in (2, 3, 4):
+        expected = exposure_density(rig.sensor.kernel, rig.sensor.edges, paths[k])
+        np.testing.assert_allclose(densities[k], expected, atol=0.05)
+
+
+def test_a_flat_without_a_level_is_halfway_to_full_scale():
+    densities, _ = shots(with_light(with_timing(RIG, 1, 1), "flat", noise_density=1e-6), 1, 2)
+    np.testing.assert_allclose(densities, (65535 - 20000) / 4000, atol=0.05)
+
+
+@pytest.mark.parametrize("light", ["flat:0.5", "flat:8", "still"])
+def test_photoelectrons_are_poisson(light):
+    frames = 4000
+    rig = with_light(with_timing(RIG, 1, 1), light, noise_density=1e-3, photoelectrons=200.0)
+    (densities,), (paths,) = shots(rig, 1, frames)
+    level = exposure_density(rig.sensor.kernel, rig.sensor.edges, paths[0])
+    level = level if light == "still" else np.full(40, float(light[5:]))
+    variance = pixel_noise_variance(rig.sensor, level)
+    assert np.abs((densities.mean(axis=0) - level) / np.sqrt(variance / frames)).max() < 5
+    electrons = level * 200 * rig.sensor.pixel_width
+    shot = variance - rig.sensor.noise_density / rig.sensor.pixel_width
+    kurtosis = np.divide(shot**2, electrons * variance**2, where=electrons > 0, out=np.zeros(40))
+    sd = np.sqrt((2 + kurtosis) / frames)
+    assert np.abs((densities.var(axis=0) / variance - 1) / sd).max() < 5
+
+
+def test_without_photoelectrons_and_in_motion_nothing_is_drawn_for_them():
+    plain, lit = RigModel(RIG, 3), RigModel(with_light(RIG, "moving,moving"), 3)
+    noisy = RigModel(with_light(RIG, "moving", photoelectrons=1e12), 3)
+    frames = []
+    for model in (plain, lit, noisy):
+        model.start_camera(0, 2)
+        frames.append(model.advance(np.zeros((400, 1))))
+    assert all(same(a, b) for a, b in zip(frames[0], frames[1], strict=True))
+    # So many electrons do not show, and read-out noise comes from its own stream.
+    assert all(np.abs(a.pixels.astype(int) - b.pixels).max() <= 1 for a, b in zip(frames[0], frames[2], strict=True))
