@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
-from aolink.calibration.measure import LEAST_FRAMES
+from aolink.calibration.measure import LEAST_FRAMES, line_sensor
 from aolink.errors import AolinkError, CalibrationError, RigError
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -72,8 +72,8 @@ def read_frames(path: Path, rig: Rig) -> Frames:
             f"{path} is not marked as a recording for calibration: make one with `aolink record --calibration"
             " dark|flat|still`"
         )
-    ours, theirs = rig.sensor, recording.rig.sensor
-    pairs = [(f"sensor.{name}", getattr(ours, name), getattr(theirs, name)) for name in _SAME]
+    ours, theirs = line_sensor(rig), recording.rig.sensor
+    pairs = [(f"sensor.{name}", getattr(ours, name), getattr(theirs, name, None)) for name in _SAME]
     for name in ("exposure_steps", "fast_step_s"):
         pairs.append((f"timing.{name}", getattr(rig.timing, name), getattr(recording.rig.timing, name)))
     for key, mine, found in pairs:
@@ -83,7 +83,7 @@ def read_frames(path: Path, rig: Rig) -> Frames:
                 " (--rig), or record it again"
             )
     whole = [exposure.pixels.ravel() for exposure in recording.exposures() if exposure.complete]
-    counts = np.array(whole, dtype=np.uint16).reshape(len(whole), rig.sensor.pixels)
+    counts = np.array(whole, dtype=np.uint16).reshape(len(whole), line_sensor(rig).pixels)
     return Frames(kind=kind, counts=counts, source=path.name)
 
 
@@ -114,6 +114,7 @@ def record_frames(
     AolinkError
         A recording failed, or nobody answers.
     """
+    line_sensor(rig)
     if frames < LEAST_FRAMES:
         raise CalibrationError(f"--frames {frames} is too few: at least {LEAST_FRAMES} are needed, better 100")
     try:

@@ -333,14 +333,14 @@ def _check_sensor(rig: Rig) -> list[Finding]:
             " moments depend on where in a pixel the spot rests"
         )
         findings.append(Finding(severity="warning", key="sensor.kernel.sigma", message=message))
-    noise = 5 * math.sqrt(sensor.noise_density / sensor.pixel_width) * sensor.counts_per_density
+    noise = 5 * math.sqrt(sensor.noise_density / sensor.pixel_size) * sensor.counts_per_density
     if sensor.black_level < noise:
         message = (
             f"five sd of pixel noise are {noise:.0f} counts, more than the black level, {sensor.black_level:g}:"
             " clipped at zero, the noise biases every moment"
         )
         findings.append(Finding(severity="warning", key="sensor.black_level", message=message))
-    peak = math.erf(sensor.pixel_width / 2 / sensor.kernel.sigma) / sensor.pixel_width * sensor.counts_per_density
+    peak = sensor.peak_density * sensor.counts_per_density
     if sensor.black_level + peak + noise > sensor.full_scale:
         message = (
             f"a resting spot and five sd of noise reach {sensor.black_level + peak + noise:.0f} counts,"

@@ -13,13 +13,19 @@ import tomllib
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.errors import RigError
+from aolink.sensor import BaseSensor, read_calibration, read_sensor
+from aolink.sensor import CalibrationTable as CalibrationTable
+from aolink.sensor import Kernel as Kernel
+from aolink.sensor import Sensor as Sensor
+from aolink.sensor import SpotSensor as SpotSensor
+from aolink.toml_table import Table, shape_text
 
 FloatArray = NDArray[np.float64]
 
@@ -77,66 +83,6 @@ class Timing:
     @property
     def fast_step_ns(self) -> int:
         return round(self.fast_step_s * 1e9)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Kernel:
-    """Image kernel Psi, the spot that a resting beam makes; of unit mass."""
-
-    shape: Literal["gaussian"]
-    sigma: float
-    """Width, slope units, in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2."""
-
-    @property
-    def variance(self) -> float:
-        """Variance of the kernel, slope units squared."""
-        return self.sigma**2 / 2
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensor:
-    """A line sensor: equal pixels on ``field``, an integer read-out."""
-
-    kind: Literal["line"]
-    pixels: int
-    field: tuple[float, float]
-    """Outer edges of the first and the last pixel, slope units."""
-    noise_density: float
-    """V: a pixel of width D that holds the mean density has noise variance V/D (Mishra & Wen, section V)."""
-    kernel: Kernel
-    bit_depth: int
-    black_level: float
-    """Counts of a pixel that sees nothing."""
-    counts_per_density: float
-    """Counts for a density of one (one over the slope unit)."""
-    photoelectrons: float = 0.0
-    """Photo-electrons of the whole spot in one exposure; 0 means so many that shot noise does not matter."""
-
-    @property
-    def pixel_width(self) -> float:
-        """D, slope units."""
-        return (self.field[1] - self.field[0]) / self.pixels
-
-    @property
-    def edges(self) -> FloatArray:
-        """Pixel edges, slope units, (pixels + 1,)."""
-        return np.linspace(self.field[0], self.field[1], self.pixels + 1)
-
-    @property
-    def centres(self) -> FloatArray:
-        """Pixel centres, slope units, (pixels,)."""
-        edges = self.edges
-        return (edges[:-1] + edges[1:]) / 2
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of a frame."""
-        return (1, self.pixels)
-
-    @property
-    def full_scale(self) -> int:
-        """Largest count."""
-        return (1 << self.bit_depth) - 1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -226,25 +172,6 @@ class Simulation:
     faults: Faults = Faults()
 
 
-@dataclass(frozen=True, kw_only=True)
-class CalibrationTable:
-    """How well the sensor's values are known, as `aolink calibrate` wrote it: standard deviations, and from what.
-
-    A standard deviation is None where its value was not measured.
-    """
-
-    black_level_sd: float | None = None
-    noise_density_sd: float | None = None
-    counts_per_density_sd: float | None = None
-    photoelectrons_sd: float | None = None
-    kernel_sigma_sd: float | None = None
-    dark_frames: int = 0
-    flat_frames: int = 0
-    still_frames: int = 0
-    sources: tuple[str, ...] = ()
-    """Kind, name and SHA-256 of each recording that was used."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rig:
     """A whole rig, validated."""
@@ -253,7 +180,7 @@ class Rig:
     summary: str
     plant: Plant
     timing: Timing
-    sensor: Sensor
+    sensor: BaseSensor
     mirror: MirrorDriver
     drive: Drive
     simulation: Simulation
@@ -276,117 +203,6 @@ class Rig:
     def n_outputs(self) -> int:
         """Outputs of the whole rig: rows of a path."""
         return self.plant.axes * self.plant.n_outputs
-
-
-class _Table:
-    """One TOML table while it is read: every key must be asked for, and those that were not are errors."""
-
-    def __init__(self, values: Any, path: str) -> None:
-        if not isinstance(values, dict):
-            raise RigError(f"{path}: expected a table, found {_shown(values)}")
-        self._values, self._path, self._asked = values, path, set[str]()
-
-    def key(self, name: str) -> str:
-        return f"{self._path}.{name}" if self._path else name
-
-    def has(self, name: str) -> bool:
-        self._asked.add(name)
-        return name in self._values
-
-    def get(self, name: str, default: Any = None) -> Any:
-        self._asked.add(name)
-        if name not in self._values:
-            if default is None:
-                raise RigError(f"{self.key(name)} is missing: the rig file must give it")
-            return default
-        return self._values[name]
-
-    def table(self, name: str, *, optional: bool = False) -> _Table:
-        return _Table(self.get(name, {} if optional else None), self.key(name))
-
-    def text(self, name: str, default: str | None = None) -> str:
-        value = self.get(name, default)
-        if not isinstance(value, str):
-            raise RigError(f"{self.key(name)}: expected text, found {_shown(value)}")
-        return value
-
-    def choice(self, name: str, choices: tuple[str, ...], default: str | None = None) -> Any:
-        value = self.text(name, default)
-        if value not in choices:
-            raise RigError(f"{self.key(name)} = {value!r} is not known: use one of {', '.join(choices)}")
-        return value
-
-    def number(
-        self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf
-    ) -> float:
-        value = self.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise RigError(f"{self.key(name)}: expected a finite number, found {_shown(value)}")
-        if value < low or value <= above:
-            bound = f"at least {low:g}" if value < low else f"above {above:g}"
-            raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
-        return float(value)
-
-    def optional_number(self, name: str, *, low: float) -> float | None:
-        return self.number(name, low=low) if self.has(name) else None
-
-    def texts(self, name: str) -> tuple[str, ...]:
-        values = self.get(name, [])
-        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-            raise RigError(f"{self.key(name)}: expected a list of texts, found {_shown(values)}")
-        return tuple(values)
-
-    def rate(self, name: str) -> float:
-        value = self.number(name, 0.0, low=0.0)
-        if value > 1:
-            raise RigError(f"{self.key(name)} = {value:g} is a probability: it must be at most 1")
-        return value
-
-    def integer(self, name: str, default: int | None = None, *, low: int, high: int = 2**31) -> int:
-        value = self.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise RigError(f"{self.key(name)}: expected a whole number from {low} to {high}, found {_shown(value)}")
-        return value
-
-    def matrix(self, name: str, shape: tuple[int | None, int | None], why: str) -> FloatArray:
-        """A matrix; a number stands for a 1x1 one. None in ``shape`` takes any size."""
-        array = self._array(name, self.get(name))
-        if array.ndim == 0:
-            array = array.reshape(1, 1)
-        if (
-            array.ndim != 2
-            or 0 in array.shape
-            or any(s is not None and s != a for s, a in zip(shape, array.shape, strict=True))
-        ):
-            wanted = " x ".join("any" if s is None else str(s) for s in shape)
-            raise RigError(f"{self.key(name)} has shape {_shape(array)}, expected {wanted} ({why})")
-        return array
-
-    def vector(self, name: str, size: int, why: str, default: float | None = None) -> FloatArray:
-        """A vector; a number is repeated."""
-        array = self._array(name, self.get(name, default))
-        if array.ndim == 0:
-            return np.full(size, float(array))
-        if array.shape != (size,):
-            raise RigError(f"{self.key(name)} has shape {_shape(array)}, expected {size} ({why})")
-        return array
-
-    def _array(self, name: str, value: Any) -> FloatArray:
-        try:
-            array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise RigError(
-                f"{self.key(name)}: expected numbers in rows of equal length, found {_shown(value)}"
-            ) from None
-        if not np.isfinite(array).all():
-            raise RigError(f"{self.key(name)} holds a number that is not finite")
-        return array
-
-    def finish(self) -> None:
-        for name in self._values:
-            if name not in self._asked:
-                known = ", ".join(sorted(self._asked))
-                raise RigError(f"{self.key(name)} is not a key that aolink knows; known here: {known}")
 
 
 def load_rig(path_or_name: str | Path) -> Rig:
@@ -432,18 +248,18 @@ def builtin_rigs() -> list[str]:
 def parse_rig(text: str) -> Rig:
     """Validate the text of a rig file. Raises `RigError`, naming the key."""
     try:
-        root = _Table(tomllib.loads(text), "")
+        root = Table(tomllib.loads(text), "")
     except tomllib.TOMLDecodeError as error:
         raise RigError(f"not valid TOML: {error}") from None
     name, summary = root.text("name"), root.text("summary", "")
     plant = _plant(root.table("plant"))
     timing = _timing(root.table("timing"))
-    sensor = _sensor(root.table("sensor"), plant)
+    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs)
     n_inputs = plant.axes * plant.n_inputs
     mirror = _mirror(root.table("mirror"), n_inputs, timing)
     drive = _drive(root.table("drive", optional=True), n_inputs, mirror)
     simulation = _simulation(root.table("simulation", optional=True))
-    calibration = _calibration(root.table("calibration")) if root.has("calibration") else None
+    calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
     root.finish()
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
@@ -452,11 +268,11 @@ def parse_rig(text: str) -> Rig:
     )  # fmt: skip
 
 
-def _plant(table: _Table) -> Plant:
+def _plant(table: Table) -> Plant:
     A = table.matrix("A", (None, None), "states x states")
     n = A.shape[0]
     if A.shape != (n, n):
-        raise RigError(f"plant.A has shape {_shape(A)}, expected a square matrix (states x states)")
+        raise RigError(f"plant.A has shape {shape_text(A)}, expected a square matrix (states x states)")
     radius = float(np.abs(np.linalg.eigvals(A)).max())
     if radius > 1 + 1e-9:
         raise RigError(f"plant.A is unstable: its largest eigenvalue has modulus {radius:.6g}, it must be at most 1")
@@ -483,7 +299,7 @@ def _plant(table: _Table) -> Plant:
     )  # fmt: skip
 
 
-def _covariance(table: _Table, name: str, size: int, why: str) -> FloatArray:
+def _covariance(table: Table, name: str, size: int, why: str) -> FloatArray:
     matrix = table.matrix(name, (size, size), why)
     if not np.allclose(matrix, matrix.T):
         raise RigError(f"{table.key(name)} is not symmetric, a covariance must be")
@@ -493,7 +309,7 @@ def _covariance(table: _Table, name: str, size: int, why: str) -> FloatArray:
     return matrix
 
 
-def _timing(table: _Table) -> Timing:
+def _timing(table: Table) -> Timing:
     fast_step_s = table.number("fast_step_s", above=0.0)
     steps = table.integer("exposure_steps", low=1, high=1_000_000)
     period = table.integer("frame_period_steps", steps, low=1, high=10_000_000)
@@ -505,37 +321,7 @@ def _timing(table: _Table) -> Timing:
     return Timing(fast_step_s=fast_step_s, exposure_steps=steps, frame_period_steps=period)
 
 
-def _sensor(table: _Table, plant: Plant) -> Sensor:
-    kind = table.choice("kind", ("line",))
-    if plant.axes * plant.n_outputs != 1:
-        raise RigError(
-            f"sensor.kind = 'line' sees one slope, but the plant has {plant.axes * plant.n_outputs}"
-            " (plant.axes times the rows of plant.C)"
-        )
-    field = table.vector("field", 2, "lower and upper edge")
-    if field[0] >= field[1]:
-        raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
-    kernel_table = table.table("kernel")
-    kernel = Kernel(shape=kernel_table.choice("shape", ("gaussian",)), sigma=kernel_table.number("sigma", above=0.0))
-    kernel_table.finish()
-    sensor = Sensor(
-        kind=kind,
-        pixels=table.integer("pixels", low=2, high=65_536),
-        field=(float(field[0]), float(field[1])),
-        noise_density=table.number("noise_density", low=0.0),
-        kernel=kernel,
-        bit_depth=table.integer("bit_depth", 16, low=1, high=16),
-        black_level=table.number("black_level", 0.0, low=0.0),
-        counts_per_density=table.number("counts_per_density", above=0.0),
-        photoelectrons=table.number("photoelectrons", 0.0, low=0.0),
-    )
-    if sensor.black_level >= sensor.full_scale:
-        raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
-    table.finish()
-    return sensor
-
-
-def _mirror(table: _Table, n_inputs: int, timing: Timing) -> MirrorDriver:
+def _mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
     low = table.vector("input_min", n_inputs, "inputs")
     high = table.vector("input_max", n_inputs, "inputs")
     if (low >= high).any():
@@ -566,7 +352,7 @@ def _mirror(table: _Table, n_inputs: int, timing: Timing) -> MirrorDriver:
     return driver
 
 
-def _drive(table: _Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
+def _drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
     kind = table.choice("kind", ("none", "sine"), "none")
     offset = table.vector("offset", n_inputs, "inputs", 0.0)
     amplitude = table.vector("amplitude", n_inputs, "inputs", None if kind == "sine" else 0.0)
@@ -578,7 +364,7 @@ def _drive(table: _Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
     return Drive(kind=kind, amplitude=amplitude, period_s=period, offset=offset)
 
 
-def _simulation(table: _Table) -> Simulation:
+def _simulation(table: Table) -> Simulation:
     faults_table = table.table("faults", optional=True)
     faults = Faults(**{name: faults_table.rate(name) for name in Faults.__dataclass_fields__})
     faults_table.finish()
@@ -609,28 +395,3 @@ def parse_light(text: str, name: str) -> tuple[Light, ...]:
             raise RigError(f"{name}: the density of {word.strip()!r} must be a number above 0")
         lights.append(Light(kind=kind, level=density))  # type: ignore[arg-type] # one of the four, as checked
     return tuple(lights)
-
-
-def _calibration(table: _Table) -> CalibrationTable:
-    calibration = CalibrationTable(
-        black_level_sd=table.optional_number("black_level_sd", low=0.0),
-        noise_density_sd=table.optional_number("noise_density_sd", low=0.0),
-        counts_per_density_sd=table.optional_number("counts_per_density_sd", low=0.0),
-        photoelectrons_sd=table.optional_number("photoelectrons_sd", low=0.0),
-        kernel_sigma_sd=table.optional_number("kernel_sigma_sd", low=0.0),
-        dark_frames=table.integer("dark_frames", 0, low=0),
-        flat_frames=table.integer("flat_frames", 0, low=0),
-        still_frames=table.integer("still_frames", 0, low=0),
-        sources=table.texts("sources"),
-    )
-    table.finish()
-    return calibration
-
-
-def _shape(array: FloatArray) -> str:
-    return " x ".join(map(str, array.shape)) or "number"
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

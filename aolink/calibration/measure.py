@@ -19,7 +19,7 @@ from scipy import stats
 
 from aolink.calibration.spot import Spot, check_at_rest, fit_spots
 from aolink.errors import CalibrationError
-from aolink.rig import Rig
+from aolink.rig import Rig, Sensor
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -137,6 +137,16 @@ def pixel_statistics(series: Sequence[NDArray[np.uint16]], *, steady: bool = Tru
     )
 
 
+def line_sensor(rig: Rig) -> Sensor:
+    """The rig's sensor. Raises CalibrationError where it is not a line: nothing else can be calibrated."""
+    if not isinstance(rig.sensor, Sensor):
+        raise CalibrationError(
+            f"{rig.name} has no line sensor, and only that can be calibrated: put what is known of this one into the"
+            " rig file by hand"
+        )
+    return rig.sensor
+
+
 def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     """Calibrate a line sensor from frames of what it was shown.
 
@@ -152,6 +162,7 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     CalibrationError
         There are no dark frames or too few frames, they are saturated, or not what they are said to be.
     """
+    sensor = line_sensor(rig)
     for each in recordings:
         if len(each.counts) < LEAST_FRAMES:
             raise CalibrationError(
@@ -187,13 +198,13 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     if stills:
         noise = (read.value, max(gain.value, 0.0) if gain else 0.0)
         lit = list(zip(stills, still_signals, strict=True))
-        spot = fit_spots(rig.sensor, [(each.source, s.frames, s.mean) for each, s in lit], good, noise, dark.frames)
+        spot = fit_spots(sensor, [(each.source, s.frames, s.mean) for each, s in lit], good, noise, dark.frames)
         for k, (each, signal) in enumerate(lit):
             alone, spread = signal.variance, signal.spread
             if flats and gain:  # then what a pixel does by itself is known apart from this spot
                 alone = read.value + max(gain.value + 2 * gain.sd, 0.0) * np.maximum(signal.mean, 0.0)
                 spread = 0.0
-            notes += check_at_rest(rig.sensor, each.source, each.counts[:, good], (alone[good], spread), good, spot, k)
+            notes += check_at_rest(sensor, each.source, each.counts[:, good], (alone[good], spread), good, spot, k)
         if not spot.gaussian:
             notes.append(spot.complaint)
     return _result(rig, recordings, black, read, gain, spot, good, notes)

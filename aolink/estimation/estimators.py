@@ -24,10 +24,11 @@ from aolink.estimation.moments import (
     spot_significance,
 )
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
+from aolink.estimation.spots import centroid_noise, measure_spots
 from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
-from aolink.rig import Rig
+from aolink.rig import Rig, SpotSensor
 
 FloatArray = NDArray[np.float64]
 Engine = Literal["aolink", "filterpy"]
@@ -145,6 +146,13 @@ def measure(
     sensor, pixels = rig.sensor, exposure.pixels
     if pixels.shape != sensor.shape:
         return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
+    if isinstance(sensor, SpotSensor):
+        orders = observation.orders if isinstance(observation, PathMoments) else None
+        return measure_spots(
+            sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
+            least_usable=_LEAST_USABLE, least_significance=_LEAST_SIGNIFICANCE,
+        )  # fmt: skip
+    sensor = sensor.profile
     saturated = is_saturated(sensor, pixels) & exposure.mask
     usable = exposure.mask & ~saturated
     remark = ""
@@ -236,15 +244,24 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
         gain = _steady_gain(rig, options) if name == "o1" and options.gain == "steady-state" else None
         engine = FilterpyMoments if options.engine == "filterpy" else PathMoments
         return engine(rig.plant.n_outputs, _PAPER_ORDERS[name], gain)
+    if rig.plant.n_outputs > 1:
+        raise EstimatorError(
+            f"{name} looks at one output of each copy of the plant, {rig.name} has {rig.plant.n_outputs}: use"
+            f" {', '.join(_PAPER_ORDERS)}"
+        )
     return WindowedMoments(
-        rig.sensor, options.orders, basis=options.basis, flux=options.flux, shot_gain=options.shot_gain
+        rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux, shot_gain=options.shot_gain
     )
 
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file; None where there is none."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps)
-    noise = known_flux_covariance(effective_noise_density(rig.sensor), noise_integrals(rig.sensor, 2), [1])
+    if isinstance(rig.sensor, SpotSensor):
+        noise = centroid_noise(rig.sensor, rig.plant.n_outputs)
+    else:
+        line = rig.sensor.profile
+        noise = known_flux_covariance(effective_noise_density(line), noise_integrals(line, 2), [1])
     return steady_gain(model, added_noise(model, options.process_noise), noise)
 
 

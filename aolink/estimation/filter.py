@@ -110,7 +110,8 @@ class BlurFilter:
             coefficients = prior
         else:
             done = looks.correct(model, response, prior, measured)
-            coefficients, status = self._trusted(prior, done, lost)
+            done = _without(done, measured.usable)
+            coefficients, status = self._trusted(prior, done, lost, measured.usable)
         if with_noise:
             self.belief = predicted(coefficients, model.end_rows, model.end_remainder, response.end)
         else:
@@ -126,15 +127,21 @@ class BlurFilter:
             nis=_numbers(done.nis),
         )
 
-    def _trusted(self, prior: Belief, done: Correction, lost: NDArray[np.bool_]) -> tuple[Belief, NDArray[np.int64]]:
-        """The correction where it can be believed, the prior elsewhere; and the status of each axis."""
-        after = done.posterior
+    def _trusted(
+        self, prior: Belief, done: Correction, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
+    ) -> tuple[Belief, NDArray[np.int64]]:
+        """The correction where there is one that can be believed, the prior elsewhere; and the status of each axis."""
+        after, missed = done.posterior, self._missed
         used = done.nis <= self._gate
         if not (np.isfinite(after.mean).all() and np.isfinite(after.covariance).all()):
             used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
         self._missed = np.where(used, 0, np.where(lost, 1, self._missed + 1))
         status = np.where(used, np.where(lost, Status.REINITIALISED, Status.OK), Status.GATED)
         status = np.where(~used & (self._missed >= _PATIENCE), Status.DIVERGED, status)
+        if usable is not None:
+            used &= usable
+            status = np.where(usable, status, Status.INPUT_INVALID)
+            self._missed = np.where(usable, self._missed, missed)
         return _where(used, after, prior), status
 
 
@@ -142,6 +149,15 @@ def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: F
     """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
     mean = stacked.matvec(transition, belief.mean) + kick
     return Belief(mean, stacked.symmetric(stacked.congruence(transition, belief.covariance) + noise))
+
+
+def _without(done: Correction, usable: NDArray[np.bool_] | None) -> Correction:
+    """Innovations, their covariance and NIS of zero for axes of which nothing was measured."""
+    if usable is None:
+        return done
+    innovation = np.where(usable[:, None], done.innovation, 0.0)
+    covariance = np.where(usable[:, None, None], done.innovation_covariance, 0.0)
+    return Correction(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
 
 
 def _with_noise(state: Belief, count: int) -> Belief:

@@ -35,6 +35,8 @@ class Measurement:
     """(axes, n_measurements)"""
     covariance: FloatArray
     """(axes, n_measurements, n_measurements)"""
+    usable: NDArray[np.bool_] | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
 
 
 def raw_moments(sensor: Sensor, counts: NDArray[np.uint16], highest: int) -> FloatArray:

@@ -66,8 +66,9 @@ def score(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: in
         start_nees.append(_normalised(at_start, estimate.start_covariance))
         end_nees.append(_normalised(at_end, estimate.end_covariance))
         if estimate.innovation.shape[1]:
-            nis.append(estimate.nis)
-            dimensions.append(estimate.innovation.shape[1] * len(estimate.nis))
+            seen = estimate.innovation_covariance.any(axis=(1, 2))  # zero where nothing was measured of an axis
+            nis.append(estimate.nis[seen])
+            dimensions.append(estimate.innovation.shape[1] * int(seen.sum()))
     n_states = start[0].shape[1] if start else 0
     states = len(start) * (len(start[0]) if start else 0) * n_states
     return Score(

@@ -57,6 +57,8 @@ class Profile:
     """One over slope units, (axes, pixels)."""
     mask: NDArray[np.bool_]
     """True where the pixel can be used, (axes, pixels)."""
+    usable: NDArray[np.bool_] | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
 
 
 @dataclass(frozen=True, eq=False)

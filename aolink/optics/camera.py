@@ -1,4 +1,7 @@
-"""The camera as an integer device: densities become counts and counts become densities."""
+"""The camera as an integer device: densities become counts and counts become densities.
+
+A pixel's size D is its length on a line of pixels, and its area on a plane of them.
+"""
 
 from __future__ import annotations
 
@@ -7,42 +10,42 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.rig import Sensor
+from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 
 
-def to_counts(sensor: Sensor, density: FloatArray) -> NDArray[np.uint16]:
-    """What the camera reads out for a density (one over slope units): rounded, and cut at zero and at full scale."""
+def to_counts(sensor: BaseSensor, density: FloatArray) -> NDArray[np.uint16]:
+    """What the camera reads out for a density: rounded, and cut at zero and at full scale."""
     counts = np.rint(sensor.black_level + sensor.counts_per_density * density)
     return np.clip(counts, 0, sensor.full_scale).astype(np.uint16)
 
 
-def to_density(sensor: Sensor, counts: NDArray[np.uint16]) -> FloatArray:
-    """The density (one over slope units) that counts stand for; noise makes it negative where nothing shines."""
+def to_density(sensor: BaseSensor, counts: NDArray[np.uint16]) -> FloatArray:
+    """The density that counts stand for; noise makes it negative where nothing shines."""
     return (counts.astype(np.float64) - sensor.black_level) / sensor.counts_per_density
 
 
-def is_saturated(sensor: Sensor, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def is_saturated(sensor: BaseSensor, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
     """True where a count is at an end of the scale, so that the light may have been more, or less."""
     return np.asarray((counts == 0) | (counts >= sensor.full_scale))
 
 
-def pixel_noise_sd(sensor: Sensor) -> float:
-    """Standard deviation of a pixel's density by read-out noise, sqrt(V/D), one over slope units."""
-    return math.sqrt(sensor.noise_density / sensor.pixel_width)
+def pixel_noise_sd(sensor: BaseSensor) -> float:
+    """Standard deviation of a pixel's density by read-out noise, sqrt(V/D)."""
+    return math.sqrt(sensor.noise_density / sensor.pixel_size)
 
 
-def shot_gain(sensor: Sensor) -> float:
+def shot_gain(sensor: BaseSensor) -> float:
     """Variance of a pixel's density by shot noise for each unit of density, 1/(photoelectrons D); 0 if negligible."""
-    return 1 / (sensor.photoelectrons * sensor.pixel_width) if sensor.photoelectrons else 0.0
+    return 1 / (sensor.photoelectrons * sensor.pixel_size) if sensor.photoelectrons else 0.0
 
 
-def pixel_noise_variance(sensor: Sensor, density: FloatArray) -> FloatArray:
+def pixel_noise_variance(sensor: BaseSensor, density: FloatArray) -> FloatArray:
     """Variance of pixels' densities by read-out and shot noise, V/D + Y/(photoelectrons D), shape of ``density``."""
-    return sensor.noise_density / sensor.pixel_width + shot_gain(sensor) * np.maximum(density, 0.0)
+    return sensor.noise_density / sensor.pixel_size + shot_gain(sensor) * np.maximum(density, 0.0)
 
 
-def effective_noise_density(sensor: Sensor) -> float:
+def effective_noise_density(sensor: BaseSensor) -> float:
     """V with the rounding to whole counts added (variance 1/12 of a count), so that it is never zero."""
-    return sensor.noise_density + sensor.pixel_width / (12 * sensor.counts_per_density**2)
+    return sensor.noise_density + sensor.pixel_size / (12 * sensor.counts_per_density**2)

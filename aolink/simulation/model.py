@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from aolink.exposure import Exposure, Truth
 from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
-from aolink.optics.kernel import exposure_density
+from aolink.optics.frame import frame_density
 from aolink.plant import psd_root
 from aolink.rig import Rig, load_rig
 
@@ -132,7 +132,7 @@ class RigModel:
         if light.kind == "still":
             self._rest = path[:, :1] if self._rest is None else self._rest
             path = np.repeat(self._rest, path.shape[1], axis=1)
-        return path, exposure_density(sensor.kernel, sensor.edges, path)
+        return path, frame_density(sensor, path)
 
 
 def simulate(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import rerun.blueprint as rrb
 
-from aolink.rig import Rig
+from aolink.rig import Rig, SpotSensor
 from aolink.viewing.camera import HISTORY, profile_bounds
 from aolink.viewing.motion import BAND, NIS_COVERAGE
 from aolink.viewing.timebase import DEVICE_TIME, FAST_STEP
@@ -42,7 +42,7 @@ class Contents:
 
 def blueprint(contents: Contents) -> rrb.Blueprint:
     """The layout: the exposure on top, the session's estimates below it, the devices at the bottom."""
-    exposure = rrb.Horizontal(_history(contents), _profile(contents), _paths(contents), column_shares=[4, 4, 7])
+    exposure = rrb.Horizontal(_camera(contents), _profile(contents), _paths(contents), column_shares=[4, 4, 7])
     rows: list[rrb.Container | rrb.View] = [exposure]
     if contents.estimators:
         beliefs = [*_errors(contents), *_nis(contents), _states(contents)]
@@ -57,18 +57,33 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
     )
 
 
-def _history(contents: Contents) -> rrb.View:
+def _camera(contents: Contents) -> rrb.Container | rrb.View:
+    """The last exposures; where there are many spots they are those of the first one, behind the whole frame."""
+    sensor = contents.rig.sensor
+    if not isinstance(sensor, SpotSensor):
+        return _history(contents, "paths in their blur")
+    rows, columns = sensor.shape
+    shown = ["camera/image", *(f"camera/image/path/{name}" for name in ("truth", contents.focus) if name)]
+    frame = rrb.Spatial2DView(
+        name="Camera: frame (pixels), paths in their blur",
+        contents=_exactly(shown),
+        visual_bounds=rrb.VisualBounds2D(x_range=(0, columns), y_range=(0, rows)),
+    )
+    return rrb.Tabs(frame, _history(contents, "first spot along x"), active_tab=0)
+
+
+def _history(contents: Contents, what: str) -> rrb.View:
     shown = ["camera/history", "camera/history/centroid"]
     shown += [f"camera/history/path/{name}" for name in ("truth", contents.focus) if name]
     return rrb.Spatial2DView(
-        name=f"Camera: last {HISTORY} exposures (pixels), paths in their blur",
+        name=f"Camera: last {HISTORY} exposures (pixels), {what}",
         contents=_exactly(shown),
-        visual_bounds=rrb.VisualBounds2D(x_range=(0, contents.rig.sensor.pixels), y_range=(0, HISTORY)),
+        visual_bounds=rrb.VisualBounds2D(x_range=(0, contents.rig.sensor.profile.pixels), y_range=(0, HISTORY)),
     )
 
 
 def _profile(contents: Contents) -> rrb.View:
-    x_range, y_range = profile_bounds(contents.rig.sensor, contents.density_top)
+    x_range, y_range = profile_bounds(contents.rig.sensor.profile, contents.density_top)
     return rrb.Spatial2DView(
         origin="profile",
         name="Intensity density (1/slope unit) over slope",

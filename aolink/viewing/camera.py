@@ -7,15 +7,18 @@ too, so that a path is drawn as a line through the blur that it made.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from aolink.estimation.spots import profiles
 from aolink.exposure import Exposure
 from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.optics.kernel import exposure_density
-from aolink.rig import Sensor
+from aolink.sensor import BaseSensor, Sensor, SpotSensor
 from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH, Colour, estimator_colour
 from aolink.viewing.timebase import Timebase
 
@@ -29,6 +32,8 @@ PROFILE_ASPECT = 0.7
 """Height of the profile's plot over its width."""
 _POINTS_IN_ROW = 21
 """Of a path inside one row of the picture: more than can be told apart."""
+_POINTS_OF_SPOT = 51
+"""Of a spot's path on the frame."""
 _BRIGHTEST = 190
 """Grey of the brightest pixel: short of white, so that the paths stand out."""
 
@@ -61,6 +66,42 @@ def log_frames(stream: rr.RecordingStream, timebase: Timebase, exposures: Sequen
     stream.log("camera/image", rr.Image.from_fields(format=layout), static=True)
     buffers = np.stack([e.pixels.astype("<u2").ravel().view(np.uint8) for e in exposures])
     _send_at_starts(stream, "camera/image", timebase, exposures, rr.Image.columns(buffer=buffers))
+
+
+def first_profiles(sensor: BaseSensor, exposures: Sequence[Exposure]) -> list[Exposure]:
+    """The exposures as ``sensor.profile`` would have seen them: of many spots, the first one along x."""
+    if not isinstance(sensor, SpotSensor):
+        return list(exposures)
+    seen = []
+    for exposure in exposures:
+        found = profiles(sensor, exposure.pixels, exposure.mask)
+        counts: NDArray[Any] = found.counts[:1]
+        seen.append(replace(exposure, pixels=counts, mask=found.mask[:1]))
+    return seen
+
+
+def log_spot_paths(
+    stream: rr.RecordingStream, sensor: SpotSensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
+    by_frame: Mapping[int, FloatArray],
+) -> None:  # fmt: skip
+    """Paths of all spots over the frame, in its pixels: ``/camera/image/path/NAME``.
+
+    Parameters
+    ----------
+    by_frame:
+        Frame id -> (n_outputs, n_steps), slope units.
+    """
+    known = [e for e in exposures if e.frame_id in by_frame]
+    (rows, columns), (height, width) = sensor.grid, sensor.window
+    corner = np.stack(np.meshgrid(width * np.arange(columns), height * np.arange(rows)), axis=-1).reshape(-1, 2)
+    strips = []
+    for exposure in known:
+        path = by_frame[exposure.frame_id]
+        some = np.unique(np.linspace(0, path.shape[1] - 1, _POINTS_OF_SPOT).astype(int))
+        inside = np.clip((path[:, some] - sensor.field[0]) / sensor.pixel_width, 0, width)
+        spots = inside.reshape(sensor.spots, 2, -1).swapaxes(1, 2) + corner[:, None]
+        strips.append(list(spots.astype(np.float32)))
+    _send_strips(stream, f"camera/image/path/{name}", timebase, known, strips, colour_of(name), 1.5)
 
 
 def log_history(

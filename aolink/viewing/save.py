@@ -17,6 +17,7 @@ from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
 from aolink.exposure import Exposure
+from aolink.rig import SpotSensor
 from aolink.viewing import camera, devices, motion
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.palette import by_rank
@@ -121,16 +122,22 @@ def _send_camera(
     estimates: dict[str, list[Estimate]],
 ) -> float:
     """Send frames, history and profiles; the density at the top of the profile's plot."""
-    rig = recording.rig
-    paths = {name: {e.frame_id: e.path[0] for e in sequence} for name, sequence in estimates.items()}
-    true_paths = {e.frame_id: e.truth.path[0] for e in exposures if e.truth is not None}
-    top = camera.density_top(rig.sensor, exposures)
+    sensor = recording.rig.sensor
+    outputs = {"truth": {e.frame_id: e.truth.path for e in exposures if e.truth is not None}}
+    outputs |= {name: {e.frame_id: e.path for e in sequence} for name, sequence in estimates.items()}
     camera.log_frames(stream, timebase, exposures)
-    camera.log_history(stream, rig.sensor, timebase, exposures, {"truth": true_paths, **paths}, top)
-    camera.log_profile_axes(stream, rig.sensor, top)
-    camera.log_measured_profile(stream, rig.sensor, timebase, exposures, top)
-    for name, by_frame in {"truth": true_paths, **paths}.items():
-        camera.log_predicted_profile(stream, rig.sensor, timebase, exposures, name, by_frame, top)
+    if isinstance(sensor, SpotSensor):
+        for name, by_frame in outputs.items():
+            camera.log_spot_paths(stream, sensor, timebase, exposures, name, by_frame)
+    # What follows is one slope over time: the first one.
+    paths = {name: {k: path[0] for k, path in by_frame.items()} for name, by_frame in outputs.items()}
+    line, seen = sensor.profile, camera.first_profiles(sensor, exposures)
+    top = camera.density_top(line, seen)
+    camera.log_history(stream, line, timebase, seen, paths, top)
+    camera.log_profile_axes(stream, line, top)
+    camera.log_measured_profile(stream, line, timebase, seen, top)
+    for name, first in paths.items():
+        camera.log_predicted_profile(stream, line, timebase, seen, name, first, top)
     return top
 
 

@@ -1,0 +1,166 @@
+"""Frames of many spots: a profile for each slope of each spot, with its noise, and what is measured of it.
+
+A window's counts summed over its rows are what a line sensor (`BaseSensor.profile`) would see of the slope
+along x, summed over its columns of the one along y; so every estimator of line sensors works on them. A pixel
+that cannot be used takes its whole column out of the one and its whole row out of the other, and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.moments import (
+    LEAST_FLUX,
+    Flux,
+    Measurement,
+    known_flux_covariance,
+    measure_moments,
+    noise_integrals,
+    raw_moments,
+)
+from aolink.estimation.moments2d import measure_moments_2d
+from aolink.estimation.windowed import Profile
+from aolink.optics.camera import effective_noise_density, is_saturated, to_density
+from aolink.optics.plane import kernel_covariance
+from aolink.rig import Plant, Sensor, SpotSensor
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Profiles:
+    """What the frame shows of each output of the rig, as counts of `SpotSensor.profile`."""
+
+    counts: NDArray[np.int64]
+    """(n_outputs, pixels), zero where the mask is."""
+    mask: BoolArray
+    """True where all pixels summed can be used, (n_outputs, pixels)."""
+
+
+def profiles(sensor: SpotSensor, pixels: NDArray[np.uint16], usable: BoolArray) -> Profiles:
+    """Sums of each window over its rows (x) and over its columns (y); both arguments are (rows, columns)."""
+    counts, good = windows(sensor, pixels.astype(np.int64)), windows(sensor, usable)
+    n_outputs = 2 * sensor.spots
+    sums = np.stack([counts.sum(axis=1), counts.sum(axis=2)], axis=1).reshape(n_outputs, -1)
+    mask = np.stack([good.all(axis=1), good.all(axis=2)], axis=1).reshape(n_outputs, -1)
+    return Profiles(counts=np.where(mask, sums, 0), mask=mask)
+
+
+def windows(sensor: SpotSensor, frame: NDArray[Any]) -> NDArray[Any]:
+    """A frame cut into its windows, (rows, columns) -> (spots, rows of a window, columns of a window)."""
+    (rows, columns), (height, width) = sensor.grid, sensor.window
+    return frame.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
+
+
+def measure_spots(
+    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, orders: Sequence[int] | None,
+    flux: Flux, *, least_usable: float, least_significance: float,
+) -> tuple[Measurement | Profile | None, str]:  # fmt: skip
+    """What a frame says of each axis, or nothing; and how many axes it says nothing of, and why.
+
+    Parameters
+    ----------
+    pixels, arrived:
+        The frame and which of it there is, (rows, columns).
+    orders:
+        Of the moments to take, which need whole profiles; None for the profiles themselves.
+    least_usable:
+        Share of a profile's pixels that the profiles themselves can do with.
+    least_significance:
+        By how many standard deviations of noise a spot must stand out.
+    """
+    saturated = is_saturated(sensor, pixels) & arrived
+    found = profiles(sensor, pixels, arrived & ~saturated)
+    share = found.mask.mean(axis=1)
+    whole = share == 1 if orders else share >= least_usable
+    density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)  # type: ignore[arg-type] # sums
+    lit = brightest_stretch(sensor.profile, density) >= least_significance
+    if orders and flux == "measured":
+        lit &= _enough_light(sensor.profile, found.counts)
+    usable = (whole & lit).reshape(plant.axes, plant.n_outputs).all(axis=1)
+    reasons = [
+        (int((~arrived).sum()), f"of {pixels.size} pixels are missing"),
+        (int(saturated.sum()), f"of {pixels.size} pixels are at an end of the scale"),
+        (int((whole & ~lit).sum()), f"of {len(lit)} profiles show no spot"),
+    ]
+    remark = ", ".join(f"{count} {what}" for count, what in reasons if count)
+    if not usable.all():
+        remark = f"{int((~usable).sum())} of {plant.axes} axes predicted: {remark}"
+    elif remark:
+        remark += ": left out"
+    if not usable.any():
+        return None, remark
+    measured: Measurement | Profile | str
+    if orders is None:
+        # An axis without a measurement needs one that can be computed with.
+        measured = Profile(density=density, mask=found.mask | ~usable[:, None])
+    elif plant.n_outputs == 1:
+        chosen: NDArray[Any] = found.counts[usable]
+        measured = measure_moments(sensor.profile, chosen, orders, flux)
+    else:
+        measured = _coupled_moments(sensor, plant, pixels, usable, orders, flux)
+    if isinstance(measured, str):
+        return None, measured
+    if not usable.all():
+        measured = replace(_spread(measured, usable), usable=usable)
+    return measured, remark
+
+
+def brightest_stretch(line: Sensor, density: FloatArray) -> FloatArray:
+    """`spot_significance` of each of many profiles, (n, pixels) -> (n,)."""
+    light = np.concatenate([np.zeros((len(density), 1)), np.cumsum(density, axis=1)], axis=1) * line.pixel_width
+    sd = np.sqrt(effective_noise_density(line) * line.pixel_width)
+    lengths = [2**k for k in range(line.pixels.bit_length()) if 2**k <= line.pixels]
+    gained = [(light[:, n:] - light[:, :-n]).max(axis=1) / (sd * np.sqrt(n)) for n in lengths]
+    return np.asarray(np.max(gained, axis=0))
+
+
+def centroid_noise(sensor: SpotSensor, n_outputs: int) -> FloatArray:
+    """Covariance of the first moments of one copy's outputs, known flux, (n_outputs, n_outputs)."""
+    integrals = noise_integrals(sensor.profile, 2)
+    own = known_flux_covariance(effective_noise_density(sensor.profile), integrals, [1])
+    if n_outputs == 1:
+        return own
+    other = effective_noise_density(sensor) * integrals[1] ** 2
+    return np.kron(np.eye(n_outputs // 2), np.array([[own[0, 0], other], [other, own[0, 0]]]))
+
+
+def _enough_light(line: Sensor, counts: NDArray[Any]) -> BoolArray:
+    sd = np.sqrt(effective_noise_density(line) * noise_integrals(line, 0)[0])
+    return np.asarray(raw_moments(line, counts, 0)[:, 0] >= LEAST_FLUX * sd)
+
+
+def _coupled_moments(
+    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], usable: BoolArray, orders: Sequence[int], flux: Flux
+) -> Measurement | str:
+    """Moments where one copy of the plant moves whole spots: a spot's two slopes share the noise of its pixels."""
+    spots = plant.n_outputs // 2
+    density = windows(sensor, to_density(sensor, pixels))[np.repeat(usable, spots)]
+    edges, width = sensor.profile.edges, sensor.kernel.sigma * np.eye(2)
+    along = [(p, 0) for p in orders] + [(0, p) for p in orders]
+    noise = effective_noise_density(sensor)
+    found = measure_moments_2d(density, edges, edges, kernel_covariance(width), noise, along, flux)
+    if isinstance(found, str):
+        return found
+    copies, m = len(density) // spots, len(along)
+    covariance = np.zeros((copies, spots, m, spots, m))
+    for k in range(spots):
+        covariance[:, k, :, k] = found.covariance[k::spots]
+    size = spots * m
+    return Measurement(value=found.value.reshape(copies, size), covariance=covariance.reshape(copies, size, size))
+
+
+def _spread(measured: Measurement | Profile, usable: BoolArray) -> Measurement | Profile:
+    """Moments of the usable axes in the places of these; the others get zero with unit covariance."""
+    if isinstance(measured, Profile):
+        return measured
+    m = measured.value.shape[1]
+    value, covariance = np.zeros((len(usable), m)), np.tile(np.eye(m), (len(usable), 1, 1))
+    value[usable], covariance[usable] = measured.value, measured.covariance
+    return Measurement(value=value, covariance=covariance)

@@ -1,0 +1,107 @@
+"""Whole frames of an exposure, without noise: a line of pixels, or a spot in each of many windows."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.optics.kernel import exposure_density, pixel_mass
+from aolink.sensor import BaseSensor, Kernel, Sensor, SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+# Spots together: their masses stay in the processor's cache.
+_AT_ONCE = 16
+# Points of the table of masses in one sigma. Half a step to the third, times a sixth of the third derivative's
+# maximum, is what the expansion leaves out: 2e-9 of a spot's light.
+_POINTS = 256
+# Beyond so many sigma from the pixels there is no light on them.
+_REACH = 6.0
+# Numbers in a table at most; a kernel so narrow that it needs more is integrated step by step.
+_LARGEST_TABLE = 4_000_000
+
+
+def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
+    """Mean density in each pixel of a frame.
+
+    Parameters
+    ----------
+    path:
+        Positions of all spots at each fast step, slope units, (n_outputs, n_steps), in the sensor's order.
+
+    Returns
+    -------
+    (rows, columns)
+    """
+    if isinstance(sensor, SpotSensor):
+        rows, columns = sensor.grid
+        windows = spots_density(sensor.kernel, sensor.profile.edges, path.reshape(sensor.spots, 2, -1))
+        tiled = windows.reshape(rows, columns, *sensor.window).swapaxes(1, 2)
+        return np.asarray(np.ascontiguousarray(tiled).reshape(sensor.shape))
+    assert isinstance(sensor, Sensor)
+    return exposure_density(sensor.kernel, sensor.edges, path)
+
+
+def spots_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatArray:
+    """Mean density in the pixels of one square window for each spot.
+
+    (1/N) sum_i of the round kernel integrated over each pixel: the kernel is a product of its two directions,
+    so the sum over the fast steps is one matrix product of their masses.
+
+    Parameters
+    ----------
+    edges:
+        Edges of equal rows and of equal columns, slope units, (pixels + 1,).
+    path:
+        x and y at each fast step, slope units, (spots, 2, n_steps).
+
+    Returns
+    -------
+    One over slope units squared, (spots, rows, columns).
+    """
+    n, n_steps = len(edges) - 1, path.shape[-1]
+    light = np.empty((len(path), n, n))
+    for k in range(0, len(path), _AT_ONCE):
+        some = slice(k, k + _AT_ONCE)
+        masses = _masses(kernel, edges, path[some])
+        np.matmul(masses[:, 1].swapaxes(1, 2), masses[:, 0], out=light[some])
+    light /= n_steps * (edges[1] - edges[0]) ** 2
+    return light
+
+
+def _masses(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> FloatArray:
+    """`pixel_mass` to 2e-9, five times as fast: a table of it and its derivatives, expanded to the second order."""
+    if _table_rows(kernel.sigma, edges) * (len(edges) - 1) > _LARGEST_TABLE:
+        return pixel_mass(kernel, edges, positions)
+    mass, first, second = _mass_table(kernel.sigma, tuple(edges.tolist()))
+    place = (positions - edges[0]) * (_POINTS / kernel.sigma) + _REACH * _POINTS
+    np.clip(place, 0, len(mass) - 1, out=place)
+    row = np.rint(place)
+    away = (place - row)[..., None]
+    row = row.astype(np.intp)
+    out = second.take(row, axis=0)
+    out *= away
+    out += first.take(row, axis=0)
+    out *= away
+    out += mass.take(row, axis=0)
+    return np.asarray(out)
+
+
+def _table_rows(sigma: float, edges: FloatArray) -> int:
+    return math.ceil(float((edges[-1] - edges[0]) / sigma + 2 * _REACH) * _POINTS) + 1
+
+
+@lru_cache(maxsize=8)
+def _mass_table(sigma: float, pixel_edges: tuple[float, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Masses of the pixels at equal steps of the position, and their Taylor coefficients, each (rows, pixels)."""
+    edges = np.array(pixel_edges)
+    step = sigma / _POINTS
+    positions = edges[0] - _REACH * sigma + step * np.arange(_table_rows(sigma, edges))
+    u = (edges - positions[:, None]) / sigma
+    bell = np.exp(-u * u) / math.sqrt(math.pi)
+    first = -np.diff(bell, axis=1) / _POINTS
+    second = -np.diff(u * bell, axis=1) / _POINTS**2
+    return pixel_mass(Kernel(shape="gaussian", sigma=sigma), edges, positions), first, second

@@ -1,0 +1,278 @@
+"""What a camera is: where its pixels lie, how it counts, and how well that is known.
+
+Quantities are in the rig's own slope unit: that of ``sensor.field``, of the plant's output and of the
+kernel's width. A density is light over length for a line of pixels, and over area where pixels have two sides.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RigError
+from aolink.toml_table import Table
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernel:
+    """Image kernel Psi, the spot that a resting beam makes; of unit mass. On a plane it is round."""
+
+    shape: Literal["gaussian"]
+    sigma: float
+    """Width, slope units, in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2."""
+
+    @property
+    def variance(self) -> float:
+        """Variance of the kernel, slope units squared."""
+        return self.sigma**2 / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseSensor(ABC):
+    """What all sensors have: equal pixels, each spot seen on ``field``, an integer read-out."""
+
+    field: tuple[float, float]
+    """Outer edges of the first and the last pixel that see a spot, slope units; the same in both directions."""
+    noise_density: float
+    """V: a pixel of size D that holds the mean density has noise variance V/D (Mishra & Wen, section V)."""
+    kernel: Kernel
+    bit_depth: int
+    black_level: float
+    """Counts of a pixel that sees nothing."""
+    counts_per_density: float
+    """Counts for a density of one."""
+    photoelectrons: float = 0.0
+    """Photo-electrons of a whole spot in one exposure; 0 means so many that shot noise does not matter."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+
+    @property
+    @abstractmethod
+    def pixel_width(self) -> float:
+        """Side of a pixel, slope units."""
+
+    @property
+    @abstractmethod
+    def pixel_size(self) -> float:
+        """D: a pixel's length (slope units) on a line, its area on a plane."""
+
+    @property
+    @abstractmethod
+    def profile(self) -> Sensor:
+        """The line sensor that sees one slope of one spot as this one does, all light of the other direction summed."""
+
+    @property
+    @abstractmethod
+    def peak_density(self) -> float:
+        """Density of a pixel at whose middle a spot rests."""
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return (1 << self.bit_depth) - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor(BaseSensor):
+    """A line sensor: one spot on a row of pixels."""
+
+    kind: Literal["line"]
+    pixels: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return (1, self.pixels)
+
+    @property
+    def pixel_width(self) -> float:
+        """D, slope units."""
+        return (self.field[1] - self.field[0]) / self.pixels
+
+    @property
+    def pixel_size(self) -> float:
+        """D, slope units."""
+        return self.pixel_width
+
+    @property
+    def profile(self) -> Sensor:
+        """Itself."""
+        return self
+
+    @property
+    def peak_density(self) -> float:
+        """Density of a pixel at whose middle a spot rests, one over slope units."""
+        return math.erf(self.pixel_width / 2 / self.kernel.sigma) / self.pixel_width
+
+    @property
+    def edges(self) -> FloatArray:
+        """Pixel edges, slope units, (pixels + 1,)."""
+        return np.linspace(self.field[0], self.field[1], self.pixels + 1)
+
+    @property
+    def centres(self) -> FloatArray:
+        """Pixel centres, slope units, (pixels,)."""
+        edges = self.edges
+        return (edges[:-1] + edges[1:]) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpotSensor(BaseSensor):
+    """A camera behind lenslets: a grid of windows, a spot in each, seen in two directions.
+
+    The rig's outputs are spot 0's slope along x (columns), spot 0's along y (rows), spot 1's along x, ...;
+    spots are counted along the rows of the grid.
+    """
+
+    kind: Literal["spots"]
+    grid: tuple[int, int]
+    """Rows and columns of windows."""
+    window: tuple[int, int]
+    """Rows and columns of pixels in a window; a square."""
+
+    @property
+    def spots(self) -> int:
+        """Number of spots."""
+        return self.grid[0] * self.grid[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return (self.grid[0] * self.window[0], self.grid[1] * self.window[1])
+
+    @property
+    def pixel_width(self) -> float:
+        """Side of a pixel, slope units."""
+        return (self.field[1] - self.field[0]) / self.window[1]
+
+    @property
+    def pixel_size(self) -> float:
+        """Area of a pixel, slope units squared."""
+        return self.pixel_width**2
+
+    @cached_property
+    def profile(self) -> Sensor:
+        """The line sensor whose counts are the sums of a window's counts over its rows, or over its columns.
+
+        A density summed over the other direction's length L has noise density V L. Every pixel is rounded,
+        not only the sum: the variance of the other roundings is in V.
+        """
+        side, across = self.pixel_width, self.window[0]
+        roundings = (across - 1) * side**3 / (12 * self.counts_per_density**2)
+        return Sensor(
+            kind="line",
+            pixels=self.window[1],
+            field=self.field,
+            noise_density=self.noise_density * (self.field[1] - self.field[0]) + roundings,
+            kernel=self.kernel,
+            bit_depth=self.bit_depth + (across - 1).bit_length(),
+            black_level=across * self.black_level,
+            counts_per_density=self.counts_per_density / side,
+            photoelectrons=self.photoelectrons,
+        )
+
+    @property
+    def peak_density(self) -> float:
+        """Density of a pixel at whose middle a spot rests, one over slope units squared."""
+        return (math.erf(self.pixel_width / 2 / self.kernel.sigma) / self.pixel_width) ** 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrationTable:
+    """How well the sensor's values are known, as `aolink calibrate` wrote it: standard deviations, and from what.
+
+    A standard deviation is None where its value was not measured.
+    """
+
+    black_level_sd: float | None = None
+    noise_density_sd: float | None = None
+    counts_per_density_sd: float | None = None
+    photoelectrons_sd: float | None = None
+    kernel_sigma_sd: float | None = None
+    dark_frames: int = 0
+    flat_frames: int = 0
+    still_frames: int = 0
+    sources: tuple[str, ...] = ()
+    """Kind, name and SHA-256 of each recording that was used."""
+
+
+def read_sensor(table: Table, axes: int, n_outputs: int) -> BaseSensor:
+    """The table ``[sensor]``, for a plant of ``axes`` copies with ``n_outputs`` each. Raises `RigError`."""
+    kind = table.choice("kind", ("line", "spots"))
+    sensor = _line(table, axes * n_outputs) if kind == "line" else _spots(table, axes, n_outputs)
+    if sensor.black_level >= sensor.full_scale:
+        raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
+    table.finish()
+    return sensor
+
+
+def _line(table: Table, outputs: int) -> Sensor:
+    if outputs != 1:
+        raise RigError(
+            f"sensor.kind = 'line' sees one slope, but the plant has {outputs} (plant.axes times the rows of plant.C)"
+        )
+    return Sensor(kind="line", pixels=table.integer("pixels", low=2, high=65_536), **_read_out(table))
+
+
+def _spots(table: Table, axes: int, n_outputs: int) -> SpotSensor:
+    rows, columns = table.integers("grid", 2, "rows and columns of windows", low=1, high=256)
+    height, width = table.integers("window", 2, "rows and columns of pixels", low=2, high=256)
+    if height != width:
+        raise RigError(f"sensor.window = [{height}, {width}] is not square: a window needs as many rows as columns")
+    if axes * n_outputs != 2 * rows * columns:
+        raise RigError(
+            f"sensor.grid = [{rows}, {columns}] sees {2 * rows * columns} slopes, two a spot, but the plant has"
+            f" {axes * n_outputs} (plant.axes times the rows of plant.C)"
+        )
+    if n_outputs > 1 and n_outputs % 2:
+        raise RigError(
+            f"plant.C has {n_outputs} rows: for sensor.kind = 'spots' it needs one, or two for each spot that it moves"
+        )
+    return SpotSensor(kind="spots", grid=(rows, columns), window=(height, width), **_read_out(table))
+
+
+def _read_out(table: Table) -> dict[str, Any]:
+    """The fields of `BaseSensor`."""
+    field = table.vector("field", 2, "lower and upper edge")
+    if field[0] >= field[1]:
+        raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
+    kernel_table = table.table("kernel")
+    kernel = Kernel(shape=kernel_table.choice("shape", ("gaussian",)), sigma=kernel_table.number("sigma", above=0.0))
+    kernel_table.finish()
+    return {
+        "field": (float(field[0]), float(field[1])),
+        "noise_density": table.number("noise_density", low=0.0),
+        "kernel": kernel,
+        "bit_depth": table.integer("bit_depth", 16, low=1, high=16),
+        "black_level": table.number("black_level", 0.0, low=0.0),
+        "counts_per_density": table.number("counts_per_density", above=0.0),
+        "photoelectrons": table.number("photoelectrons", 0.0, low=0.0),
+    }
+
+
+def read_calibration(table: Table) -> CalibrationTable:
+    """The table ``[calibration]``. Raises `RigError`."""
+    calibration = CalibrationTable(
+        black_level_sd=table.optional_number("black_level_sd", low=0.0),
+        noise_density_sd=table.optional_number("noise_density_sd", low=0.0),
+        counts_per_density_sd=table.optional_number("counts_per_density_sd", low=0.0),
+        photoelectrons_sd=table.optional_number("photoelectrons_sd", low=0.0),
+        kernel_sigma_sd=table.optional_number("kernel_sigma_sd", low=0.0),
+        dark_frames=table.integer("dark_frames", 0, low=0),
+        flat_frames=table.integer("flat_frames", 0, low=0),
+        still_frames=table.integer("still_frames", 0, low=0),
+        sources=table.texts("sources"),
+    )
+    table.finish()
+    return calibration
