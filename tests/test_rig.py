@@ -116,6 +116,41 @@ def test_what_is_wrong_is_named(old: str, new: str, message: str) -> None:
     assert "\n" not in str(caught.value)
 
 
+SPOTS = load_rig("sh-4x4").toml
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("axes = 32", "axes = 16", r"sensor.grid = \[4, 4\] sees 32 slopes, two a spot, but the plant has 16 "),
+        ("grid = [4, 4]", "grid = [4]", "sensor.grid: expected 2 whole numbers from 1 to 256 .rows and columns of w"),
+        ("grid = [4, 4]", "grid = [4, 0]", r"sensor.grid: expected 2 whole numbers .* found \[4, 0\]"),
+        ("grid = [4, 4]", "grid = 16", "sensor.grid: expected 2 whole numbers .* found 16"),
+        ("grid = [4, 4]", "grid = [4, 4.0]", "sensor.grid: expected 2 whole numbers"),
+        ("grid = [4, 4] ", "", "sensor.grid is missing"),
+        ("window = [24, 24]", "window = [24, 16]", r"sensor.window = \[24, 16\] is not square"),
+        ("window = [24, 24]", "window = [24, 24]\npixels = 24", "sensor.pixels is not a key that aolink knows; known"),
+        ("C = [[1.0, 0.0]]", "C = [[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]", "sees 32 slopes, .* but the plant has 96"),
+        ("field = [-1.0, 1.0]", "field = [1.0, -1.0]", "the lower edge must be below the upper one"),
+        ("black_level = 500", "black_level = 4095", "sensor.black_level = 4095 is not below the full scale, 4095"),
+        ('kind = "spots"', 'kind = "line"', "sensor.kind = 'line' sees one slope, but the plant has 32"),
+    ],
+)
+def test_what_is_wrong_with_a_sensor_of_spots_is_named(old: str, new: str, message: str) -> None:
+    assert SPOTS.count(old) == 1, old
+    with pytest.raises(RigError, match=message) as caught:
+        parse_rig(SPOTS.replace(old, new))
+    assert "\n" not in str(caught.value)
+
+
+def test_copies_of_a_plant_move_whole_spots_or_single_slopes() -> None:
+    three = SPOTS.replace("grid = [4, 4]", "grid = [1, 3]").replace("C = [[1.0, 0.0]]", "C = [[1, 0], [0, 1], [1, 1]]")
+    with pytest.raises(RigError, match=r"plant\.C has 3 rows: for sensor.kind = 'spots' it needs one, or two for each"):
+        parse_rig(three.replace("axes = 32", "axes = 2"))
+    two = three.replace("C = [[1, 0], [0, 1], [1, 1]]", "C = [[1, 0], [0, 1]]").replace("axes = 32", "axes = 3")
+    assert parse_rig(two).sensor.shape == (24, 72)
+
+
 @given(st.text())
 def test_any_text_is_a_rig_or_one_error(text: str) -> None:
     with pytest.raises(RigError):

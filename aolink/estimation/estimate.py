@@ -23,7 +23,7 @@ class Status(enum.IntEnum):
     REINITIALISED = 3
     """The filter started again from the plant's prior."""
     INPUT_INVALID = 4
-    """The exposure could not be used; the reason says why. The estimate is a prediction."""
+    """The exposure, or what it shows of some axes, could not be used; the reason says why. These are predicted."""
     PREDICTED = 5
     """The estimator does not look at the camera (`open-loop`)."""
 
@@ -64,4 +64,7 @@ class Estimate:
     innovation_covariance: FloatArray
     """(axes, n_measurements, n_measurements)"""
     nis: FloatArray
-    """Normalised innovation squared, chi-square with n_measurements degrees of freedom if all is well, (axes,)."""
+    """Normalised innovation squared, (axes,); zero for an axis of which nothing was measured.
+
+    Chi-square with n_measurements degrees of freedom if all is well.
+    """

@@ -66,7 +66,7 @@ def score(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: in
         start_nees.append(_normalised(at_start, estimate.start_covariance))
         end_nees.append(_normalised(at_end, estimate.end_covariance))
         if estimate.innovation.shape[1]:
-            seen = estimate.innovation_covariance.any(axis=(1, 2))  # zero where nothing was measured of an axis
+            seen = estimate.nis > 0  # nothing was measured of the other axes
             nis.append(estimate.nis[seen])
             dimensions.append(estimate.innovation.shape[1] * int(seen.sum()))
     n_states = start[0].shape[1] if start else 0
@@ -93,8 +93,8 @@ def _normalised(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _consistency(values: Sequence[FloatArray], degrees: int) -> Consistency:
-    if not values:
-        return Consistency(mean=math.nan, low=math.nan, high=math.nan)
     samples = sum(len(v) for v in values)
+    if not samples:
+        return Consistency(mean=math.nan, low=math.nan, high=math.nan)
     low, high = (2 * float(special.gammaincinv(degrees / 2, p)) / samples for p in (0.025, 0.975))
     return Consistency(mean=float(np.concatenate(values).mean()), low=low, high=high)

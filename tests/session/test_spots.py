@@ -1,0 +1,109 @@
+"""Sessions of two-dimensional frames: two processes, frames and truths in many chunks, damage among them."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import aolink
+from aolink.demo import simulated_rig
+from aolink.estimation.estimate import Status
+from aolink.estimation.score import score
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, reestimate
+from aolink.rig import load_rig
+from aolink.session import record
+from tests.conftest import Session
+from tests.session.test_session import FAULTY
+
+ESTIMATORS = ("open-loop", "o1", "o2", "o3", "moments")
+EXPOSURES = 12
+
+
+@pytest.fixture(scope="module", params=["single-lenslet", "sh-4x4"])
+def spots(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Session:
+    path = tmp_path_factory.mktemp("spots") / "session.mcap"
+    with simulated_rig(request.param) as (camera, mirror):
+        report = record(
+            load_rig(request.param), camera, mirror, path, estimators=ESTIMATORS, exposures=EXPOSURES
+        )  # fmt: skip
+    return Session(path, report)
+
+
+def test_every_frame_survives_the_wire_as_the_model_made_it(spots: Session) -> None:
+    report, recording = spots.report, Recording(spots.path)
+    assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
+    assert report.frames_lost == report.frames_incomplete == report.packets_missing == report.blocks_retransmitted == 0
+    simulated = aolink.simulate(recording.rig, EXPOSURES)
+    for ours, theirs in zip(recording.exposures(), simulated, strict=True):
+        assert ours.pixels.shape == recording.rig.sensor.shape
+        assert np.array_equal(ours.pixels, theirs.pixels)
+        assert np.array_equal(ours.inputs, theirs.inputs)
+        assert ours.complete
+        assert ours.truth is not None
+        assert theirs.truth is not None
+        assert np.array_equal(ours.truth.path, theirs.truth.path)
+        assert ours.truth.path.shape == (recording.rig.n_outputs, 200)
+
+
+def test_online_and_offline_estimates_agree_bit_for_bit(spots: Session) -> None:
+    recording = Recording(spots.path)
+    for name, again in reestimate(recording, ESTIMATORS).items():
+        assert first_difference(recording.estimates(name), again) is None
+
+
+def test_looking_at_the_frames_is_better_than_not_looking(spots: Session) -> None:
+    recording = Recording(spots.path)
+    exposures = list(recording.exposures())
+    rmse = {name: score(exposures, recording.estimates(name), skip=2).path_rmse for name in ESTIMATORS}
+    assert rmse["o1"] < 0.7 * rmse["open-loop"]
+    assert rmse["o3"] < 0.7 * rmse["open-loop"]
+    assert rmse["moments"] < 0.5 * rmse["o3"]
+
+
+def test_over_a_bad_link_frames_come_in_part_and_the_rest_of_them_is_used(tmp_path: Path) -> None:
+    rig_file, path = tmp_path / "faulty.toml", tmp_path / "a.mcap"
+    rig_file.write_text(load_rig("sh-4x4").toml + FAULTY)
+    with simulated_rig(rig_file) as (camera, mirror):
+        report = record(load_rig(rig_file), camera, mirror, path, estimators=["o3", "moments"], exposures=20)
+    assert report.ended == "complete"
+    assert report.frames_incomplete > 0
+    recording = Recording(path)
+    whole = {e.first_step: e for e in aolink.simulate(recording.rig, 20)}
+    exposures, estimates = list(recording.exposures()), recording.estimates("o3")
+    for exposure, estimate in zip(exposures, estimates, strict=True):
+        truth = whole[exposure.first_step]
+        assert np.array_equal(exposure.pixels[exposure.mask], truth.pixels[exposure.mask])
+        assert np.isfinite(estimate.path).all()
+        if not exposure.complete:
+            assert exposure.chunks_lost
+            assert estimate.status is Status.INPUT_INVALID
+            assert "of 32 axes predicted" in estimate.reason
+            # Fewer than all: the windows that came whole were used.
+            assert 0 < np.count_nonzero(estimate.nis) < 32
+    for name in ("o3", "moments"):
+        assert first_difference(recording.estimates(name), reestimate(recording, [name])[name]) is None
+
+
+def test_the_demo_works(aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path) -> None:
+    result = aolink("demo", "--rig", "single-lenslet", "--exposures", "8", "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "agree bit for bit" in result.stdout
+
+
+def test_calibrating_it_is_refused(
+    aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:  # fmt: skip
+    with simulated_rig("single-lenslet") as (camera, mirror):
+        dark = aolink(
+            "record", "--camera", camera, "--mirror", mirror, "--rig", "single-lenslet", "--exposures", "2",
+            "--calibration", "dark", "-o", "dark.mcap",
+        )  # fmt: skip
+    assert dark.returncode == 0, dark.stderr
+    result = aolink("calibrate", "dark.mcap", "--rig", "single-lenslet", "-o", "x.toml")
+    assert result.returncode == 8
+    assert "single-lenslet has no line sensor, and only that can be calibrated" in result.stderr

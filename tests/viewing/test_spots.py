@@ -1,0 +1,92 @@
+"""What is shown of two-dimensional frames, read back from the file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aolink.estimation import run
+from aolink.estimation.estimate import Estimate
+from aolink.exposure import Exposure
+from aolink.rig import Rig, load_rig
+from aolink.simulation.model import simulate
+from aolink.viewing import save_rrd
+from tests.viewing.rrd import read_rrd
+from tests.viewing.test_save import absent_from_views
+
+N = 4
+NAMES = ["o1", "open-loop"]
+
+
+@dataclass
+class Simulated:
+    """What `aolink.recording.reader.Recording` offers, of a rig that no device was part of."""
+
+    rig: Rig
+    estimators: list[str] = field(default_factory=lambda: NAMES)
+    path: Path = Path("session.mcap")
+    metadata: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._exposures = simulate(self.rig, N)
+        self._estimates = run(self.rig, self._exposures, self.estimators)
+
+    def exposures(self) -> list[Exposure]:
+        return self._exposures
+
+    def estimates(self, name: str) -> list[Estimate]:
+        return self._estimates[name]
+
+    def messages(self, *topics: str) -> list[Any]:
+        return []
+
+
+@pytest.fixture(scope="module")
+def recording() -> Simulated:
+    return Simulated(load_rig("sh-4x4"))
+
+
+@pytest.fixture(scope="module")
+def saved(recording: Simulated, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_rrd(recording, tmp_path_factory.mktemp("rrd") / "spots.rrd")  # type: ignore[arg-type]
+
+
+def test_paths_of_all_spots_lie_in_their_blur(recording: Simulated, saved: Path) -> None:
+    """Where the light of a window is, there the true path is: their means agree within a fraction of a pixel."""
+    strips = read_rrd(saved)["/camera/image/path/truth"]["LineStrips2D:strips"]
+    sensor = recording.rig.sensor
+    assert [len(each) for each in strips] == [16] * N
+    for exposure, paths in zip(recording.exposures(), strips, strict=True):
+        light = np.maximum(exposure.pixels - sensor.black_level - 300.0, 0)  # above the noise
+        for spot, (row, column) in enumerate(np.ndindex(4, 4)):
+            window = light[24 * row : 24 * row + 24, 24 * column : 24 * column + 24]
+            y, x = (np.indices(window.shape) * window).sum(axis=(1, 2)) / window.sum() + 0.5
+            np.testing.assert_allclose(np.mean(paths[spot], axis=0), [x + 24 * column, y + 24 * row], atol=0.7)
+
+
+def test_frames_are_whole_and_every_estimator_has_its_paths(recording: Simulated, saved: Path) -> None:
+    entities = read_rrd(saved)
+    buffers = entities["/camera/image"]["Image:buffer"]
+    for exposure, (buffer,) in zip(recording.exposures(), buffers, strict=True):
+        assert np.array_equal(np.array(buffer, dtype=np.uint8).view("<u2").reshape(96, 96), exposure.pixels)
+    for name in NAMES:
+        assert len(entities[f"/camera/image/path/{name}"]["LineStrips2D:strips"]) == N
+
+
+def test_the_profile_is_that_of_the_first_spot_along_x(recording: Simulated, saved: Path) -> None:
+    (strip,) = read_rrd(saved)["/profile/measured"]["LineStrips2D:strips"][0]
+    assert len(strip) == 2 * 24
+    line = recording.rig.sensor.profile
+    counts = recording.exposures()[0].pixels[:24, :24].sum(axis=0, dtype=np.int64)
+    density = (counts - line.black_level) / line.counts_per_density
+    drawn = -np.array(strip)[::2, 1]
+    np.testing.assert_allclose(drawn / drawn.max(), density / density.max(), atol=1e-6)
+
+
+def test_no_view_is_empty(saved: Path) -> None:
+    missing = [each for each in absent_from_views(saved) if not each.startswith(("/link", "/mirror"))]
+    assert missing == []
