@@ -6,7 +6,7 @@ Everything here follows from x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -280,7 +280,7 @@ def _check_observability(rig: Rig) -> list[Finding]:
 
 def _check_field(rig: Rig) -> list[Finding]:
     """Whether the spot stays on the sensor, as it should go and with three standard deviations around that."""
-    path, sd = nominal_path(rig)
+    path, sd = nominal_path(_different_copies(rig))
     low, high = rig.sensor.field
     least, most = float(path.min()), float(path.max())
     key = "drive.amplitude" if rig.drive.kind == "sine" else "drive.offset"
@@ -298,6 +298,15 @@ def _check_field(rig: Rig) -> list[Finding]:
         )
         return [Finding(severity="warning", key="sensor.field", message=message)]
     return []
+
+
+def _different_copies(rig: Rig) -> Rig:
+    """The rig with one of all copies of the plant that its drive moves alike: thousands of axes take no longer."""
+    plant, drive = rig.plant, rig.drive
+    each = np.stack([drive.amplitude, drive.offset]).reshape(2, plant.axes, plant.n_inputs).transpose(1, 0, 2)
+    different = np.unique(each, axis=0)
+    drive = replace(drive, amplitude=different[:, 0].ravel(), offset=different[:, 1].ravel())
+    return replace(rig, plant=replace(plant, axes=len(different)), drive=drive)
 
 
 def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:

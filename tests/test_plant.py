@@ -218,3 +218,13 @@ def test_a_random_walk_is_a_plant_like_any_other():
         initial_mean=np.zeros(1), initial_covariance=np.eye(1) * 1e-4,
     )  # fmt: skip
     assert "error" not in {f.severity for f in check_rig(rig)}
+
+
+def test_the_check_of_many_copies_finds_the_one_that_goes_too_far() -> None:
+    rig = load_rig("sh-4x4")
+    amplitude = rig.drive.amplitude.copy()
+    assert not any(f.severity == "error" for f in check_rig(rig))
+    amplitude[17] = 0.03
+    drive = dataclasses.replace(rig.drive, amplitude=amplitude)
+    findings = check_rig(dataclasses.replace(rig, drive=drive))
+    assert [f.key for f in findings if f.severity == "error"] == ["drive.amplitude"]
