@@ -61,8 +61,6 @@ class Options:
     """Of `moments`: which functions of the basis; 0 is the light in the window."""
     basis: Basis = "monomial"
     """Of `moments`: "monomial", "legendre" or "fourier"."""
-    shot_gain: float = 0.0
-    """Of `moments`: variance of a pixel's density by shot noise, for each unit of density."""
 
 
 class Estimator:
@@ -236,15 +234,18 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
         gain = _steady_gain(rig, options) if name == "o1" and options.gain == "steady-state" else None
         engine = FilterpyMoments if options.engine == "filterpy" else PathMoments
         return engine(rig.plant.n_outputs, _PAPER_ORDERS[name], gain)
-    return WindowedMoments(
-        rig.sensor, options.orders, basis=options.basis, flux=options.flux, shot_gain=options.shot_gain
-    )
+    return WindowedMoments(rig.sensor, options.orders, basis=options.basis, flux=options.flux)
 
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file; None where there is none."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps)
-    noise = known_flux_covariance(effective_noise_density(rig.sensor), noise_integrals(rig.sensor, 2), [1])
+    sensor, plant = rig.sensor, rig.plant
+    noise = known_flux_covariance(effective_noise_density(sensor), noise_integrals(sensor, 2), [1])
+    if sensor.photoelectrons:
+        # y_2 / photoelectrons, of a spot where the plant's prior has it.
+        spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
+        noise = noise + np.diag(spread + sensor.kernel.variance) / sensor.photoelectrons
     return steady_gain(model, added_noise(model, options.process_noise), noise)
 
 
