@@ -62,8 +62,6 @@ class Options:
     """Of `moments`: which functions of the basis; 0 is the light in the window."""
     basis: Basis = "monomial"
     """Of `moments`: "monomial", "legendre" or "fourier"."""
-    shot_gain: float = 0.0
-    """Of `moments`: variance of a pixel's density by shot noise, for each unit of density."""
 
 
 class Estimator:
@@ -249,19 +247,22 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
             f"{name} looks at one output of each copy of the plant, {rig.name} has {rig.plant.n_outputs}: use"
             f" {', '.join(_PAPER_ORDERS)}"
         )
-    return WindowedMoments(
-        rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux, shot_gain=options.shot_gain
-    )
+    return WindowedMoments(rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux)
 
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file; None where there is none."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps)
-    if isinstance(rig.sensor, SpotSensor):
-        noise = centroid_noise(rig.sensor, rig.plant.n_outputs)
+    sensor, plant = rig.sensor, rig.plant
+    if isinstance(sensor, SpotSensor):
+        noise = centroid_noise(sensor, plant.n_outputs)
     else:
-        line = rig.sensor.profile
+        line = sensor.profile
         noise = known_flux_covariance(effective_noise_density(line), noise_integrals(line, 2), [1])
+    if sensor.photoelectrons:
+        # y_2 / photoelectrons, of a spot where the plant's prior has it.
+        spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
+        noise = noise + np.diag(spread + sensor.kernel.variance) / sensor.photoelectrons
     return steady_gain(model, added_noise(model, options.process_noise), noise)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation import stacked
+from aolink.estimation import entries, stacked
 from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
 from aolink.estimation.observation import Belief, Correction, Observation
@@ -25,6 +26,8 @@ Predict = Callable[[Belief, FloatArray, FloatArray, FloatArray], Belief]
 # process noise inside an exposure out, and have every right to innovations larger than they expect.
 _GATE_PROBABILITY = 1e-9
 _PATIENCE = 3
+# Relative change of a covariance that is rounding.
+_SETTLED = 1e-13
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,6 +87,8 @@ class BlurFilter:
         self.belief = prior
         # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
         self._unseen = Belief(prior.mean, prior.covariance[:1])
+        # The transition that no longer changes it.
+        self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
         self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
@@ -94,7 +99,7 @@ class BlurFilter:
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
             self.belief = self._predict(self.belief, transition, noise, kick)
-            self._unseen = predicted(self._unseen, transition, noise, kick)
+            self._predict_unseen(transition, noise, kick)
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
         """One exposure, with what the observation takes of it, or without."""
@@ -117,7 +122,7 @@ class BlurFilter:
         else:
             noise = added_noise(model, self._process_noise)
             self.belief = self._predict(coefficients, model.transition, noise, response.end)
-        self._unseen = predicted(self._unseen, model.transition, model.process_noise, response.end)
+        self._predict_unseen(model.transition, model.process_noise, response.end)
         return Posterior(
             coefficients=coefficients,
             end=self.belief,
@@ -127,28 +132,57 @@ class BlurFilter:
             nis=_numbers(done.nis),
         )
 
+    def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
+        """Carry on what would be believed without a camera; a covariance that has settled is not computed again."""
+        before = self._unseen
+        if transition is self._settled_under:
+            self._unseen = Belief(_predicted_mean(before.mean, transition, kick), before.covariance)
+            return
+        self._unseen = after = predicted(before, transition, noise, kick)
+        change = np.abs(after.covariance - before.covariance).max()
+        settled = change <= _SETTLED * np.abs(before.covariance).max()
+        self._settled_under = transition if settled else None
+
     def _trusted(
         self, prior: Belief, done: Correction, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
     ) -> tuple[Belief, NDArray[np.int64]]:
         """The correction where there is one that can be believed, the prior elsewhere; and the status of each axis."""
         after, missed = done.posterior, self._missed
         used = done.nis <= self._gate
-        if not (np.isfinite(after.mean).all() and np.isfinite(after.covariance).all()):
+        # Sums are finite where all is; those that overflow are looked at again, axis by axis.
+        if not (_has_finite_sum(after.mean) and _has_finite_sum(after.covariance)):
             used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
+        if usable is None and used.all() and not self._missed.any():
+            return after, np.full(len(used), int(Status.OK), dtype=np.int64)
+        refused = ~used
         self._missed = np.where(used, 0, np.where(lost, 1, self._missed + 1))
-        status = np.where(used, np.where(lost, Status.REINITIALISED, Status.OK), Status.GATED)
-        status = np.where(~used & (self._missed >= _PATIENCE), Status.DIVERGED, status)
+        status = np.full(len(used), int(Status.OK), dtype=np.int64)
+        status[lost & used] = Status.REINITIALISED
+        status[refused] = Status.GATED
+        status[refused & (self._missed >= _PATIENCE)] = Status.DIVERGED
         if usable is not None:
-            used &= usable
-            status = np.where(usable, status, Status.INPUT_INVALID)
+            refused |= ~usable
+            status[~usable] = Status.INPUT_INVALID
             self._missed = np.where(usable, self._missed, missed)
-        return _where(used, after, prior), status
+        return _where(refused, prior, after), status
 
 
 def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
     """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
-    mean = stacked.matvec(transition, belief.mean) + kick
-    return Belief(mean, stacked.symmetric(stacked.congruence(transition, belief.covariance) + noise))
+    mean = _predicted_mean(belief.mean, transition, kick)
+    if max(transition.shape) > entries.MOST_ROWS:
+        return Belief(mean, stacked.symmetric(stacked.congruence(transition, belief.covariance) + noise))
+    P, Q = entries.unpack(belief.covariance), entries.unpack(noise)
+    covariance = entries.congruence(entries.unpack(transition), P, Q)
+    return Belief(mean, entries.pack(covariance, len(belief.covariance)))
+
+
+def _predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:
+    """x -> A x + d"""
+    if max(transition.shape) > entries.MOST_ROWS:
+        return stacked.matvec(transition, mean) + kick
+    moved = entries.times_vector(entries.unpack(transition), entries.columns(mean))
+    return entries.pack_vector(entries.add(moved, entries.columns(kick)), len(mean))
 
 
 def _without(done: Correction, usable: NDArray[np.bool_] | None) -> Correction:
@@ -170,14 +204,19 @@ def _with_noise(state: Belief, count: int) -> Belief:
 
 def _numbers(values: FloatArray) -> FloatArray:
     """Zero for what is not a number, the largest one for what is too large."""
-    return values if np.isfinite(values).all() else np.nan_to_num(values)
+    return values if _has_finite_sum(values) else np.nan_to_num(values)
+
+
+def _has_finite_sum(values: FloatArray) -> bool:
+    return math.isfinite(np.add.reduce(values, axis=None))
 
 
 def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
     """Axis by axis, the first belief where chosen."""
-    if not chosen.any():
+    which = np.flatnonzero(chosen)
+    if not len(which):
         return second
     mean, covariance = second.mean.copy("K"), second.covariance.copy("K")
-    np.copyto(mean, first.mean, where=chosen[:, None])
-    np.copyto(covariance, first.covariance, where=chosen[:, None, None])
+    mean[which] = first.mean[which]
+    covariance[which] = first.covariance[which] if len(first.covariance) > 1 else first.covariance[0]
     return Belief(mean, covariance)

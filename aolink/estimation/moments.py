@@ -8,7 +8,7 @@ that E[y_p] = mean(theta^p). Mishra & Wen (7) to (11).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.estimation import stacked
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import kernel_moments
 from aolink.rig import Sensor
@@ -52,7 +53,7 @@ def raw_moments(sensor: Sensor, counts: NDArray[np.uint16], highest: int) -> Flo
     about_centre: FloatArray = sums * (half ** np.arange(highest + 1) * sensor.pixel_width / sensor.counts_per_density)
     if centre == 0:
         return about_centre
-    return _recombine(about_centre, _shift(centre, highest))
+    return recombine(about_centre, shift_matrix(centre, highest))
 
 
 def noise_integrals(sensor: Sensor, highest: int) -> FloatArray:
@@ -76,15 +77,17 @@ def measured_flux_covariance(
 
     Parameters
     ----------
+    integrals:
+        I(n) from n = 0, (n,), or of each axis, (axes, n).
     ratios:
         y_p, kernel included, (axes, orders).
     total:
         M_0, (axes,).
     """
     p = np.asarray(orders)
-    y, first = ratios, integrals[p]
-    spread = integrals[p[:, None] + p] - y[:, :, None] * first - first[:, None] * y[:, None, :]
-    spread = spread + y[:, :, None] * y[:, None, :] * integrals[0]
+    y, first = ratios, integrals[..., p]
+    spread = integrals[..., p[:, None] + p] - y[:, :, None] * first[..., None, :] - first[..., :, None] * y[:, None, :]
+    spread = spread + y[:, :, None] * y[:, None, :] * integrals[..., 0, None, None]
     return np.asarray(noise_density * spread / total[:, None, None] ** 2)
 
 
@@ -118,26 +121,87 @@ def measure_moments(
     -------
     The moments, or why there are none.
     """
-    highest, p = max(orders), list(orders)
-    total_noise, integrals = effective_noise_density(sensor), noise_integrals(sensor, 2 * max(orders))
-    everything = range(highest + 1)
-    raw = raw_moments(sensor, counts, highest)
+    highest = max(orders)
+    noise = effective_noise_density(sensor) * noise_integrals(sensor, 2 * highest)
+    if sensor.photoelectrons:
+        noise = with_shot_noise(noise, counts, sensor.black_level, lambda light: _shot_sums(sensor, light, 2 * highest))
+    return moments_from_sums(raw_moments(sensor, counts, highest), noise, _unmixing(sensor, highest), orders, flux)
+
+
+def with_shot_noise(
+    read: FloatArray, counts: NDArray[np.uint16], black_level: float, sums: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Cov(M_p, M_q) by p + q with shot noise of the light as measured, (axes, 2 highest + 1).
+
+    Shot noise adds y_(p+q) / photoelectrons.
+
+    Parameters
+    ----------
+    read:
+        The same by read-out alone, (2 highest + 1,).
+    sums:
+        From counts above the black level, (axes, pixels), what shot noise adds.
+    """
+    light = counts.astype(np.float64) - black_level
+    noise = read + sums(light)
+    # Where noise makes the light so negative that this is no covariance, light is what is above the black level.
+    poor = ~_is_covariance(noise)
+    if poor.any():
+        noise[poor] = read + sums(np.maximum(light[poor], 0.0))
+    return noise
+
+
+def _is_covariance(noise: FloatArray) -> NDArray[np.bool_]:
+    """Whether the matrices with entries noise[p + q] are positive definite, (axes, 2 highest + 1) -> (axes,)."""
+    size = noise.shape[1] // 2 + 1
+    left = [[noise[:, p + q] for q in range(size)] for p in range(size)]
+    good = np.ones(len(noise), dtype=bool)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for k in range(size):
+            good &= left[k][k] > 0
+            for p in range(k + 1, size):
+                for q in range(k + 1, size):
+                    left[p][q] = left[p][q] - left[p][k] * left[k][q] / left[k][k]
+    return good
+
+
+def _shot_sums(sensor: Sensor, light: FloatArray, highest: int) -> FloatArray:
+    powers = sensor.centres[:, None] ** np.arange(highest + 1)
+    scale = sensor.pixel_width / (sensor.counts_per_density * sensor.photoelectrons)
+    # Row by row: the bits of one product would depend on the number of rows.
+    return np.stack([row @ powers for row in light]) * scale
+
+
+def moments_from_sums(
+    raw: FloatArray, noise: FloatArray, unmix: FloatArray, orders: Sequence[int], flux: Flux
+) -> Measurement | str:
+    """Moments without the kernel from those with it.
+
+    Parameters
+    ----------
+    raw:
+        M_0 and on, (axes, highest + 1).
+    noise:
+        Cov(M_p, M_q) by p + q, (2 highest + 1,) or (axes, 2 highest + 1).
+    unmix:
+        As of `without_kernel`, (highest + 1, highest + 1).
+    """
+    everything = np.arange(raw.shape[1])
     if flux == "measured":
-        total = raw[:, 0].copy()
-        sd = math.sqrt(total_noise * integrals[0])
+        total, sd = raw[:, 0].copy(), np.sqrt(noise[..., 0])
         if (total < LEAST_FLUX * sd).any():
-            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd:.3g}"
+            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd.max():.3g}"
         raw = raw / total[:, None]
-        covariance = measured_flux_covariance(total_noise, integrals, everything, raw, total)
+        covariance = measured_flux_covariance(1.0, noise, list(everything), raw, total)
     else:
+        raw = raw.copy()
         raw[:, 0] = 1.0
-        covariance = np.array([known_flux_covariance(total_noise, integrals, everything)])
-        covariance[:, 0] = covariance[:, :, 0] = 0.0
-    unmix = _unmixing(sensor, highest)[p]
-    covariance = unmix @ covariance @ unmix.T
+        covariance = np.array(noise[..., everything[:, None] + everything])
+        covariance[..., 0, :] = covariance[..., :, 0] = 0.0
+    unmix = unmix[list(orders)]
+    covariance = stacked.congruence(unmix, covariance if covariance.ndim == 3 else covariance[None])
     return Measurement(
-        value=_recombine(raw, unmix),
-        covariance=np.broadcast_to(covariance, (len(counts), *covariance.shape[1:])),
+        value=recombine(raw, unmix), covariance=np.broadcast_to(covariance, (len(raw), *covariance.shape[1:]))
     )
 
 
@@ -154,7 +218,7 @@ def _unmixing(sensor: Sensor, highest: int) -> FloatArray:
     return without_kernel(kernel_moments(sensor.kernel, sensor.pixel_width, highest), highest)
 
 
-def _shift(centre: float, highest: int) -> FloatArray:
+def shift_matrix(centre: float, highest: int) -> FloatArray:
     """Moments about ``centre`` to moments about zero, (highest + 1, highest + 1)."""
     matrix = np.zeros((highest + 1, highest + 1))
     for p in range(highest + 1):
@@ -163,6 +227,6 @@ def _shift(centre: float, highest: int) -> FloatArray:
     return matrix
 
 
-def _recombine(moments: FloatArray, matrix: FloatArray) -> FloatArray:
+def recombine(moments: FloatArray, matrix: FloatArray) -> FloatArray:
     """matrix @ moments for each axis, in elementwise operations."""
     return np.stack([sum(row[k] * moments[:, k] for k in range(len(row))) for row in matrix], axis=1)

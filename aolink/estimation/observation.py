@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from aolink.estimation import stacked
+from aolink.estimation import entries, stacked
+from aolink.estimation.entries import Entry
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.moments import Measurement
 
@@ -83,8 +84,13 @@ class PathMoments:
         self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
     ) -> Correction:
         """One step of the (extended) Kalman filter."""
-        h, H = predicted_moments(model, response, prior.mean, self.orders, crosses=self.crosses)
-        return corrected(prior, measured.value - h, H, measured.covariance, self.gain)
+        h, H = _moment_entries(model, response, prior.mean, self.orders, crosses=self.crosses)
+        axes = len(prior.mean)
+        if max(len(H), model.plant.n_states) > entries.MOST_ROWS:
+            innovation = measured.value - entries.pack_vector(h, axes)
+            return corrected(prior, innovation, entries.pack(H, axes), measured.covariance, self.gain)
+        innovations = [y - expected for y, expected in zip(entries.columns(measured.value), h, strict=True)]
+        return _corrected_small(prior, innovations, H, measured.covariance, self.gain)
 
 
 def predicted_moments(
@@ -106,26 +112,42 @@ def predicted_moments(
     -------
     h (axes, m) and H (axes, m, n_states); an output's orders are together, cross moments come last.
     """
-    moments, slopes = [], []
+    h, H = _moment_entries(model, response, state, orders, crosses=crosses)
+    return entries.pack_vector(h, len(state)), entries.pack(H, len(state))
+
+
+def _moment_entries(
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int], *, crosses: bool = False
+) -> tuple[list[Entry], entries.Matrix]:
+    """`predicted_moments`, entry by entry."""
+    x = entries.columns(state)
+    moments: list[Entry] = []
+    slopes: entries.Matrix = []
     for o in range(model.plant.n_outputs):
         if 1 in orders:
-            moments.append(stacked.dot(state, model.mean_row[o]) + response.mean[:, o])
-            slopes.append(np.broadcast_to(model.mean_row[o], state.shape))
+            mean_row = model.mean_row[o].tolist()
+            moments.append(entries.dot(mean_row, x) + response.mean[:, o])
+            slopes.append(mean_row)
         if 2 in orders:
-            half = stacked.matvec(model.quadratic[o], state) + response.slope[:, o]
-            moments.append(stacked.dot(state, half + response.slope[:, o]) + response.square[:, o])
-            slopes.append(2 * half)
+            slope = entries.columns(response.slope[:, o])
+            half = entries.add(_times_state(model.quadratic[o], state), slope)
+            moments.append(entries.dot(x, entries.add(half, slope)) + response.square[:, o])
+            slopes.append([2 * each for each in half])
     for o, p in itertools.combinations(range(model.plant.n_outputs), 2) if crosses else ():
         # mean (a'x + c)(b'x + d) = x'M_ab x + (b_ad + b_bc)'x + s_cd
-        mixed = stacked.matvec(model.cross_quadratic(o, p), state)
-        slope, square = model.cross_response(response, o, p)
-        moments.append(stacked.dot(state, mixed + slope) + square)
-        slopes.append(2 * mixed + slope)
-    h = np.empty((len(moments), len(state)))
-    H = np.empty((len(moments), model.plant.n_states, len(state)))
-    for m, (moment, slope) in enumerate(zip(moments, slopes, strict=True)):
-        h[m], H[m] = moment, slope.T
-    return h.T, np.moveaxis(H, -1, 0)
+        mixed = _times_state(model.cross_quadratic(o, p), state)
+        both, square = model.cross_response(response, o, p)
+        slope = entries.columns(both)
+        moments.append(entries.dot(x, entries.add(mixed, slope)) + square)
+        slopes.append([2 * a + b for a, b in zip(mixed, slope, strict=True)])
+    return moments, slopes
+
+
+def _times_state(matrix: FloatArray, state: FloatArray) -> list[Entry]:
+    """A matrix (n, n) times states (axes, n)."""
+    if len(matrix) > entries.MOST_ROWS:
+        return entries.columns(stacked.matvec(matrix, state))
+    return entries.times_vector(entries.unpack(matrix), entries.columns(state))
 
 
 def corrected(
@@ -146,6 +168,24 @@ def corrected(
     covariance = stacked.symmetric(stacked.congruence(keep, prior.covariance) + stacked.congruence(K, R))
     nis = stacked.dot(innovation, stacked.matvec(S_inverse, innovation))
     return Correction(Belief(mean, covariance), innovation, S, nis)
+
+
+def _corrected_small(
+    prior: Belief, innovation: list[Entry], H: entries.Matrix, R: FloatArray, gain: FloatArray | None
+) -> Correction:
+    """`corrected` for one or two states and measurements, entry by entry."""
+    axes, P, noise = len(prior.mean), entries.unpack(prior.covariance), entries.unpack(R)
+    HP = entries.times_transposed(H, P)
+    S = entries.symmetric_times_transposed(HP, H, noise)
+    S_inverse = entries.inverse(S)
+    K = entries.unpack(gain) if gain is not None else entries.times_transposed(entries.transpose(HP), S_inverse)
+    mean = entries.add(entries.columns(prior.mean), entries.times_vector(K, innovation))
+    keep = entries.one_minus(entries.times_transposed(K, entries.transpose(H)))
+    from_noise = entries.symmetric_times_transposed(entries.times_transposed(K, noise), K)
+    covariance = entries.congruence(keep, P, from_noise)
+    nis = np.asarray(entries.dot(innovation, entries.times_vector(S_inverse, innovation)))
+    after = Belief(entries.pack_vector(mean, axes), entries.pack(covariance, axes))
+    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), nis)
 
 
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:

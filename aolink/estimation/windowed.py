@@ -86,17 +86,15 @@ class WindowedMoments:
     flux:
         "known": the light of a frame sums to one; "measured": all is divided by the light in the window
         (order 0 is left out).
-    shot_gain:
-        Variance of a pixel's density by shot noise, for each unit of density.
     """
 
     models_noise = True
 
     def __init__(
         self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
-        flux: Flux = "known", shot_gain: float = 0.0,
+        flux: Flux = "known",
     ) -> None:  # fmt: skip
-        self.sensor, self.basis, self.flux, self.shot_gain = sensor, basis, flux, shot_gain
+        self.sensor, self.basis, self.flux = sensor, basis, flux
         # A ratio to the light in the window needs the light first.
         self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
         self.n_measurements = len(self.orders) - (flux == "measured")
@@ -199,8 +197,8 @@ class WindowedMoments:
         D = self.sensor.pixel_width
         y = stacked.matvec(W, density * D)
         variance = np.full_like(density, effective_noise_density(self.sensor) * D)
-        if self.shot_gain:
-            variance += self.shot_gain * D**2 * np.maximum(density, 0.0)
+        if self.sensor.photoelectrons:
+            variance += np.maximum(density, 0.0) * (D / self.sensor.photoelectrons)
         noise = stacked.matmul(W * variance[:, None], stacked.transpose(W))
         # Where a window has too few pixels for its functions, their sums hang together.
         noise += 1e-12 * np.eye(len(self.orders)) * noise.max(axis=(1, 2), keepdims=True)

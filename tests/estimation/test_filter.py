@@ -11,7 +11,7 @@ from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import exposure_model
 from aolink.estimation.filter import BlurFilter
 from aolink.estimation.moments import Measurement
-from aolink.estimation.observation import PathMoments, predicted_moments, steady_gain
+from aolink.estimation.observation import Belief, PathMoments, corrected, predicted_moments, steady_gain
 from aolink.plant import lift
 from aolink.rig import load_rig
 
@@ -313,3 +313,37 @@ def test_an_axis_does_not_depend_on_those_beside_it(orders, axes, which, mimo, w
             (few.status, many.status),
         ):
             np.testing.assert_array_equal(ours, theirs[:axes])
+
+
+def test_what_is_believed_without_a_camera_settles_and_moves_on_with_gaps():
+    """The covariance is not computed again where it no longer changes; a gap, or another exposure, changes it."""
+    cold = dataclasses.replace(PLANT, initial_covariance=np.zeros((2, 2)))
+    filter_, model = BlurFilter(cold, PathMoments(1, (1,))), exposure_model(cold, N)
+    response = model.response(np.zeros((N, 1)))
+    expected = np.zeros((2, 2))
+    for _ in range(100):
+        filter_.step(model, response, None)
+        expected = model.transition @ expected @ model.transition.T + model.process_noise
+        np.testing.assert_allclose(filter_._unseen.covariance[0], expected, rtol=1e-10, atol=1e-12)
+    filter_.bridge(np.zeros((7, 1)))
+    transition, noise = lift(cold, 7)
+    expected = transition @ expected @ transition.T + noise
+    np.testing.assert_allclose(filter_._unseen.covariance[0], expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("gain", [None, np.array([[0.3, 0.1], [2.0, -1.0]])])
+def test_written_out_it_is_the_correction_in_matrices(gain):
+    rng = np.random.default_rng(3)
+    plant = dataclasses.replace(PLANT, axes=50)
+    model = exposure_model(plant, N)
+    roots = rng.standard_normal((2, 50, 2, 2))
+    P, noise = roots @ roots.swapaxes(-1, -2)
+    prior, y = Belief(rng.standard_normal((50, 2)), P), rng.standard_normal((50, 2))
+    response = model.response(0.01 * rng.standard_normal((N, 50)))
+    ours = PathMoments(1, (1, 2), gain).correct(model, response, prior, Measurement(value=y, covariance=noise))
+    h, H = predicted_moments(model, response, prior.mean, (1, 2))
+    theirs = corrected(prior, y - h, H, noise, gain)
+    np.testing.assert_allclose(ours.posterior.mean, theirs.posterior.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, rtol=1e-7, atol=1e-11)
+    np.testing.assert_allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-9)
+    np.testing.assert_allclose(ours.nis, theirs.nis, rtol=1e-7)

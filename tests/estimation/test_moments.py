@@ -100,6 +100,33 @@ def test_ratios_scatter_as_their_covariance_says(field):
     assert abs(spread[0, 1]) > 0.05 * scale[0, 1]  # off centre or not, the two are not independent here
 
 
+@pytest.mark.parametrize("flux", ["known", "measured"])
+def test_shot_noise_is_in_the_covariance(flux):
+    """Mishra & Wen have read-out noise only; Poisson light adds y_(p+q) / photoelectrons."""
+    sensor = dataclasses.replace(SENSOR, noise_density=1e-4, photoelectrons=1000.0)
+    rng, light = np.random.default_rng(4), sensor.photoelectrons * sensor.pixel_width
+    clean = exposure_density(sensor.kernel, sensor.edges, np.linspace(0.1, 0.5, 50))
+    density = rng.poisson(clean * light, (10_000, 40)) / light + np.sqrt(1e-4 / 0.05) * rng.standard_normal(
+        (10_000, 40)
+    )
+    counts = to_counts(sensor, density)
+    measured = measure_moments(sensor, counts, (1, 2), flux)
+    spread = np.cov(measured.value.T)
+    scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
+    np.testing.assert_allclose(measured.covariance.mean(axis=0) / scale, spread / scale, atol=0.05)
+    without = measure_moments(dataclasses.replace(sensor, photoelectrons=0.0), counts, (1, 2), flux)
+    assert (without.covariance.mean(axis=0).diagonal() < 0.9 * spread.diagonal()).all()
+    np.testing.assert_array_equal(measure_moments(sensor, counts[:3], (1, 2), flux).covariance, measured.covariance[:3])
+
+
+def test_a_covariance_with_shot_noise_is_one_whatever_noise_does():
+    sensor = dataclasses.replace(SENSOR, noise_density=1e-6, photoelectrons=3.0)
+    rng = np.random.default_rng(5)
+    counts = to_counts(sensor, 0.5 * rng.standard_normal((500, 40)))
+    covariance = measure_moments(sensor, counts, (1, 2)).covariance
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
 def test_ratio_covariance_by_finite_differences():
     """First order: J V I J' with J the derivative of M_p/M_0, differenced."""
     integrals, orders = noise_integrals(dataclasses.replace(SENSOR, field=(-0.6, 1.4)), 4), (1, 2)

@@ -11,7 +11,7 @@ from aolink.estimation import Status, exposure_model, make_estimator, run, score
 from aolink.estimation.filter import BlurFilter
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import Profile, WindowedMoments, _nodes
-from aolink.optics.camera import to_counts
+from aolink.optics.camera import pixel_noise_variance, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
@@ -122,13 +122,14 @@ def test_expected_sums_are_those_of_a_noiseless_frame(basis, flux):
     assert W[0, 0, 24] == 0
 
 
-@pytest.mark.parametrize("shot_gain", [0.0, 0.05])
-def test_noise_of_the_sums_is_that_of_many_frames(shot_gain):
+@pytest.mark.parametrize("photoelectrons", [0.0, 400.0])
+def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
     path = np.linspace(0.1, 0.4, 200)
     clean = exposure_density(SENSOR.kernel, SENSOR.edges, path)
     rng = np.random.default_rng(3)
-    sd = np.sqrt(SENSOR.noise_density / SENSOR.pixel_width + shot_gain * clean)
-    observation = WindowedMoments(SENSOR, shot_gain=shot_gain)
+    sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
+    sd = np.sqrt(pixel_noise_variance(sensor, clean))
+    observation = WindowedMoments(sensor)
     W = observation.window_weights(path[None], np.full((1, 200), 0.001), np.ones((1, 40), bool))
     _, noise = observation.measured(W, clean[None], None)
     spread = np.cov((clean + sd * rng.standard_normal((20_000, 40))) @ W[0].T * SENSOR.pixel_width, rowvar=False)
@@ -260,6 +261,20 @@ def test_a_frame_without_a_spot_is_refused():
     dark = estimator.step(dataclasses.replace(exposures[1], pixels=to_counts(SENSOR, noise)))
     assert dark.status == Status.INPUT_INVALID
     assert "no spot" in dark.reason
+
+
+def test_shot_noise_by_the_rig_file_is_allowed_for():
+    """Of 300 photo-electrons there is more noise than the camera's own; without allowing for it, NEES shows it."""
+    sensor = dataclasses.replace(SENSOR, noise_density=1e-4, photoelectrons=300.0)
+    plant = dataclasses.replace(
+        RIG.plant, process_noise=np.array([[0.5]]), initial_covariance=RIG.plant.initial_covariance / 20
+    )
+    rig = dataclasses.replace(RIG, plant=plant, sensor=sensor)
+    exposures = simulate(rig, 210, seed=9)
+    told = dataclasses.replace(rig, sensor=dataclasses.replace(sensor, photoelectrons=0.0))
+    aware, unaware = (score(exposures, run(each, exposures, ["moments"])["moments"], 10) for each in (rig, told))
+    assert aware.nis.mean == pytest.approx(4.0, abs=0.6)
+    assert unaware.nis.mean > 1.3 * aware.nis.mean
 
 
 def test_orders_that_make_no_sense_are_refused():
