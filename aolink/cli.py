@@ -22,6 +22,10 @@ from aolink.rig import Rig, load_rig, parse_light
 from aolink.terminal import StopRequest, ask, input_ended, progress_bar
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from aolink.estimation import Estimate
+    from aolink.exposure import Exposure
     from aolink.recording.reader import Recording
 
 app = typer.Typer(
@@ -335,7 +339,12 @@ def estimate(
     """Estimate the motion inside each exposure of a recording, again or for the first time."""
     from aolink import tables
     from aolink.recording.reader import Recording
-    from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
+    from aolink.recording.reestimate import (
+        recorded_estimates,
+        reestimated,
+        scored_and_compared,
+        write_reestimated,
+    )
 
     recording = _open(file)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
@@ -344,15 +353,11 @@ def estimate(
         if output is not None:
             write_reestimated(recording, names, output, overwrite=overwrite, progress=lambda n: tell("estimate", n))
             written = Recording(output)
-            estimates = {name: written.estimates(name) for name in names}
+            each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
+            series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
         else:
-            estimates = reestimate(recording, names, lambda n: tell("estimate", n))
-    differences = {
-        name: first_difference(recording.estimates(name), estimates[name])
-        for name in names
-        if name in recording.estimators
-    }
-    scores = tables.score_all(recording, estimates)
+            series = reestimated(recording, names, lambda n: tell("estimate", n))
+        scores, differences = scored_and_compared(recording, series, names)
     if as_json:
         print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from rich.table import Table
 
 from aolink.calibration.rig_text import written
 from aolink.estimation import Estimate
-from aolink.estimation.score import Consistency, Score, score
+from aolink.estimation.score import Consistency, Score, Scorer
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -35,10 +35,16 @@ _LATENCY_STEPS = (
 )
 
 
-def score_all(recording: Recording, estimates: Mapping[str, Sequence[Estimate]]) -> dict[str, Score]:
-    """Score estimates against the truth in their recording, by estimator."""
-    exposures = list(recording.exposures())
-    return {name: score(exposures, values) for name, values in estimates.items()}
+def score_all(recording: Recording, estimates: Mapping[str, Iterable[Estimate]]) -> dict[str, Score]:
+    """Score estimates against the truth in their recording, by estimator; one exposure at a time is in memory."""
+    names = list(estimates)
+    if not names:
+        return {}
+    scorers = {name: Scorer() for name in names}
+    for exposure, each in zip(recording.exposures(), zip(*estimates.values(), strict=True), strict=True):
+        for name, estimate in zip(names, each, strict=True):
+            scorers[name].add(exposure, estimate)
+    return {name: scorer.result() for name, scorer in scorers.items()}
 
 
 def recording_facts(recording: Recording) -> dict[str, Any]:

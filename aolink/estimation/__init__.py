@@ -7,7 +7,7 @@ from aolink.estimation.filter import BlurFilter
 from aolink.estimation.moments import Measurement, measure_moments
 from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.observation import PathMoments
-from aolink.estimation.score import Consistency, Score, score
+from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.estimation.windows import Window, measure_windows
 
@@ -24,6 +24,7 @@ __all__ = [
     "PathMoments",
     "Profile",
     "Score",
+    "Scorer",
     "Status",
     "Window",
     "WindowedMoments",

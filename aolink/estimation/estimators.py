@@ -19,6 +19,7 @@ from aolink.estimation.moments import (
     Flux,
     Measurement,
     known_flux_covariance,
+    least_significance,
     measure_moments,
     noise_integrals,
     spot_significance,
@@ -37,8 +38,6 @@ _PAPER_ORDERS: dict[str, tuple[int, ...]] = {"o1": (1,), "o2": (2,), "o3": (1, 2
 ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments")
 """The names that `make_estimator` knows."""
 
-# A frame without a spot reaches this about once in thirty.
-_LEAST_SIGNIFICANCE = 4.0
 _HIGHEST_ORDER = 8
 # Share of the pixels that `moments` can do with.
 _LEAST_USABLE = 0.5
@@ -148,7 +147,7 @@ def measure(
         orders = observation.orders if isinstance(observation, PathMoments) else None
         return measure_spots(
             sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
-            least_usable=_LEAST_USABLE, least_significance=_LEAST_SIGNIFICANCE,
+            least_usable=_LEAST_USABLE, least_significance=least_significance(sensor.profile),
         )  # fmt: skip
     sensor = sensor.profile
     saturated = is_saturated(sensor, pixels) & exposure.mask
@@ -163,7 +162,7 @@ def measure(
         remark += ": left out"
     density = np.where(usable, to_density(sensor, pixels), 0.0)
     significance = spot_significance(sensor, density)
-    if significance < _LEAST_SIGNIFICANCE:
+    if significance < least_significance(sensor):
         return None, f"no spot: the brightest stretch is {significance:.1f} standard deviations of noise"
     rows = (rig.plant.axes, -1)
     if not isinstance(observation, PathMoments):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -49,41 +50,75 @@ class Score:
     end_nees: Consistency
 
 
+class Scorer:
+    """A score that grows exposure by exposure, in the same memory however many there are."""
+
+    def __init__(self) -> None:
+        self._exposures = self._states = 0
+        self._start, self._end, self._path = _Sum(), _Sum(), _Sum()
+        self._start_nees, self._end_nees, self._nis = _Sum(), _Sum(), _Sum()
+        self._measurements = 0
+
+    def add(self, exposure: Exposure, estimate: Estimate) -> None:
+        """Count one exposure's estimate; where the exposure has no truth, nothing."""
+        truth = exposure.truth
+        if truth is None:
+            return
+        at_start, at_end = estimate.start_state - truth.start_state, estimate.end_state - truth.end_state
+        self._exposures += 1
+        self._states += at_start.size
+        self._start.add((at_start**2).sum(axis=1))
+        self._end.add((at_end**2).sum(axis=1))
+        self._path.add(np.mean((estimate.path - truth.path) ** 2, keepdims=True))
+        self._start_nees.add(_normalised(at_start, estimate.start_covariance))
+        self._end_nees.add(_normalised(at_end, estimate.end_covariance))
+        if estimate.innovation.shape[1]:
+            seen = estimate.nis > 0  # nothing was measured of the other axes
+            self._nis.add(estimate.nis[seen])
+            self._measurements += estimate.innovation.shape[1] * int(seen.sum())
+
+    def result(self) -> Score:
+        """The score of what was added so far."""
+        return Score(
+            exposures=self._exposures,
+            start_rmse=math.sqrt(self._start.mean),
+            end_rmse=math.sqrt(self._end.mean),
+            path_rmse=math.sqrt(self._path.mean),
+            nis=_consistency(self._nis, self._measurements),
+            start_nees=_consistency(self._start_nees, self._states),
+            end_nees=_consistency(self._end_nees, self._states),
+        )
+
+
 def score(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: int = 0) -> Score:
     """Score estimates, one for each exposure, against their truth; the first ``skip`` are left out."""
     if len(exposures) != len(estimates):
         raise ValueError(f"{len(estimates)} estimates for {len(exposures)} exposures")
-    start, end, path = [], [], []
-    start_nees, end_nees, nis, dimensions = [], [], [], []
-    for exposure, estimate in list(zip(exposures, estimates, strict=True))[skip:]:
-        truth = exposure.truth
-        if truth is None:
-            continue
-        at_start, at_end = estimate.start_state - truth.start_state, estimate.end_state - truth.end_state
-        start.append(at_start)
-        end.append(at_end)
-        path.append(np.mean((estimate.path - truth.path) ** 2))
-        start_nees.append(_normalised(at_start, estimate.start_covariance))
-        end_nees.append(_normalised(at_end, estimate.end_covariance))
-        if estimate.innovation.shape[1]:
-            seen = estimate.nis > 0  # nothing was measured of the other axes
-            nis.append(estimate.nis[seen])
-            dimensions.append(estimate.innovation.shape[1] * int(seen.sum()))
-    n_states = start[0].shape[1] if start else 0
-    states = len(start) * (len(start[0]) if start else 0) * n_states
-    return Score(
-        exposures=len(start),
-        start_rmse=_rms_norm(start),
-        end_rmse=_rms_norm(end),
-        path_rmse=math.sqrt(np.mean(path)) if path else math.nan,
-        nis=_consistency(nis, sum(dimensions)),
-        start_nees=_consistency(start_nees, states),
-        end_nees=_consistency(end_nees, states),
-    )
+    scorer = Scorer()
+    for exposure, estimate in itertools.islice(zip(exposures, estimates, strict=True), skip, None):
+        scorer.add(exposure, estimate)
+    return scorer.result()
 
 
-def _rms_norm(errors: Sequence[FloatArray]) -> float:
-    return math.sqrt(np.mean([np.mean((e**2).sum(axis=1)) for e in errors])) if errors else math.nan
+class _Sum:
+    """A running mean; it carries along what rounding takes from a long sum (Kahan, as Neumaier has it)."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._total = self._lost = 0.0
+
+    def add(self, values: FloatArray) -> None:
+        value = float(values.sum())
+        total = self._total + value
+        large, small = (self._total, value) if abs(self._total) >= abs(value) else (value, self._total)
+        self._lost += (large - total) + small
+        self._total = total
+        self.count += values.size
+
+    @property
+    def mean(self) -> float:
+        """NaN where there was nothing to average."""
+        return (self._total + self._lost) / self.count if self.count else math.nan
 
 
 def _normalised(error: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -92,9 +127,8 @@ def _normalised(error: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray((error * weighted[..., 0]).sum(axis=1))
 
 
-def _consistency(values: Sequence[FloatArray], degrees: int) -> Consistency:
-    samples = sum(len(v) for v in values)
-    if not samples:
+def _consistency(values: _Sum, degrees: int) -> Consistency:
+    if not values.count:
         return Consistency(mean=math.nan, low=math.nan, high=math.nan)
-    low, high = (2 * float(special.gammaincinv(degrees / 2, p)) / samples for p in (0.025, 0.975))
-    return Consistency(mean=float(np.concatenate(values).mean()), low=low, high=high)
+    low, high = (2 * float(special.gammaincinv(degrees / 2, p)) / values.count for p in (0.025, 0.975))
+    return Consistency(mean=values.mean, low=low, high=high)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
-from aolink.estimation import Driver, Estimate
-from aolink.recording import convert, topics
+from aolink.estimation import Driver, Estimate, Score, Scorer
+from aolink.exposure import Exposure
+from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 
@@ -19,13 +21,63 @@ def reestimate(
     recording: Recording, names: Sequence[str], progress: Callable[[int], None] = lambda exposures: None
 ) -> dict[str, list[Estimate]]:
     """Run estimators over a recording; gives the estimates by name, one for each exposure."""
-    driver = Driver(recording.rig, names)
     estimates: dict[str, list[Estimate]] = {name: [] for name in names}
-    for number, exposure in enumerate(recording.exposures(), 1):
-        for estimate in driver.step(exposure):
+    for _, each in reestimated(recording, names, progress):
+        for estimate in each:
             estimates[estimate.estimator].append(estimate)
-        progress(number)
     return estimates
+
+
+def reestimated(
+    recording: Recording, names: Sequence[str], progress: Callable[[int], None] = lambda exposures: None
+) -> Iterator[tuple[Exposure, list[Estimate]]]:
+    """The same exposure by exposure, estimates in the order of ``names``; nothing of it stays in memory."""
+    driver = Driver(recording.rig, names)
+    for number, exposure in enumerate(recording.exposures(), 1):
+        yield exposure, driver.step(exposure)
+        progress(number)
+
+
+def recorded_estimates(recording: Recording, name: str) -> Iterator[Estimate]:
+    """What `Recording.estimates` gives, one by one."""
+    exposures: dict[int, Exposure] = {}
+    waiting: deque[schemas_pb2.Estimate] = deque()
+    for recorded, completed in recording.assembled(topics.estimate_topic(name)):
+        if recorded is not None and isinstance(recorded.message, schemas_pb2.Estimate):
+            waiting.append(recorded.message)
+        exposures.update((exposure.frame_id, exposure) for exposure in completed)
+        # At the end of the recording, an exposure that has not come will not.
+        while waiting and (recorded is None or waiting[0].frame_id in exposures):
+            message = waiting.popleft()
+            if message.frame_id not in exposures:
+                continue
+            yield convert.estimate_from_message(message, recording.model, exposures[message.frame_id])
+            # Estimates come in the order of their exposures: what is before this one has had its own.
+            for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
+                del exposures[frame_id]
+
+
+def scored_and_compared(
+    recording: Recording, series: Iterable[tuple[Exposure, Sequence[Estimate]]], names: Sequence[str]
+) -> tuple[dict[str, Score], dict[str, str | None]]:
+    """Scores by name, and where estimates first differ from those in the recording, for the names that it has."""
+    scorers = {name: Scorer() for name in names}
+    recorded = {name: recorded_estimates(recording, name) for name in names if name in recording.estimators}
+    differences: dict[str, str | None] = dict.fromkeys(recorded)
+    count = 0
+    for count, (exposure, each) in enumerate(series, 1):
+        for estimate in each:
+            name = estimate.estimator
+            scorers[name].add(exposure, estimate)
+            if name in recorded and differences[name] is None:
+                theirs = next(recorded[name], None)
+                differences[name] = first_difference([theirs] if theirs else [], [estimate])
+                if theirs is None:
+                    differences[name] = f"{count - 1} estimates against more"
+    for name, rest in recorded.items():
+        if differences[name] is None and (more := sum(1 for _ in rest)):
+            differences[name] = f"{count + more} estimates against {count}"
+    return {name: scorer.result() for name, scorer in scorers.items()}, differences
 
 
 def write_reestimated(

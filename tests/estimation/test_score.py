@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aolink.estimation import make_estimator, run, score
+from aolink.estimation import Scorer, make_estimator, run, score
+from aolink.estimation.score import _Sum
 from aolink.simulation.model import simulate
 
 
@@ -74,3 +75,20 @@ def test_as_many_estimates_as_exposures(scored):
     exposures, estimates = scored
     with pytest.raises(ValueError, match="12 estimates for 11 exposures"):
         score(exposures[:-1], estimates["o3"])
+
+
+def test_a_scorer_can_be_asked_at_any_time(scored):
+    exposures, estimates = scored
+    scorer = Scorer()
+    for n, (exposure, estimate) in enumerate(zip(exposures, estimates["o3"], strict=True), 1):
+        scorer.add(exposure, estimate)
+        assert scorer.result() == score(exposures[:n], estimates["o3"][:n])
+
+
+def test_a_long_sum_loses_nothing():
+    total = _Sum()
+    for _ in range(1000):
+        total.add(np.array([1e16]))
+        total.add(np.array([1.0]))
+        total.add(np.array([-1e16]))
+    assert total.mean == 1 / 3

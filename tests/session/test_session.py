@@ -15,10 +15,17 @@ import pytest
 
 import aolink
 from aolink.demo import simulated_rig
-from aolink.estimation import Driver, run
+from aolink.estimation import Driver, run, score
 from aolink.recording import topics
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
+from aolink.recording.reestimate import (
+    first_difference,
+    recorded_estimates,
+    reestimate,
+    reestimated,
+    scored_and_compared,
+    write_reestimated,
+)
 from aolink.rig import load_rig
 from aolink.session import Report, open_devices, record
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
@@ -54,6 +61,19 @@ def test_online_and_offline_estimates_agree_bit_for_bit(recorded: Session) -> No
     recording = Recording(recorded.path)
     for name, again in reestimate(recording, ESTIMATORS).items():
         assert first_difference(recording.estimates(name), again) is None
+
+
+def test_scored_and_compared_one_by_one_is_as_all_at_once(recorded: Session) -> None:
+    recording = Recording(recorded.path)
+    scores, differences = scored_and_compared(recording, reestimated(recording, ESTIMATORS), ESTIMATORS)
+    assert differences == dict.fromkeys(ESTIMATORS)
+    for name in ESTIMATORS:
+        listed = recording.estimates(name)
+        assert first_difference(list(recorded_estimates(recording, name)), listed) is None
+        assert scores[name] == score(list(recording.exposures()), listed)
+    some = itertools.islice(reestimated(recording, ESTIMATORS), 3)
+    _, differences = scored_and_compared(recording, some, ESTIMATORS)
+    assert differences == dict.fromkeys(ESTIMATORS, f"{EXPOSURES} estimates against 3")
 
 
 def test_writing_the_same_estimates_again_gives_the_same_bytes(recorded: Session, tmp_path: Path) -> None:
