@@ -166,6 +166,10 @@ class _InputHistory:
         return rows, assumed
 
 
+_MOST_LEAD_STEPS = 100_000
+"""A longer gap between exposures is not followed input by input; the estimators are told by its missing inputs."""
+
+
 class Assembler:
     """Frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
 
@@ -202,6 +206,7 @@ class Assembler:
 
     def _expose(self, frame: Frame) -> Exposure:
         lead_start = frame.first_step if self._end is None else min(self._end, frame.first_step)
+        lead_start = max(lead_start, frame.first_step - _MOST_LEAD_STEPS)
         lead, lead_assumed = self._history.take(lead_start, frame.first_step)
         inputs, assumed = self._history.take(frame.first_step, frame.last_step + 1)
         self._end = frame.last_step + 1

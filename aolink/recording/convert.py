@@ -14,6 +14,9 @@ from aolink.exposure import Exposure, Truth
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
 
+_MOST_STEPS = 1_000_000
+"""Fast steps of an exposure; more is damage, not data."""
+
 
 def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
     """A frame as it is recorded: what is known about it, and its picture."""
@@ -43,7 +46,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
 def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
     """Inverse of `frame_messages`. Raises RecordingError for a picture that is not what it says."""
     size = image.width * image.height
-    if image.encoding != "mono16" or len(image.data) != 2 * size or info.last_step < info.first_step:
+    if image.encoding != "mono16" or len(image.data) != 2 * size or not _is_exposure(info):
         raise RecordingError(
             f"the picture of frame {info.frame_id} is damaged or not mono16: run `aolink info` on the file"
         )
@@ -66,6 +69,10 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
         host_start_ns=info.host_start_ns,
         clock_sigma_ns=info.clock_sigma_ns,
     )
+
+
+def _is_exposure(info: pb.ExposureInfo) -> bool:
+    return 0 <= info.last_step - info.first_step < _MOST_STEPS
 
 
 def estimate_message(estimate: Estimate) -> pb.Estimate:

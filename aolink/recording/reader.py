@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import os
-import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
-import lz4.frame
-import zstandard
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
-from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from aolink.assembly import Assembler
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel
 from aolink.exposure import Exposure, Truth
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
 from aolink.wire import messages_pb2 as wire
-
-_MAX_RECORD = 256 << 20
-"""Bytes; a larger record is damage, not data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +36,30 @@ class RecordedMessage:
     message: Message
 
 
+class RawMessage(NamedTuple):
+    """A message of a recording as bytes."""
+
+    topic: str
+    schema: str
+    """Full name of its type."""
+    log_time_ns: int
+    sequence: int
+    data: bytes
+
+
 class Recording:
-    """A recording on disk. It is scanned from its start, so a file that was cut off gives what is whole.
+    """A recording on disk, read piece by piece: files larger than the memory are no matter.
+
+    A whole file is read by its index. One that was cut off or damaged is scanned and gives what is
+    whole, with what was lost in `losses`.
+
+    Parameters
+    ----------
+    path:
+        The file.
+    check:
+        Read every byte at once, so that `losses` is known from the start. Without it, damage in the
+        middle of a file that has its index is noticed when it is read.
 
     Raises
     ------
@@ -52,23 +67,41 @@ class Recording:
         The file cannot be read, or is not a recording of aolink.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, *, check: bool = False) -> None:
         self.path = Path(path)
         self.metadata: dict[str, str] = {}
         """Facts about the session, from its start and its end."""
+        self.attachments: dict[str, bytes] = {}
+        """By name, among them the rig file and the exposure basis."""
         self.counts: dict[str, int] = {}
         """Messages by topic."""
-        self.damage = ""
-        """Why the file cannot be read to its end, in words; empty where it can."""
         self.start_ns = self.end_ns = 0
         """Log times of the first and of the last message."""
-        rig_text = self._survey()
+        self._losses: dict[int, Loss] = {}
+        self._channels: dict[int, tuple[str, str]] = {}
+        """Topic and name of the schema, by the channel's id."""
+        self.schemas: dict[str, Schema] = {}
+        """By name, as they are in the file."""
+        self._index: list[ChunkIndex] | None = None
+        rig_text = self._survey(check=check)
         if rig_text is None:
             raise RecordingError(f"{self.path} is an MCAP file but not a recording of aolink: it holds no rig file")
         try:
             self.rig: Rig = parse_rig(rig_text)
         except RigError as error:
             raise RecordingError(f"{self.path} holds a rig file that this aolink does not take: {error}") from None
+
+    @property
+    def losses(self) -> list[Loss]:
+        """What of the file could not be read, as far as it has been read, in the order of the file."""
+        return [self._losses[offset] for offset in sorted(self._losses)]
+
+    @property
+    def damage(self) -> str:
+        """Why the file cannot be read whole, in words; empty where it can."""
+        losses = self.losses
+        more = f" and {len(losses) - 1} more" if len(losses) > 1 else ""
+        return f"{losses[0].what}{more}" if losses else ""
 
     @property
     def complete(self) -> bool:
@@ -85,26 +118,35 @@ class Recording:
         """The exposure model that expands the recorded coefficients."""
         return ExposureModel(self.rig.plant, self.rig.timing.exposure_steps)
 
-    def messages(self, *wanted: str) -> Iterator[RecordedMessage]:
-        """The messages of some topics (of all, if none is named) in the order in which they were recorded."""
-        schemas: dict[int, str] = {}
-        channels: dict[int, tuple[str, type[Message]]] = {}
-        for record in self._records():
-            if isinstance(record, McapMessage):
-                if record.channel_id not in channels:
-                    continue
-                topic, kind = channels[record.channel_id]
-                try:
-                    message = kind.FromString(record.data)
-                except DecodeError:
-                    raise RecordingError(f"{self.path}: a message on {topic} is damaged") from None
-                yield RecordedMessage(topic, record.log_time, record.sequence, message)
-            elif isinstance(record, Schema):
-                schemas[record.id] = record.name
-            elif isinstance(record, Channel):
-                known = topics.SCHEMAS.get(schemas.get(record.schema_id, ""))
-                if known is not None and (not wanted or record.topic in wanted):
-                    channels[record.id] = (record.topic, known)
+    def messages(
+        self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RecordedMessage]:
+        """The messages of some topics (of all, if none is named) in the order in which they were recorded.
+
+        With ``start_ns`` (inclusive) and ``end_ns`` (exclusive) those whose log time is between them; with
+        an index, the rest of the file is not read.
+        """
+        for raw in self.raw_messages(*wanted, start_ns=start_ns, end_ns=end_ns):
+            kind = topics.SCHEMAS.get(raw.schema)
+            if kind is None:
+                continue
+            try:
+                message = kind.FromString(raw.data)
+            except DecodeError:
+                raise RecordingError(f"{self.path}: a message on {raw.topic} is damaged") from None
+            yield RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
+
+    def raw_messages(
+        self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """As `messages`, as bytes, and those of other software too."""
+        low = start_ns if start_ns is not None else 0
+        high = end_ns if end_ns is not None else 1 << 64
+        channels = {k: names for k, names in self._channels.items() if not wanted or names[0] in wanted}
+        for record in self._records(channels, low, high):
+            if isinstance(record, McapMessage) and record.channel_id in channels and low <= record.log_time < high:
+                topic, schema = channels[record.channel_id]
+                yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
 
     def assembled(self, *others: str) -> Iterator[tuple[RecordedMessage | None, list[Exposure]]]:
         """Messages with the exposures that each completes, as they were in the session.
@@ -163,73 +205,80 @@ class Recording:
             if message.frame_id in latest
         ]
 
-    def _survey(self) -> str | None:
-        """Scan the file once: what is in it. Gives the text of the rig file."""
-        rig_text = None
-        names: dict[int, str] = {}
-        for record in self._records():
+    def _survey(self, *, check: bool) -> str | None:
+        """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
+        rig_texts: dict[str, str] = {}
+        with open_recording(self.path) as file:
+            summary = None if check else read_summary(file)
+            if summary is not None:
+                self._index = summary.chunks
+                for schema in summary.schemas.values():
+                    self.schemas[schema.name] = schema
+                for channel in summary.channels.values():
+                    known = summary.schemas.get(channel.schema_id)
+                    self._channels[channel.id] = (channel.topic, known.name if known else "")
+                statistics = summary.statistics
+                for channel_id, count in sorted(statistics.channel_message_counts.items()):
+                    if channel_id in self._channels:
+                        self.counts[self._channels[channel_id][0]] = count
+                self.start_ns, self.end_ns = statistics.message_start_time, statistics.message_end_time
+                for each in summary.others:
+                    self._note(record_at(file, each.offset), rig_texts)
+                return rig_texts.get(topics.RIG_ATTACHMENT, rig_texts.get(topics.RIG_METADATA))
+        ids: dict[int, str] = {}
+        names: dict[int, int] = {}
+        for record in self._scanned():
             if isinstance(record, McapMessage):
-                topic = names.get(record.channel_id, "")
-                self.counts[topic] = self.counts.get(topic, 0) + 1
+                names[record.channel_id] = names.get(record.channel_id, 0) + 1
                 self.start_ns = min(self.start_ns or record.log_time, record.log_time)
                 self.end_ns = max(self.end_ns, record.log_time)
+            elif isinstance(record, Schema):
+                ids[record.id] = record.name
+                self.schemas[record.name] = record
             elif isinstance(record, Channel):
-                names[record.id] = record.topic
-            elif isinstance(record, Attachment) and record.name == topics.RIG_ATTACHMENT:
-                rig_text = record.data.decode(errors="replace")
-            elif isinstance(record, Metadata) and record.name in (topics.SESSION_METADATA, topics.END_METADATA):
-                self.metadata.update(record.metadata)
-        return rig_text
+                self._channels[record.id] = (record.topic, ids.get(record.schema_id, ""))
+            else:
+                self._note(record, rig_texts)
+        for channel_id, count in names.items():
+            if channel_id in self._channels:
+                self.counts[self._channels[channel_id][0]] = count
+        return rig_texts.get(topics.RIG_ATTACHMENT, rig_texts.get(topics.RIG_METADATA))
 
-    def _records(self) -> Iterator[McapRecord]:
-        """Every whole record; stops where the file is cut off or damaged."""
-        try:
-            with self.path.open("rb") as file:
-                try:
-                    for record in StreamReader(file, emit_chunks=True, record_size_limit=_MAX_RECORD).records:
-                        if isinstance(record, Chunk):
-                            yield from breakup_chunk(_decompressed(record), validate_crc=True)
-                        else:
-                            yield record
-                except InvalidMagic:
-                    if file.tell() <= _MAGIC_BYTES:
-                        raise RecordingError(f"{self.path} is not a recording: it is not an MCAP file") from None
-                    self.damage = "it was cut off at its very end"
-                except EndOfFile:
-                    if file.tell() < _MAGIC_BYTES:
-                        raise RecordingError(f"{self.path} is empty or too short to be a recording") from None
-                    self.damage = f"it was cut off: it ends at byte {file.tell()}, in the middle of a record"
-                except _DAMAGE as error:
-                    self.damage = f"it is damaged before byte {file.tell()} ({error}): what comes after is not read"
-        except OSError as error:
-            raise RecordingError(f"cannot read {self.path}: {os.strerror(error.errno or 0).lower()}") from None
+    def _note(self, record: McapRecord | None, rig_texts: dict[str, str]) -> None:
+        """Keep what an attachment or metadata says."""
+        if isinstance(record, Attachment):
+            self.attachments[record.name] = record.data
+            if record.name == topics.RIG_ATTACHMENT:
+                rig_texts[record.name] = record.data.decode(errors="replace")
+        elif isinstance(record, Metadata):
+            values = record.metadata
+            if record.name in (topics.SESSION_METADATA, topics.END_METADATA):
+                self.metadata.update(values)
+            elif record.name == topics.RIG_METADATA and "toml" in values:
+                rig_texts[record.name] = values["toml"]
+            elif record.name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
+                self._channels.setdefault(int(values["id"]), (values.get("topic", ""), values.get("schema", "")))
+
+    def _records(self, channels: Container[int], low: int, high: int) -> Iterator[McapRecord]:
+        """Records in the order of the file, at least all messages of some channels between two log times."""
+        if self._index is None:
+            yield from self._scanned()
+            return
+        with open_recording(self.path) as file:
+            for index in self._index:
+                held = index.message_index_offsets
+                if index.message_end_time < low or index.message_start_time >= high:
+                    continue
+                if held and not any(channel in channels for channel in held):
+                    continue
+                yield from chunk_at(file, index, self._lose)
+
+    def _scanned(self) -> Iterator[McapRecord]:
+        with open_recording(self.path) as file:
+            yield from scan(file, self._lose)
+
+    def _lose(self, loss: Loss) -> None:
+        self._losses.setdefault(loss.offset, loss)
 
 
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
-_MAGIC_BYTES = 8
-# What the mcap library and the decompressors raise on a file that is cut off or damaged.
-_DAMAGE = (
-    McapError,
-    CRCValidationError,
-    struct.error,
-    RuntimeError,
-    ValueError,
-    EOFError,
-    KeyError,
-    zstandard.ZstdError,
-)
-
-
-def _decompressed(chunk: Chunk) -> Chunk:
-    """A chunk without compression. It may say one size and hold another: neither may fill the memory."""
-    if chunk.uncompressed_size > _MAX_RECORD:
-        raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
-    if chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
-    elif chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(chunk.uncompressed_size + 1)
-    else:
-        return chunk
-    if len(data) != chunk.uncompressed_size:
-        raise ValueError("a chunk that is not of the size that it says")
-    return replace(chunk, compression="", data=data)

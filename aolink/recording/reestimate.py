@@ -104,8 +104,6 @@ def write_reestimated(
         "estimated_from": recording.path.name,
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
-    if recording.damage:
-        metadata["damage"] = recording.damage
     with RecordingWriter(
         path, recording.rig, metadata, recording.start_ns, overwrite=overwrite, deterministic=True
     ) as writer:
@@ -120,6 +118,8 @@ def write_reestimated(
                     writer.write(topics.estimate_topic(estimate.estimator), message, last_ns)
                 done += 1
                 progress(done)
+        if recording.damage:
+            writer.close({"damage": recording.damage})
 
 
 def first_difference(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> str | None:

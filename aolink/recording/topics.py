@@ -10,6 +10,9 @@ from aolink.recording import schemas_pb2
 from aolink.wire import messages_pb2
 
 IMAGE = "/camera/image"
+SCENE = "/scene/image"
+"""A second, picture sensor that shares the exposure."""
+PICTURES = (IMAGE, SCENE)
 EXPOSURE = "/camera/exposure"
 COMMAND = "/mirror/command"
 APPLIED = "/mirror/applied"
@@ -42,6 +45,10 @@ RIG_ATTACHMENT = "rig.toml"
 BASIS_ATTACHMENT = "exposure_basis.npy"
 SESSION_METADATA = "aolink"
 """Written at the start: versions, rig, devices, note."""
+RIG_METADATA = "aolink/rig"
+"""The rig file a second time, in case that the attachment is damaged."""
+CHANNEL_METADATA = "aolink/channel"
+"""One for each topic: its id, name and schema a second time, in case that their chunk is damaged."""
 CALIBRATION = "calibration"
 """Key in the metadata of a session that recorded frames for a calibration: what they show."""
 END_METADATA = "aolink/end"

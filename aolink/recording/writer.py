@@ -1,4 +1,4 @@
-"""Writes a recording: an MCAP file that needs nothing but itself.
+"""Writes a recording: one or several MCAP files that need nothing but themselves.
 
 The file work is done in a thread of its own, so that a slow disk does not reach the loop. The queue to
 it is bounded; when it is full, or when the disk is, the session gets an error: nothing is lost silently.
@@ -19,20 +19,15 @@ from typing import Self
 
 import numpy as np
 from google.protobuf.message import Message
-from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import build_file_descriptor_set
+from mcap.records import Schema
 
 from aolink.errors import RecordingError
 from aolink.estimation import ExposureModel
-from aolink.recording import topics
+from aolink.recording import schemas_pb2, topics
+from aolink.recording.lead import Lead
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.rig import Rig
 
-FLUSH_S = 0.1
-"""How often what was recorded goes to the file: a killed process loses no more than twice that."""
-FSYNC_S = 1.0
-"""How often the file goes to the disk: a power cut loses no more than that and twice FLUSH_S."""
-CHUNK_BYTES = 128 << 10
 _QUEUE_BYTES = 256 << 20
 """What may wait for the disk."""
 _STALL_S = 5.0
@@ -44,44 +39,20 @@ class _Item:
     """A message on its way to the file."""
 
     topic: str
-    message_class: type[Message]
+    message: Message
     data: bytes
     log_time_ns: int
 
 
-class _File:
-    """A file that writes all or raises, and can be cut back to its last whole part."""
-
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
-        if path.is_dir():
-            raise RecordingError(f"{path} is a folder: give the name of a file in it")
-        flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL)
-        try:
-            self.descriptor = os.open(path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
-        except FileExistsError:
-            raise RecordingError(
-                f"{path} exists and is not overwritten: give another name, or --overwrite to replace it"
-            ) from None
-        except OSError as error:
-            raise RecordingError(f"cannot create {path}: {os.strerror(error.errno or 0).lower()}") from None
-        self._position = 0
-
-    def write(self, data: bytes) -> int:
-        view = memoryview(data)
-        while view:
-            written = os.write(self.descriptor, view)
-            self._position += written
-            view = view[written:]
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def close(self) -> None:
-        os.close(self.descriptor)
+def begin_recording(file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int) -> None:
+    """Write what a recording begins with: the rig file, twice, the exposure basis, and facts about the session."""
+    file.start()
+    basis = io.BytesIO()
+    np.save(basis, ExposureModel(rig.plant, rig.timing.exposure_steps).basis)
+    file.add_attachment(topics.RIG_ATTACHMENT, "application/toml", rig.toml.encode(), start_ns)
+    file.add_attachment(topics.BASIS_ATTACHMENT, "application/octet-stream", basis.getvalue(), start_ns)
+    file.add_metadata(topics.SESSION_METADATA, metadata)
+    file.add_metadata(topics.RIG_METADATA, {"toml": rig.toml})  # nothing can be read without it
 
 
 class RecordingWriter:
@@ -90,7 +61,8 @@ class RecordingWriter:
     Parameters
     ----------
     path:
-        The file; it must not exist unless ``overwrite``.
+        The file; it must not exist unless ``overwrite``. Where the options ask for several files, their
+        names are this one with -001, -002 ... before the suffix.
     rig:
         Goes into the file as an attachment, with its exposure basis.
     metadata:
@@ -116,17 +88,17 @@ class RecordingWriter:
         *,
         overwrite: bool = False,
         deterministic: bool = False,
+        options: WriteOptions | None = None,
     ) -> None:
         self.path = Path(path)
-        self._file = _File(self.path, overwrite=overwrite)
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.LZ4)  # type: ignore[arg-type]
+        self.paths: list[Path] = []
+        """The files so far."""
+        self._options = options or WriteOptions()
+        self._rig, self._metadata, self._overwrite = rig, metadata, overwrite
         self._deterministic = deterministic
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
+        self._schemas: dict[type[Message], Schema] = {}
+        self._lead = Lead()
         self._sequence = 0
-        self._chunk_start_ns: int | None = None
-        self._whole = 0
-        """Bytes up to which the file is whole."""
         self._end_metadata: dict[str, str] = {}
         self._error: RecordingError | None = None
         self._closed = False
@@ -135,7 +107,7 @@ class RecordingWriter:
         self._busy_since: float | None = None
         """When the thread began what it is doing with the file."""
         try:
-            self._begin(rig, metadata, start_ns)
+            self._begin(start_ns)
         except OSError as error:
             self._give_up(error)
             self._closed = True
@@ -147,7 +119,7 @@ class RecordingWriter:
         """Record a message. Raises RecordingError if the file can no longer be written."""
         if self._error:
             raise self._error
-        item = _Item(topic, type(message), message.SerializeToString(deterministic=True), log_time_ns)
+        item = _Item(topic, message, message.SerializeToString(deterministic=True), log_time_ns)
         while self._is_stalled() or self._put_bytes - self._taken_bytes > _QUEUE_BYTES:
             if self._error:
                 raise self._error
@@ -185,38 +157,38 @@ class RecordingWriter:
             with contextlib.suppress(RecordingError):
                 self.close({"ended": f"error: {error}"})
 
-    def _begin(self, rig: Rig, metadata: dict[str, str], start_ns: int) -> None:
-        self._writer.start(profile="aolink", library="aolink")
-        model = ExposureModel(rig.plant, rig.timing.exposure_steps)
-        basis = io.BytesIO()
-        np.save(basis, model.basis)
-        for name, kind, data in (
-            (topics.RIG_ATTACHMENT, "application/toml", rig.toml.encode()),
-            (topics.BASIS_ATTACHMENT, "application/octet-stream", basis.getvalue()),
-        ):
-            self._writer.add_attachment(start_ns, start_ns, name, kind, data)
-        self._writer.add_metadata(topics.SESSION_METADATA, metadata)
-        self._whole = self._file.tell()
+    def _begin(self, start_ns: int) -> None:
+        """Create the file, or the next of several."""
+        metadata, path = self._metadata, self.path
+        if self._options.split_bytes or self._options.split_s:
+            part = len(self.paths) + 1
+            path = path.with_name(f"{path.stem}-{part:03d}{path.suffix}")
+            metadata = metadata | {"part": str(part)}
+        self.paths.append(path)
+        self._file = McapFile(path, self._options, overwrite=self._overwrite)
+        self._part_start_ns = start_ns
+        begin_recording(self._file, self._rig, metadata, start_ns)
 
     def _run(self) -> None:
         last_sync = time.monotonic()
+        options = self._options
         while True:
             try:
-                item = self._queue.get(timeout=None if self._deterministic else FLUSH_S)
+                item = self._queue.get(timeout=None if self._deterministic else options.flush_s)
             except queue.Empty:
                 item = _NOTHING
             self._busy_since = time.monotonic()
             try:
                 if item is None:
-                    self._finish()
+                    self._finish(self._end_metadata)
                     return
                 if item is not _NOTHING:
                     self._add(item)
                     self._taken_bytes += len(item.data)
-                elif self._chunk_start_ns is not None:
-                    self._flush()
-                if not self._deterministic and time.monotonic() - last_sync > FSYNC_S:
-                    os.fsync(self._file.descriptor)
+                elif self._file.has_unwritten:
+                    self._file.flush()
+                if not self._deterministic and time.monotonic() - last_sync > options.fsync_s:
+                    self._file.sync()
                     last_sync = time.monotonic()
             except Exception as error:  # whatever it is, the session must hear of it
                 self._give_up(error)
@@ -225,53 +197,44 @@ class RecordingWriter:
                 self._busy_since = None
 
     def _add(self, item: _Item) -> None:
-        channel = self._channels.get(item.topic)
-        if channel is None:
-            channel = self._channels[item.topic] = self._register(item)
-        if self._chunk_start_ns is None:
-            self._chunk_start_ns = item.log_time_ns
-        elif item.log_time_ns - self._chunk_start_ns >= FLUSH_S * 1e9:
-            self._flush()
-            self._chunk_start_ns = item.log_time_ns
+        if item.topic == topics.EXPOSURE and self._part_is_full(item.log_time_ns):
+            self._finish({"ended": "goes on in the next part"})
+            self._begin(item.log_time_ns)
+            for topic, message, log_time_ns, sequence in self._lead.messages():
+                data = message.SerializeToString(deterministic=True)
+                self._file.add(topic, self._schema(type(message)), data, log_time_ns, sequence)
         # Streams may share a log time: the sequence is the order.
         self._sequence += 1
-        self._writer.add_message(channel, item.log_time_ns, item.data, item.log_time_ns, self._sequence & 0xFFFFFFFF)
+        self._lead.add(item.topic, item.message, item.log_time_ns, self._sequence)
+        self._file.add(item.topic, self._schema(type(item.message)), item.data, item.log_time_ns, self._sequence)
 
-    def _register(self, item: _Item) -> int:
-        name = item.message_class.DESCRIPTOR.full_name
-        if name not in self._schemas:
-            data = build_file_descriptor_set(item.message_class).SerializeToString(deterministic=True)
-            self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, data)
-        return self._writer.register_channel(item.topic, MessageEncoding.Protobuf, self._schemas[name])
+    def _part_is_full(self, now_ns: int) -> bool:
+        size, seconds = self._options.split_bytes, self._options.split_s
+        return bool((size and self._file.size >= size) or (seconds and now_ns - self._part_start_ns >= seconds * 1e9))
 
-    def _flush(self) -> None:
-        self._writer.flush()
-        self._chunk_start_ns = None
-        self._whole = self._file.tell()
+    def _schema(self, message_class: type[Message]) -> Schema:
+        if message_class not in self._schemas:
+            self._schemas[message_class] = schema_of(message_class)
+        return self._schemas[message_class]
 
-    def _finish(self) -> None:
-        self._flush()
-        if self._end_metadata:
-            self._writer.add_metadata(topics.END_METADATA, self._end_metadata)
-            self._whole = self._file.tell()
-        self._writer.finish()
-        if not self._deterministic:
-            os.fsync(self._file.descriptor)
-        self._file.close()
+    def _finish(self, end_metadata: dict[str, str]) -> None:
+        if end_metadata:
+            self._file.add_metadata(topics.END_METADATA, end_metadata)
+        self._file.finish(sync=not self._deterministic)
 
     def _give_up(self, error: Exception) -> None:
         """The disk is full or gone: leave a file that ends with its last whole part."""
-        with contextlib.suppress(OSError):
-            os.ftruncate(self._file.descriptor, self._whole)
-        with contextlib.suppress(OSError):
-            self._file.close()
+        self._file.cut_back()
+        if isinstance(error, RecordingError):
+            self._error = error
+            return
         what = repr(error)
         if isinstance(error, OSError):
             full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
             what = "the disk is full" if full else os.strerror(error.errno or 0).lower()
         self._error = RecordingError(
-            f"cannot write {self.path}: {what}; what was recorded until then is in it and can be read"
+            f"cannot write {self.paths[-1]}: {what}; what was recorded until then is in it and can be read"
         )
 
 
-_NOTHING = _Item("", Message, b"", 0)
+_NOTHING = _Item("", schemas_pb2.ClockSample(), b"", 0)

@@ -119,7 +119,9 @@ def record(
         rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
         rig = replace(rig, drive=rest)
     with open_devices(rig, camera_port, mirror_port, stop) as (hub, camera, mirror, warnings):
+        start_ns = hub.now_ns()
         facts = {
+            "session": f"{start_ns:x}",
             "aolink_version": version("aolink"),
             "rig": rig.name,
             "rig_digest": rig.digest,
@@ -131,7 +133,7 @@ def record(
         }
         if calibration:
             facts[topics.CALIBRATION] = calibration
-        writer = RecordingWriter(path, rig, facts, hub.now_ns(), overwrite=overwrite, deterministic=hub.virtual)
+        writer = RecordingWriter(path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual)
         loop = SessionLoop(rig, hub, camera, mirror, writer, driver)
         report = loop.report
         report.warnings += warnings

@@ -187,13 +187,19 @@ def test_the_generated_classes_are_those_of_the_proto_files(room: str, tmp_path:
     assert generated == compiled, "run tools/protocol"
 
 
-def test_one_flipped_bit_is_noticed_and_said(recorded: Session, tmp_path: Path) -> None:
+def test_one_flipped_bit_costs_its_chunk_and_is_said(recorded: Session, tmp_path: Path) -> None:
     data = bytearray(recorded.path.read_bytes())
     data[len(data) // 2] ^= 0x10
     (path := tmp_path / "flipped.mcap").write_bytes(data)
     recording = Recording(path)
-    assert "it is damaged before byte" in recording.damage
-    assert 0 < len(list(recording.exposures())) < EXPOSURES
+    assert recording.complete, "its index is whole"
+    whole = {each.frame_id: each for each in Recording(recorded.path).exposures()}
+    exposures = list(recording.exposures())
+    assert "is damaged" in recording.damage
+    assert "is damaged" in Recording(path, check=True).damage
+    assert EXPOSURES - 4 < len(exposures) < EXPOSURES
+    for exposure in exposures:
+        assert np.array_equal(exposure.pixels, whole[exposure.frame_id].pixels)
     write_reestimated(recording, ["o3"], tmp_path / "again.mcap")
     assert Recording(tmp_path / "again.mcap").metadata["damage"] == recording.damage
 

@@ -1,0 +1,64 @@
+"""What the commands share: the consoles, common options, opening files."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from aolink.errors import RigError
+from aolink.rig import Rig, load_rig
+
+if TYPE_CHECKING:
+    from aolink.recording.reader import Recording
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="A logged hardware-in-the-loop pipeline for adaptive optics and any loop closed through a slow camera.",
+)
+stdout = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
+stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+
+RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
+FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
+EstimatorOption = Annotated[
+    list[str] | None, typer.Option("--estimator", "-e", help="Estimator to run; may be given several times.")
+]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
+
+
+def load_checked(path_or_name: str) -> Rig:
+    """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
+    from aolink.plant import check_rig
+
+    loaded = load_rig(path_or_name)
+    for finding in check_rig(loaded):
+        if finding.severity == "error":
+            raise RigError(f"{path_or_name}: {finding.key}: {finding.message}")
+        if finding.severity == "warning":
+            stderr.print(f"aolink: warning: {escape(finding.key)}: {escape(finding.message)}")
+    return loaded
+
+
+def open_recording(file: Path) -> Recording:
+    """Open a recording, and say so where it is not whole."""
+    from aolink.recording.reader import Recording
+
+    recording = Recording(file)
+    if recording.damage:
+        stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
+    return recording
+
+
+def program() -> str:
+    """What the user types for this program: its name where the shell finds it, else its path."""
+    return "aolink" if shutil.which("aolink") else str(Path(sys.executable).with_name("aolink"))

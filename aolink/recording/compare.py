@@ -1,0 +1,211 @@
+"""What differs between two recordings, message by message and field by field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from google.protobuf.message import Message
+
+from aolink.recording import schemas_pb2, topics
+from aolink.recording.reader import RecordedMessage, Recording
+from aolink.wire import messages_pb2 as wire
+
+RELATIVE = 1e-9
+"""Default tolerance: what another machine's arithmetic may change."""
+ABSOLUTE = 1e-12
+
+
+class Difference(NamedTuple):
+    """The first place where two recordings differ in a field."""
+
+    frame_id: int | None
+    """Of the exposure that the message belongs to; None where it belongs to none."""
+    text: str
+    """Both values, in short."""
+
+
+@dataclass(slots=True)
+class FieldDifference:
+    """How a field of the messages of a topic differs."""
+
+    first: Difference
+    messages: int = 0
+    """In how many messages it does."""
+    largest: float = 0.0
+    """Largest absolute difference between numbers; infinite where one is not finite, or the lengths differ."""
+    largest_relative: float = 0.0
+    """The same, relative to the larger of the two."""
+
+
+@dataclass(slots=True)
+class TopicComparison:
+    """What was found in one topic."""
+
+    compared: int = 0
+    """Messages that are in both."""
+    missing: int = 0
+    """In the first only."""
+    added: int = 0
+    """In the second only."""
+    first_missing: str = ""
+    first_added: str = ""
+    fields: dict[str, FieldDifference] = field(default_factory=dict)
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing differs."""
+        return not (self.missing or self.added or self.fields)
+
+
+def compare(
+    first: Recording,
+    second: Recording,
+    *,
+    relative: float = RELATIVE,
+    absolute: float = ABSOLUTE,
+    only: Sequence[str] = (),
+    progress: Callable[[int], None] = lambda messages: None,
+) -> dict[str, TopicComparison]:
+    """Compare two recordings by topic.
+
+    Messages are matched by what they are of (exposure, command block, or place in the topic), not by
+    their place in the file. Two numbers are the same if they differ by no more than ``absolute`` plus
+    ``relative`` times the larger, or if both are NaN; integers, texts and pictures must be equal.
+
+    Parameters
+    ----------
+    only:
+        Topics to look at; all if none is given. One that ends with "/" means all that begin with it.
+    """
+    result: dict[str, TopicComparison] = {}
+    waiting: dict[tuple[str, object], tuple[bool, Message, int | None]] = {}
+    names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, only)}
+    if not names:
+        return {}
+    for number, (is_first, key, message, frame_id) in enumerate(_alternating(first, second, sorted(names)), 1):
+        topic = key[0]
+        found = result.setdefault(topic, TopicComparison())
+        other = waiting.get(key)
+        if other is None or other[0] == is_first:
+            waiting[key] = (is_first, message, frame_id)
+        else:
+            del waiting[key]
+            found.compared += 1
+            pair = (message, other[1]) if is_first else (other[1], message)
+            if pair[0] != pair[1]:
+                _compare_messages(found, *pair, frame_id, relative, absolute)
+        progress(number)
+    for (topic, name), (is_first, _, frame_id) in waiting.items():
+        found = result[topic]
+        text = f"frame {frame_id}" if frame_id is not None else str(name)
+        if is_first:
+            found.missing += 1
+            found.first_missing = found.first_missing or text
+        else:
+            found.added += 1
+            found.first_added = found.first_added or text
+    return dict(sorted(result.items()))
+
+
+def _is_wanted(topic: str, only: Sequence[str]) -> bool:
+    return not only or any(topic == each or (each.endswith("/") and topic.startswith(each)) for each in only)
+
+
+def _alternating(
+    first: Recording, second: Recording, names: Sequence[str]
+) -> Iterator[tuple[bool, tuple[str, object], Message, int | None]]:
+    """The messages of both, a little of each in turn, so that only what has no partner yet is kept."""
+    sides = [(True, _named(first.messages(*names))), (False, _named(second.messages(*names)))]
+    while sides:
+        for side in list(sides):
+            is_first, messages = side
+            for _ in range(64):
+                named = next(messages, None)
+                if named is None:
+                    sides.remove(side)
+                    break
+                yield is_first, *named
+
+
+def _named(messages: Iterator[RecordedMessage]) -> Iterator[tuple[tuple[str, object], Message, int | None]]:
+    """Each message with a name that its counterpart has too, and the exposure that it belongs to."""
+    places: dict[tuple[str, object], int] = {}
+    exposure: int | None = None
+    for recorded in messages:
+        message, frame_id = recorded.message, None
+        name: object = ""
+        if isinstance(message, schemas_pb2.ExposureInfo):
+            exposure = message.frame_id
+        if recorded.topic in topics.PICTURES and exposure is not None:
+            frame_id = name = exposure
+        elif isinstance(value := getattr(message, "frame_id", None), int):
+            frame_id = name = value
+        elif isinstance(message, wire.CommandBlock | wire.Applied):
+            name = f"block {message.block_id} at fast step {message.first_step}"
+        place = places[recorded.topic, name] = places.get((recorded.topic, name), 0) + 1
+        yield (recorded.topic, (name, place) if place > 1 or name == "" else name), message, frame_id
+
+
+def _compare_messages(
+    found: TopicComparison, a: Message, b: Message, frame_id: int | None, relative: float, absolute: float
+) -> None:
+    for name in sorted({each.name for each in (*a.DESCRIPTOR.fields, *b.DESCRIPTOR.fields)}):
+        x, y = getattr(a, name, None), getattr(b, name, None)
+        largest = largest_relative = 0.0
+        if isinstance(x, float) or (_is_numbers(x) and _is_numbers(y)):
+            largest, largest_relative, differs, at = _numbers_differ(x, y, relative, absolute)
+        else:
+            differs, at = x != y, ""
+            largest = largest_relative = float("inf") if differs else 0.0
+            if differs and isinstance(x, int) and isinstance(y, int):
+                largest, largest_relative = abs(x - y), abs(x - y) / max(abs(x), abs(y))
+        if not differs:
+            continue
+        difference = found.fields.setdefault(name, FieldDifference(Difference(frame_id, at or _shown(x, y))))
+        difference.messages += 1
+        difference.largest = max(difference.largest, largest)
+        difference.largest_relative = max(difference.largest_relative, largest_relative)
+
+
+def _is_numbers(value: Any) -> bool:
+    return hasattr(value, "__len__") and not isinstance(value, str | bytes | Message)
+
+
+def _numbers_differ(x: Any, y: Any, relative: float, absolute: float) -> tuple[float, float, bool, str]:
+    """Largest difference, the same relatively, whether it is too large, and the first place in words."""
+    a, b = (np.atleast_1d(np.asarray(value, dtype=np.float64)) for value in (x, y))
+    if a.shape != b.shape:
+        return np.inf, np.inf, True, f"{a.size} numbers against {b.size}"
+    with np.errstate(invalid="ignore"):
+        gap = np.abs(a - b)
+    gap[(a == b) | (np.isnan(a) & np.isnan(b))] = 0.0
+    gap[np.isnan(gap)] = np.inf
+    scale = np.maximum(np.abs(a), np.abs(b))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.where(gap > 0, gap / scale, 0.0)
+        wrong = gap > absolute + relative * np.where(np.isfinite(scale), scale, 0.0)
+    if not wrong.any():
+        return 0.0, 0.0, False, ""
+    k = int(np.argmax(wrong))
+    where = f"[{k}] " if a.size > 1 else ""
+    return (
+        float(gap.max()),
+        float(np.nan_to_num(ratio, nan=np.inf).max()),
+        True,
+        f"{where}{a[k]:.10g} against {b[k]:.10g}",
+    )
+
+
+def _shown(x: Any, y: Any) -> str:
+    def short(value: Any) -> str:
+        if isinstance(value, bytes):
+            return f"{len(value)} bytes"
+        text = str(value)
+        return text if len(text) < 60 else text[:57] + "..."
+
+    if isinstance(x, bytes) and isinstance(y, bytes) and len(x) == len(y):
+        return f"byte {next(k for k, (p, q) in enumerate(zip(x, y, strict=True)) if p != q)} of {len(x)} differs"
+    return f"{short(x)} against {short(y)}"

@@ -1,0 +1,243 @@
+"""Recordings made from recordings: salvaged, cut, merged. Messages are copied as bytes; sources stay untouched."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from google.protobuf.message import Message
+from mcap.records import Schema
+
+from aolink.errors import RecordingError
+from aolink.recording import topics
+from aolink.recording.lead import Lead
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.scan import Loss
+from aolink.recording.writer import begin_recording
+from aolink.wire import messages_pb2 as wire
+
+_ALIKE_NS = 2_000_000_000
+"""Log times between which the same message in two files is one."""
+
+
+@dataclass(slots=True)
+class Edited:
+    """What a new recording holds, and what did not get into it."""
+
+    path: Path
+    messages: int = 0
+    exposures: int = 0
+    losses: list[Loss] = field(default_factory=list)
+    """Parts of the source that could not be read."""
+
+
+class _Copy:
+    """A recording that is written message by message, with what the first source has besides its messages."""
+
+    def __init__(self, source: Recording, target: Path, notes: dict[str, str], *, overwrite: bool) -> None:
+        for same in (source.path, source.path.resolve()):
+            if target.resolve() == same:
+                raise RecordingError(f"{target} is the recording itself: give another name for the new one")
+        self.result = Edited(target)
+        self._schemas = source.schemas
+        self._file = McapFile(target, WriteOptions(), overwrite=overwrite)
+        begin_recording(self._file, source.rig, source.metadata | notes, source.start_ns)
+        for name, data in source.attachments.items():
+            if name not in (topics.RIG_ATTACHMENT, topics.BASIS_ATTACHMENT):
+                self._file.add_attachment(name, "application/octet-stream", data, source.start_ns)
+
+    def add(self, message: RawMessage) -> None:
+        known = topics.SCHEMAS.get(message.schema)
+        schema = schema_of(known) if known is not None else self._schemas.get(message.schema)
+        if schema is None:
+            schema = Schema(id=0, name=message.schema, encoding="", data=b"")
+        self._schemas = self._schemas | {message.schema: schema}
+        self.result.messages += 1
+        self.result.exposures += message.topic == topics.EXPOSURE
+        self._file.add(message.topic, schema, message.data, message.log_time_ns, self.result.messages)
+
+    def finish(self, losses: list[Loss]) -> Edited:
+        self.result.losses = losses
+        if losses:
+            self._file.add_metadata(topics.END_METADATA, {"damage": "; ".join(loss.what for loss in losses[:20])})
+        self._file.finish(sync=True)
+        return self.result
+
+    def give_up(self) -> None:
+        self._file.cut_back()
+
+
+def recover(
+    source: Path, target: Path, *, overwrite: bool = False, progress: Callable[[int], None] = lambda exposures: None
+) -> Edited:
+    """Copy what is whole of a damaged recording into a new one with an index.
+
+    Raises
+    ------
+    RecordingError
+        ``source`` is no recording, or nothing of it can be used; ``target`` exists and not ``overwrite``, or
+        cannot be written.
+    """
+    recording = Recording(source, check=True)
+    return _copied(recording, target, recording.raw_messages(), {"recovered_from": source.name}, overwrite, progress)
+
+
+def cut(
+    source: Path,
+    target: Path,
+    start_s: float,
+    end_s: float,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[int], None] = lambda exposures: None,
+) -> Edited:
+    """Copy the exposures that were received between two times, s from the recording's start, with all they need.
+
+    The commands that were given before and reach into the first exposure come along, and the reports on the last one.
+
+    Raises
+    ------
+    RecordingError
+        As `recover`; or there is no exposure between the two times.
+    """
+    if not start_s < end_s:
+        raise RecordingError(f"nothing is between {start_s:g} s and {end_s:g} s: the end must be after the start")
+    recording = Recording(source)
+    low, high = (recording.start_ns + round(t * 1e9) for t in (start_s, min(end_s, 1e9)))
+    notes = {"cut_from": source.name, "cut": f"{start_s:g} s to {end_s:g} s"}
+    result = _copied(recording, target, _between(recording, low, high), notes, overwrite, progress)
+    if not result.exposures:
+        target.unlink()
+        duration_s = (recording.end_ns - recording.start_ns) / 1e9
+        raise RecordingError(
+            f"{source} has no exposure between {start_s:g} s and {end_s:g} s: it is {duration_s:.3g} s long"
+        )
+    return result
+
+
+def merge(
+    sources: Sequence[Path],
+    target: Path,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[int], None] = lambda exposures: None,
+) -> Edited:
+    """Join the parts of one session, in any order. What is in several of them is written once.
+
+    Raises
+    ------
+    RecordingError
+        As `recover`; or the files are not of one session.
+    """
+    if len(sources) < 2:
+        raise RecordingError("one recording is nothing to merge: give two or more")
+    recordings = sorted((Recording(source) for source in sources), key=lambda each: each.start_ns)
+    first = recordings[0]
+    for other in recordings[1:]:
+        if _identity(other) != _identity(first):
+            raise RecordingError(
+                f"{other.path} is not of the same session as {first.path}: only parts of one session can be merged"
+            )
+    notes = {"merged_from": " ".join(each.path.name for each in recordings)}
+    result = _copied(first, target, _joined(recordings), notes, overwrite, progress)
+    result.losses = [loss for each in recordings for loss in each.losses]
+    return result
+
+
+def _identity(recording: Recording) -> tuple[str, str]:
+    return recording.rig.digest, recording.metadata.get("session", "")
+
+
+def _copied(
+    recording: Recording,
+    target: Path,
+    messages: Iterator[RawMessage],
+    notes: dict[str, str],
+    overwrite: bool,
+    progress: Callable[[int], None],
+) -> Edited:
+    copy = _Copy(recording, target, notes, overwrite=overwrite)
+    try:
+        for message in messages:
+            copy.add(message)
+            progress(copy.result.exposures)
+        return copy.finish(recording.losses)
+    except OSError as error:
+        copy.give_up()
+        raise RecordingError(f"cannot write {target}: {(error.strerror or str(error)).lower()}") from None
+    except BaseException:
+        copy.give_up()
+        raise
+
+
+def _decoded(message: RawMessage) -> Message | None:
+    kind = topics.SCHEMAS.get(message.schema)
+    return kind.FromString(message.data) if kind else None
+
+
+def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
+    lead, frames = Lead(), set[int]()
+    image_wanted, last_step = False, -1
+    for raw in recording.raw_messages():
+        message = _decoded(raw)
+        inside = low <= raw.log_time_ns < high
+        if raw.topic == topics.EXPOSURE and message is not None:
+            image_wanted = inside
+            if inside:
+                if not frames:
+                    yield from _raw(lead)
+                frames.add(message.frame_id)  # type: ignore[attr-defined]
+                last_step = message.last_step  # type: ignore[attr-defined]
+                yield raw
+        elif raw.topic in topics.PICTURES:
+            if image_wanted:
+                yield raw
+        elif raw.topic in (topics.COMMAND, topics.APPLIED):
+            # Also after the end, until all is known of the last exposure.
+            needed = isinstance(message, wire.CommandBlock | wire.Applied) and message.first_step <= last_step
+            if frames and (inside or needed):
+                yield raw
+        elif isinstance(frame_id := getattr(message, "frame_id", None), int):
+            if frame_id in frames:
+                yield raw
+        elif inside and frames:
+            yield raw
+        if message is not None and not frames:
+            lead.add(raw.topic, message, raw.log_time_ns, raw.sequence)
+
+
+def _raw(lead: Lead) -> Iterator[RawMessage]:
+    for topic, message, log_time_ns, sequence in lead.messages():
+        data = message.SerializeToString(deterministic=True)
+        yield RawMessage(topic, message.DESCRIPTOR.full_name, log_time_ns, sequence, data)
+
+
+def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:
+    recent: dict[tuple[str, int, bytes], int] = {}
+    frames: dict[int, int] = {}
+    for key, raw in heapq.merge(*map(_timed, recordings), key=lambda each: each[0]):
+        name = (raw.topic, raw.log_time_ns, raw.data)
+        if name in recent:
+            continue
+        if len(recent) > 100 and recent[next(iter(recent))] < key - _ALIKE_NS:
+            recent = {each: time for each, time in recent.items() if time >= key - _ALIKE_NS}
+        recent[name] = key
+        if raw.topic == topics.EXPOSURE and (message := _decoded(raw)) is not None:
+            frame_id = message.frame_id  # type: ignore[attr-defined]
+            if frame_id in frames:
+                raise RecordingError(
+                    f"frame {frame_id} is in two of the recordings, but not the same: nothing to merge"
+                )
+            frames[frame_id] = key
+        yield raw
+
+
+def _timed(recording: Recording) -> Iterator[tuple[int, RawMessage]]:
+    """Messages with a time that never goes back, so that their order stays."""
+    latest = 0
+    for raw in recording.raw_messages():
+        latest = max(latest, raw.log_time_ns)
+        yield latest, raw

@@ -1,0 +1,37 @@
+"""What was commanded and applied before an exposure and reaches into it: a file that begins there needs it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+
+from google.protobuf.message import Message
+
+from aolink.recording import schemas_pb2, topics
+from aolink.wire import messages_pb2 as wire
+
+
+class Lead:
+    """Follows the messages of a recording, and keeps those that an exposure still to come is made from."""
+
+    def __init__(self) -> None:
+        self._kept: deque[tuple[str, Message, int, int]] = deque()
+
+    def add(self, topic: str, message: Message, log_time_ns: int, sequence: int) -> None:
+        """Take the next message."""
+        if topic in (topics.COMMAND, topics.APPLIED):
+            self._kept.append((topic, message, log_time_ns, sequence))
+        elif isinstance(message, schemas_pb2.ExposureInfo):
+            # Exposures still to come begin after the last step of this one.
+            self._kept = deque(each for each in self._kept if _end_step(each[1]) > message.last_step + 1)
+
+    def messages(self) -> Iterator[tuple[str, Message, int, int]]:
+        """Topic, message, log time and sequence of what is kept, in order."""
+        return iter(self._kept)
+
+
+def _end_step(message: Message) -> int:
+    """First fast step after a block."""
+    if not isinstance(message, wire.CommandBlock | wire.Applied):
+        raise TypeError(f"{type(message).__name__} has no fast steps")
+    return int(message.first_step + message.n_steps)
