@@ -24,6 +24,7 @@ from aolink.session import Report
 if TYPE_CHECKING:
     from aolink.calibrating import Calibrated
     from aolink.demo import DemoResult
+    from aolink.recording.compare import TopicComparison
 
 _LATENCY_STEPS = (
     ("exposure end to first byte", "exposure_end_ns", "first_byte_ns"),
@@ -33,6 +34,12 @@ _LATENCY_STEPS = (
     ("command sent to acknowledged", "command_sent_ns", "command_acknowledged_ns"),
     ("command sent to applied", "command_sent_ns", "command_applied_ns"),
 )
+
+_LOSSES = (
+    "frames_lost", "frames_incomplete", "packets_missing", "packets_bad_crc", "packets_bad_framing",
+    "packets_bad_payload", "chunks_refused", "steps_late", "steps_clipped", "steps_parked",
+)  # fmt: skip
+"""What a session counts of what went wrong."""
 
 
 def score_all(recording: Recording, estimates: Mapping[str, Iterable[Estimate]]) -> dict[str, Score]:
@@ -57,10 +64,41 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
         "damage": recording.damage,
         "duration_s": duration_s,
         "messages": dict(sorted(recording.counts.items())),
+        "rates_per_s": {
+            topic: round((count - 1) / duration_s, 3)
+            for topic, count in sorted(recording.counts.items())
+            if duration_s and count > 1
+        },
+        "gaps": _gaps(recording),
+        "losses": _losses(recording),
+        "damaged_parts": [loss.text() for loss in recording.losses],
         "truth": topics.TRUTH in recording.counts,
         "session": {name: _typed(name, value) for name, value in recording.metadata.items()},
         "estimators": recording.estimators,
     }
+
+
+def _gaps(recording: Recording) -> dict[str, float]:
+    """Where the camera's frames are further apart than their period: how often, and the longest, in fast steps."""
+    period, last, gaps = recording.rig.timing.frame_period_steps, None, []
+    for recorded in recording.messages(topics.EXPOSURE):
+        first = recorded.message.first_step  # type: ignore[attr-defined]
+        if last is not None and first - last != period:
+            gaps.append(first - last - period)
+        last = first
+    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}
+
+
+def _losses(recording: Recording) -> dict[str, int]:
+    """What was lost in the session, by cause; and in the file."""
+    counted = {
+        name: int(recording.metadata[name])
+        for name in _LOSSES
+        if recording.metadata.get(name, "0").isdigit() and int(recording.metadata.get(name, "0"))
+    }
+    if recording.losses:
+        counted["parts_of_the_file"] = len(recording.losses)
+    return counted
 
 
 def _typed(name: str, value: str) -> Any:
@@ -302,3 +340,35 @@ def calibration_as_json(result: Calibrated) -> dict[str, Any]:
             }
         )
     )
+
+
+def comparison(found: Mapping[str, TopicComparison]) -> Table:
+    """Topic by topic: how many messages were compared, and what differs first."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("topic", "field"):
+        table.add_column(name, no_wrap=True)
+    for name in ("compared", "differ", "largest", "relative"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("first")
+    for topic, each in found.items():
+        if each.same:
+            table.add_row(topic, "", str(each.compared), "0", "", "", "")
+        for name, field in each.fields.items():
+            frame = f"frame {field.first.frame_id}: " if field.first.frame_id is not None else ""
+            sizes = (f"{field.largest:.2g}", f"{field.largest_relative:.2g}")
+            table.add_row(
+                topic, name, str(each.compared), str(field.messages), *sizes, escape(frame + field.first.text)
+            )
+        for count, what, first in (
+            (each.missing, "missing", each.first_missing),
+            (each.added, "added", each.first_added),
+        ):
+            if count:
+                table.add_row(topic, what, str(each.compared), str(count), "", "", escape(first))
+    return table
+
+
+def comparison_as_json(found: Mapping[str, TopicComparison], *, same_rig: bool) -> dict[str, Any]:
+    """The same for scripts; a difference without a size is null."""
+    same = same_rig and all(each.same for each in found.values())
+    return dict(_without_nan({"same": same, "same_rig": same_rig, "topics": {k: asdict(v) for k, v in found.items()}}))

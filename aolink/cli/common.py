@@ -49,11 +49,11 @@ def load_checked(path_or_name: str) -> Rig:
     return loaded
 
 
-def open_recording(file: Path) -> Recording:
+def open_recording(file: Path, *, check: bool = False) -> Recording:
     """Open a recording, and say so where it is not whole."""
     from aolink.recording.reader import Recording
 
-    recording = Recording(file)
+    recording = Recording(file, check=check)
     if recording.damage:
         stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
     return recording

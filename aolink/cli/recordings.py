@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,19 +27,26 @@ if TYPE_CHECKING:
 
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
+    from aolink.recording.editing import Edited
 
 
 @app.command(epilog="Example: aolink info session.mcap --json")
-def info(file: FileArgument, as_json: JsonOption = False) -> None:
-    """Say what a recording holds."""
+def info(
+    file: FileArgument,
+    check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what a recording holds. Exit code 1 if a part of it cannot be read."""
     from aolink import tables
 
-    recording = open_recording(file)
+    recording = open_recording(file, check=check)
     facts = tables.recording_facts(recording)
     if as_json:
         print(json.dumps(facts, allow_nan=False))
     else:
         stdout.print(tables.facts(facts))
+    if recording.damage:
+        raise typer.Exit(1)
 
 
 @app.command(epilog="Example: aolink estimate session.mcap --estimator o1 --estimator o3 -o again.mcap")
@@ -80,3 +89,132 @@ def estimate(
         stdout.print(f"{name}: {difference or 'the same as recorded, bit for bit'}")
     if output is not None:
         stdout.print(f"written: {output}", markup=False)
+
+
+CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from the recording's start.")]
+
+
+@app.command(epilog="Example: aolink compare session.mcap again.mcap --topic /estimate/")
+def compare(
+    first: Annotated[Path, typer.Argument(metavar="A", help="A recording.")],
+    second: Annotated[
+        Path | None,
+        typer.Argument(metavar="[B]", help="Another; without it, A with its estimates made again by this aolink."),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        typer.Option("--topic", "-t", help="Only this topic, or with a / at its end all below it; may be repeated."),
+    ] = None,
+    relative: Annotated[float, typer.Option(min=0, help="How much two numbers may differ, relatively ...")] = 1e-9,
+    absolute: Annotated[float, typer.Option(min=0, help="... and in their own units, added.")] = 1e-12,
+    accept: Annotated[
+        bool, typer.Option("--accept", help="Where they differ, put B (or the new estimates) in A's place.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say field by field what differs between two recordings. Exit code 1 if something does."""
+    from tempfile import TemporaryDirectory
+
+    from aolink import tables
+    from aolink.recording.compare import compare as compare_recordings
+    from aolink.recording.editing import replace_file
+    from aolink.recording.reader import Recording
+    from aolink.recording.reestimate import write_reestimated
+
+    one = open_recording(first)
+    with TemporaryDirectory(prefix="aolink-", dir=first.parent if accept else None) as folder:
+        if second is None:
+            second = Path(folder) / first.name
+            with progress_bar(stderr, one.counts.get("/camera/image", 0)) as tell:
+                write_reestimated(one, one.estimators, second, progress=lambda n: tell("estimate", n))
+        two = open_recording(second)
+        total = sum(one.counts.values()) + sum(two.counts.values())
+        with progress_bar(stderr, total) as tell:
+            found = compare_recordings(
+                one, two, relative=relative, absolute=absolute, only=topic or (), progress=lambda n: tell("compare", n)
+            )  # fmt: skip
+        same_rig = one.rig.digest == two.rig.digest
+        same = same_rig and all(each.same for each in found.values())
+        if as_json:
+            print(json.dumps(tables.comparison_as_json(found, same_rig=same_rig), allow_nan=False))
+        else:
+            stdout.print(tables.comparison(found))
+            if not same_rig:
+                stdout.print("the rig files differ")
+        damaged = [f"{each.path}: {each.damage}" for each in (Recording(first), two) if each.damage]
+        for text in damaged:
+            stderr.print(f"aolink: warning: {text}", markup=False)
+        if accept and not same:
+            replace_file(first, second)
+            stdout.print(f"accepted: {first} is replaced", markup=False)
+            return
+    if not as_json:
+        stdout.print("the same" if same else "they differ")
+    if not same:
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: aolink recover broken.mcap -o whole.mcap")
+def recover(
+    file: FileArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Save what is whole of a damaged or unfinished recording. Exit code 1 if something was lost."""
+    from aolink.recording.editing import recover as recover_recording
+
+    with progress_bar(stderr, None) as tell:
+        edited = recover_recording(file, output, overwrite=overwrite, progress=lambda n: tell("exposures", n))
+    _print_edited(edited, as_json)
+    if edited.losses:
+        raise typer.Exit(1)
+
+
+@app.command(epilog="Example: aolink cut session.mcap --start 10 --end 20 -o part.mcap")
+def cut(
+    file: FileArgument,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    start: CutTime = None,
+    end: CutTime = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Copy the exposures between two times, with the commands that belong to them."""
+    from aolink.recording.editing import cut as cut_recording
+
+    with progress_bar(stderr, None) as tell:
+        edited = cut_recording(
+            file, output, start or 0.0, math.inf if end is None else end,
+            overwrite=overwrite, progress=lambda n: tell("exposures", n),
+        )  # fmt: skip
+    _print_edited(edited, as_json)
+
+
+@app.command(epilog="Example: aolink merge session-001.mcap session-002.mcap -o session.mcap")
+def merge(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The parts of one session.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Join the parts of one session; what is in several of them is written once."""
+    from aolink.recording.editing import merge as merge_recordings
+
+    with progress_bar(stderr, None) as tell:
+        edited = merge_recordings(files, output, overwrite=overwrite, progress=lambda n: tell("exposures", n))
+    _print_edited(edited, as_json)
+
+
+def _print_edited(edited: Edited, as_json: bool) -> None:
+    if as_json:
+        losses = [asdict(loss) for loss in edited.losses]
+        print(json.dumps({**asdict(edited), "path": str(edited.path), "losses": losses}))
+        return
+    for loss in edited.losses:
+        stdout.print(f"lost: {loss.text()}", markup=False)
+    stdout.print(
+        f"written: {edited.path}: {edited.messages} messages, {edited.exposures} exposures"
+        + (f"; {len(edited.losses)} part(s) of the source lost" if edited.losses else ""),
+        markup=False,
+    )

@@ -146,7 +146,9 @@ def _named(messages: Iterator[RecordedMessage]) -> Iterator[tuple[tuple[str, obj
         elif isinstance(message, wire.CommandBlock | wire.Applied):
             name = f"block {message.block_id} at fast step {message.first_step}"
         place = places[recorded.topic, name] = places.get((recorded.topic, name), 0) + 1
-        yield (recorded.topic, (name, place) if place > 1 or name == "" else name), message, frame_id
+        if place > 1 or name == "":
+            name = f"{name or 'message'}, number {place}"
+        yield (recorded.topic, name), message, frame_id
 
 
 def _compare_messages(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -241,3 +242,20 @@ def _timed(recording: Recording) -> Iterator[tuple[int, RawMessage]]:
     for raw in recording.raw_messages():
         latest = max(latest, raw.log_time_ns)
         yield latest, raw
+
+
+def replace_file(target: Path, source: Path) -> None:
+    """Put a file in the place of another, in one step: a reader sees the one or the other.
+
+    Raises
+    ------
+    RecordingError
+        The disk is full, or the folder cannot be written.
+    """
+    temporary = target.with_name(f".{target.name}.new")
+    try:
+        shutil.copyfile(source, temporary)
+        temporary.replace(target)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise RecordingError(f"cannot write {target}: {(error.strerror or str(error)).lower()}") from None

@@ -90,6 +90,11 @@ class Loss:
     """Log times of the messages that were in it, as far as is known; 0 where it is not."""
     end_ns: int = 0
 
+    def text(self) -> str:
+        """The loss in words."""
+        span = f", {(self.end_ns - self.start_ns) / 1e9:.3g} s of messages" if self.end_ns else ""
+        return f"{self.what} ({self.length} bytes{span})"
+
 
 @dataclass(slots=True)
 class Summary:
@@ -201,8 +206,12 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[McapRecor
             on_loss(Loss(position, found - position, f"{found - position} bytes make no sense"))
             position = found
             continue
-        record = _record_at(file, position, on_loss)
-        if isinstance(record, Chunk):
+        lost: list[Loss] = []
+        record = _record_at(file, position, lost.append)
+        if lost:  # its length may be wrong: what it covers may hold whole chunks
+            end = _next_chunk(file, position + 1, size, before=end) or end
+            on_loss(replace(lost[0], length=end - position))
+        elif isinstance(record, Chunk):
             yield from broken_up(record, position, on_loss)
         elif record is not None:
             yield record
@@ -258,12 +267,13 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
         file.seek(length, os.SEEK_CUR)
         return None
     content = file.read(length)
+    stream = ReadDataStream(BytesIO(content))
     try:
-        record = _PARSERS[opcode](ReadDataStream(BytesIO(content)))
+        record = _PARSERS[opcode](stream)
+        if stream.count != length:
+            raise ValueError("size")
         if opcode == Opcode.ATTACHMENT and zlib.crc32(content[:-4]) != struct.unpack("<I", content[-4:])[0]:
             raise ValueError("checksum")
-        if isinstance(record, Chunk) and len(record.data) != length - _CHUNK_HEAD.size - len(record.compression) - 8:
-            raise ValueError("size")
     except _DAMAGE:
         kind = Opcode(opcode).name.lower().replace("_", " ")
         on_loss(Loss(position, _HEAD.size + length, f"the {kind} at byte {position} is damaged"))
@@ -279,14 +289,15 @@ def _is_plausible(opcode: int, length: int, file: IO[bytes]) -> bool:
     return opcode in _KNOWN and length <= MAX_RECORD and _LENGTHS.get(opcode, length) == length
 
 
-def _next_chunk(file: IO[bytes], position: int, size: int) -> int | None:
-    """Where the next whole chunk, or the end of the data, begins."""
-    while position < size:
+def _next_chunk(file: IO[bytes], position: int, size: int, before: int | None = None) -> int | None:
+    """Where the next whole chunk, or the end of the data, begins; None if that is not ``before`` a byte."""
+    before = size if before is None else before
+    while position < before:
         file.seek(position)
         block = file.read(_SEARCH_BYTES + 128)
         for match in _CANDIDATE.finditer(block):
             at = match.start()
-            if at >= _SEARCH_BYTES:
+            if at >= min(_SEARCH_BYTES, before - position):
                 break
             opcode, length = _HEAD.unpack_from(block, at)
             if opcode == Opcode.DATA_END:

@@ -1,0 +1,120 @@
+"""What two recordings differ in is said field by field, and nothing else is."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from google.protobuf.message import Message
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aolink.recording import compare as module
+from aolink.recording import schemas_pb2 as pb
+from aolink.recording import topics
+from aolink.recording.compare import compare
+from aolink.recording.reader import Recording
+from aolink.recording.writer import RecordingWriter
+from tests.conftest import EXPOSURES, Session
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def rewritten(source: Path, target: Path, change: Callable[[str, Message], list[Message]]) -> Recording:
+    """A copy whose messages went through ``change``."""
+    recording = Recording(source)
+    with RecordingWriter(target, recording.rig, {}, recording.start_ns, deterministic=True) as writer:
+        for each in recording.messages():
+            for message in change(each.topic, each.message):
+                writer.write(each.topic, message, each.log_time_ns)
+    return Recording(target)
+
+
+def test_a_recording_is_the_same_as_itself(recorded: Session) -> None:
+    found = compare(Recording(recorded.path), Recording(recorded.path))
+    assert set(found) == set(Recording(recorded.path).counts)
+    assert all(each.same and each.compared for each in found.values())
+
+
+def test_one_number_is_found_with_its_frame_and_field(recorded: Session, tmp_path: Path) -> None:
+    def change(topic: str, message: Message) -> list[Message]:
+        if topic == "/estimate/o3" and isinstance(message, pb.Estimate) and message.frame_id == 5:
+            message.coefficients[1] += 1e-6
+        return [message]
+
+    one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
+    found = compare(one, two)
+    (field,) = found["/estimate/o3"].fields.items()
+    assert (field[0], field[1].messages, field[1].first.frame_id) == ("coefficients", 1, 5)
+    assert "[1] " in field[1].first.text
+    np.testing.assert_allclose(field[1].largest, 1e-6, rtol=1e-3)
+    assert all(each.same for topic, each in found.items() if topic != "/estimate/o3")
+    assert all(each.same for each in compare(one, two, absolute=2e-6).values())
+    assert not compare(one, two, only=["/camera/"]).keys() - {topics.IMAGE, topics.EXPOSURE}
+
+
+def test_one_pixel_is_found(recorded: Session, tmp_path: Path) -> None:
+    def change(topic: str, message: Message) -> list[Message]:
+        if topic == topics.IMAGE and message.data[10] != 255:  # type: ignore[attr-defined]
+            message.data = message.data[:10] + bytes([message.data[10] + 1]) + message.data[11:]  # type: ignore[attr-defined]
+        return [message]
+
+    found = compare(Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change))
+    assert found[topics.IMAGE].fields["data"].first == (1, "byte 10 of 80 differs")
+
+
+def test_missing_and_added_messages_are_named_and_shift_nothing(recorded: Session, tmp_path: Path) -> None:
+    def without_frame_3(topic: str, message: Message) -> list[Message]:
+        return [] if topic == topics.TRUTH and message.frame_id == 3 else [message]  # type: ignore[attr-defined]
+
+    one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", without_frame_3)
+    found = compare(one, two)[topics.TRUTH]
+    assert (found.compared, found.missing, found.added, found.first_missing) == (EXPOSURES - 1, 1, 0, "frame 3")
+    assert not found.fields
+    found = compare(two, one)[topics.TRUTH]
+    assert (found.missing, found.added, found.first_added) == (0, 1, "frame 3")
+
+
+numbers = st.lists(st.floats(width=64), min_size=1, max_size=6)
+
+
+@given(numbers, numbers)
+def test_numbers_differ_as_numpy_says(x: list[float], y: list[float]) -> None:
+    n = min(len(x), len(y))
+    *_, differs, where = module._numbers_differ(x[:n], y[:n], 1e-9, 1e-12)
+    a, b = np.array(x[:n]), np.array(y[:n])
+    with np.errstate(invalid="ignore", over="ignore"):
+        same = np.array_equal(a, b, equal_nan=True) or bool(
+            np.all(
+                (a == b)
+                | (np.isnan(a) & np.isnan(b))
+                | (np.isfinite(a) & np.isfinite(b) & (np.abs(a - b) <= 1e-12 + 1e-9 * np.maximum(abs(a), abs(b))))
+            )
+        )
+    assert differs is not same
+    assert bool(where) is differs
+
+
+def test_the_command_accepts_a_change_when_told_to(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    def change(topic: str, message: Message) -> list[Message]:
+        if topic == "/estimate/o1":
+            message.nis[0] *= 2  # type: ignore[attr-defined]
+        return [message]
+
+    shutil.copy(recorded.path, tmp_path / "right.mcap")
+    rewritten(recorded.path, tmp_path / "wrong.mcap", change)
+    assert aolink("compare", "right.mcap").returncode == 0
+    before = (tmp_path / "wrong.mcap").read_bytes()
+    refused = aolink("compare", "wrong.mcap")
+    assert refused.returncode == 1
+    assert "/estimate/o1" in refused.stdout
+    assert "frame 1: " in refused.stdout
+    assert (tmp_path / "wrong.mcap").read_bytes() == before
+    accepted = aolink("compare", "wrong.mcap", "--accept")
+    assert accepted.returncode == 0
+    assert "accepted: wrong.mcap is replaced" in accepted.stdout
+    assert aolink("compare", "wrong.mcap").returncode == 0
+    assert [each.name for each in tmp_path.iterdir() if each.name.startswith((".", "aolink-"))] == []

@@ -1,0 +1,128 @@
+"""Recordings salvaged, cut, merged, written in parts: nothing is lost but what was damaged."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.errors import RecordingError
+from aolink.recording import topics
+from aolink.recording.compare import compare
+from aolink.recording.editing import cut, merge, recover
+from aolink.recording.mcap_file import WriteOptions
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import write_reestimated
+from aolink.recording.writer import RecordingWriter
+from tests.conftest import EXPOSURES, Session
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def in_parts(source: Path, target: Path, options: WriteOptions) -> list[Path]:
+    """What `aolink record` writes when it is told to split, from the messages of a recording."""
+    recording = Recording(source)
+    with RecordingWriter(
+        target, recording.rig, recording.metadata, recording.start_ns, deterministic=True, options=options
+    ) as writer:
+        for each in recording.messages():
+            writer.write(each.topic, each.message, each.log_time_ns)
+    return writer.paths
+
+
+@pytest.mark.parametrize("options", [WriteOptions(split_s=0.5), WriteOptions(split_bytes=20_000, compression="zstd")])
+def test_each_part_can_be_read_by_itself_and_all_together_are_the_session(
+    recorded: Session, tmp_path: Path, options: WriteOptions
+) -> None:
+    whole = {each.frame_id: each for each in Recording(recorded.path).exposures()}
+    parts = in_parts(recorded.path, tmp_path / "s.mcap", options)
+    assert len(parts) > 2
+    assert parts[0].name == "s-001.mcap"
+    seen = []
+    for path in parts:
+        part = Recording(path, check=True)
+        assert part.complete
+        for exposure in part.exposures():
+            seen.append(exposure.frame_id)
+            assert exposure.inputs_assumed == 0
+            assert np.array_equal(exposure.inputs, whole[exposure.frame_id].inputs)
+            assert np.array_equal(exposure.pixels, whole[exposure.frame_id].pixels)
+    assert seen == list(whole)
+    merged = merge(list(reversed(parts)), tmp_path / "merged.mcap")
+    assert merged.exposures == EXPOSURES
+    assert all(each.same for each in compare(Recording(recorded.path), Recording(merged.path)).values())
+
+
+def test_a_cut_gives_the_same_exposures_as_the_whole(recorded: Session, tmp_path: Path) -> None:
+    source = Recording(recorded.path)
+    result = cut(recorded.path, tmp_path / "cut.mcap", 1.0, 2.0)
+    times = [each.log_time_ns for each in source.messages(topics.EXPOSURE)]
+    inside = [k + 1 for k, time in enumerate(times) if 1e9 <= time - source.start_ns < 2e9]
+    part = Recording(result.path)
+    assert [each.frame_id for each in part.exposures()] == inside
+    whole = {each.frame_id: each for each in source.exposures()}
+    for exposure in part.exposures():
+        assert np.array_equal(exposure.inputs, whole[exposure.frame_id].inputs)
+        assert exposure.inputs_assumed == 0
+        assert exposure.truth is not None
+    assert [each.frame_id for each in part.estimates("o3")] == inside
+    write_reestimated(part, ["o3"], tmp_path / "again.mcap")
+
+
+def test_cuts_that_overlap_merge_into_what_they_were_cut_from(recorded: Session, tmp_path: Path) -> None:
+    cut(recorded.path, tmp_path / "a.mcap", 0.0, 1.7)
+    cut(recorded.path, tmp_path / "b.mcap", 1.0, 99.0)
+    merge([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "m.mcap")
+    found = compare(Recording(recorded.path), Recording(tmp_path / "m.mcap"))
+    for topic in (topics.IMAGE, topics.EXPOSURE, topics.APPLIED, topics.TRUTH, "/estimate/o3"):
+        assert found[topic].same, (topic, found[topic])
+
+
+def test_sessions_that_are_not_one_are_not_merged(recorded: Session, tmp_path: Path) -> None:
+    other = Recording(recorded.path)
+    with RecordingWriter(tmp_path / "other.mcap", other.rig, {"session": "another"}, 0, deterministic=True):
+        pass
+    with pytest.raises(RecordingError, match="is not of the same session"):
+        merge([recorded.path, tmp_path / "other.mcap"], tmp_path / "m.mcap")
+    assert not (tmp_path / "m.mcap").exists()
+    with pytest.raises(RecordingError, match="give two or more"):
+        merge([recorded.path], tmp_path / "m.mcap")
+
+
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "message"), [(5.0, 5.0, "the end must be after"), (100.0, 200.0, "it is .* s long")]
+)
+def test_a_cut_without_an_exposure_is_refused(
+    recorded: Session, tmp_path: Path, start_s: float, end_s: float, message: str
+) -> None:
+    with pytest.raises(RecordingError, match=message):
+        cut(recorded.path, tmp_path / "c.mcap", start_s, end_s)
+    assert not (tmp_path / "c.mcap").exists()
+
+
+def test_the_source_is_never_the_target(recorded: Session) -> None:
+    before = recorded.path.read_bytes()
+    with pytest.raises(RecordingError, match="is the recording itself"):
+        recover(recorded.path, recorded.path, overwrite=True)
+    assert recorded.path.read_bytes() == before
+
+
+def test_the_commands(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    data = recorded.path.read_bytes()
+    (tmp_path / "broken.mcap").write_bytes(data[: len(data) * 2 // 3])
+    result = aolink("recover", "broken.mcap", "-o", "whole.mcap")
+    assert result.returncode == 1
+    assert "lost: it was cut off" in result.stdout
+    assert aolink("info", "whole.mcap").returncode == 0
+    assert aolink("info", "broken.mcap").returncode == 1
+    assert aolink("recover", recorded.path, "-o", "copy.mcap").returncode == 0
+    again = aolink("recover", recorded.path, "-o", "copy.mcap")
+    assert again.returncode == 5
+    assert "exists and is not overwritten" in again.stderr
+    assert aolink("compare", recorded.path, "copy.mcap").returncode == 0
+    assert aolink("cut", "copy.mcap", "--start", "1", "--end", "2", "-o", "c1.mcap").returncode == 0
+    assert aolink("cut", "copy.mcap", "--start", "1.5", "-o", "c2.mcap").returncode == 0
+    assert aolink("merge", "c1.mcap", "c2.mcap", "-o", "m.mcap").returncode == 0
