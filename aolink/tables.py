@@ -6,6 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -340,6 +341,21 @@ def calibration_as_json(result: Calibrated) -> dict[str, Any]:
             }
         )
     )
+
+
+def batch(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """What came of many recordings and models, a row each."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    columns = ("recording", "model", "estimator", "exposures", "path_rmse", "end_rmse", "nis", "end_nees", "not_ok")
+    for name in columns:
+        table.add_column(name, justify="left" if name in columns[:3] else "right", no_wrap=True)
+    for row in rows:
+        if row["error"]:
+            table.add_row(Path(row["recording"]).name, escape(row["model"]), "failed")
+            continue
+        cells = [Path(row["recording"]).name if name == "recording" else row[name] for name in columns]
+        table.add_row(*(escape(f"{cell:.4g}" if isinstance(cell, float) else str(cell or "")) for cell in cells))
+    return table
 
 
 def comparison(found: Mapping[str, TopicComparison]) -> Table:

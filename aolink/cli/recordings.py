@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,10 +20,11 @@ from aolink.cli.common import (
     stderr,
     stdout,
 )
-from aolink.terminal import progress_bar
+from aolink.errors import AolinkError
+from aolink.terminal import StopRequest, progress_bar
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
@@ -49,17 +50,89 @@ def info(
         raise typer.Exit(1)
 
 
-@app.command(epilog="Example: aolink estimate session.mcap --estimator o1 --estimator o3 -o again.mcap")
+@app.command(
+    epilog="Examples: aolink estimate session.mcap -e o1 -e o3 -o again.mcap"
+    "  |  aolink estimate *.mcap -e moments --set plant.process_noise=0.2,0.4 --jobs 2 -o results/"
+)
 def estimate(
-    file: FileArgument,
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="One recording or many.")],
     estimator: EstimatorOption = None,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", metavar="FILE", help="A copy with the new estimates.")
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE|DIR",
+            help="A copy with the new estimates; of many files or models, a folder for the copies and their table.",
+        ),
     ] = None,
+    rig: Annotated[
+        str | None, typer.Option(metavar="RIG.toml", help="Estimate with this rig file, not the recording's own.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE,...", help="Change a value of the rig file; each value is a model."),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="How many recordings at once.")] = 1,
+    parquet: Annotated[bool, typer.Option("--parquet", help="Write the table as Parquet, not as CSV.")] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Estimate the motion inside each exposure of a recording, again or for the first time."""
+    """Estimate the motion inside each exposure of recordings, again or for the first time.
+
+    With many files or models, what was done before and has not changed is not done again, and a file that
+    fails does not stop the others (exit code 1 then).
+    """
+    if len(files) == 1 and not rig and not settings and not (output and output.is_dir()):
+        _estimate_one(files[0], estimator, output, overwrite=overwrite, as_json=as_json)
+        return
+    from aolink import batch, tables
+    from aolink.rig import load_rig
+
+    if output is None:
+        raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
+    models = batch.models(load_rig(rig).toml if rig else None, settings or [])
+    todo = batch.jobs(files, models, estimator or [], output)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AolinkError(f"cannot make the folder {output}: {(error.strerror or str(error)).lower()}") from None
+    done = []
+    table = output / ("results.parquet" if parquet else "results.csv")
+    with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
+        for each in batch.run(todo, jobs, stop=stop, progress=lambda n: tell("estimate", n)):
+            done.append(each)
+            if each.error:
+                stderr.print(f"aolink: {each.job.source} {each.job.model.name}: {each.error}", markup=False)
+    batch.write_table(table, done)
+    rows = batch.table_rows(done)
+    if as_json:
+        print(json.dumps(rows, allow_nan=False))
+    else:
+        stdout.print(tables.batch(rows))
+        _draw(rows, output / "results.png")
+        failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
+        text = f"{len(done)} of {len(todo)} done, {skipped} of them before, {failed} failed; table: {table}"
+        stdout.print(text, markup=False)
+    stop.exit_if_asked()
+    if any(each.error for each in done):
+        raise typer.Exit(1)
+
+
+def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    from aolink.plotting import batch_picture
+
+    try:
+        batch_picture(rows, path)
+    except AolinkError as error:
+        stderr.print(f"aolink: no picture: {error}", markup=False)
+    else:
+        stdout.print(f"picture: {path}", markup=False)
+
+
+def _estimate_one(
+    file: Path, estimator: Sequence[str] | None, output: Path | None, *, overwrite: bool, as_json: bool
+) -> None:
     from aolink import tables
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
@@ -71,7 +144,7 @@ def estimate(
 
     recording = open_recording(file)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
-    total = recording.counts.get("/camera/image", 0)
+    total, known = recording.counts.get("/camera/image", 0), recording.damage
     with progress_bar(stderr, total) as tell:
         if output is not None:
             write_reestimated(recording, names, output, overwrite=overwrite, progress=lambda n: tell("estimate", n))
@@ -81,6 +154,8 @@ def estimate(
         else:
             series = reestimated(recording, names, lambda n: tell("estimate", n))
         scores, differences = scored_and_compared(recording, series, names)
+    if recording.damage != known:
+        stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
     if as_json:
         print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
         return

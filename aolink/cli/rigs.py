@@ -153,6 +153,18 @@ def record(
         Light | None,
         typer.Option(help="Frames of this for `aolink calibrate`: the mirror stays parked, whatever the rig's drive."),
     ] = None,
+    split_mib: Annotated[
+        float, typer.Option(min=0, metavar="MIB", help="Begin another file at this size; 0 for one file.")
+    ] = 0.0,
+    split_s: Annotated[
+        float, typer.Option(min=0, metavar="S", help="Begin another file after this time; 0 for one file.")
+    ] = 0.0,
+    compression: Annotated[str, typer.Option(help="lz4, zstd or none.")] = "lz4",
+    chunk_kib: Annotated[int, typer.Option(metavar="KIB", help="A chunk of this size goes to the file.")] = 128,
+    flush_s: Annotated[
+        float, typer.Option(metavar="S", help="A chunk this old goes to the file: a kill loses twice this at most.")
+    ] = 0.1,
+    fsync_s: Annotated[float, typer.Option(metavar="S", help="How often the file goes to the disk.")] = 1.0,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -161,7 +173,12 @@ def record(
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
     """
     from aolink import session
+    from aolink.recording.mcap_file import WriteOptions
 
+    options = WriteOptions(
+        compression=compression, chunk_bytes=chunk_kib << 10, flush_s=flush_s, fsync_s=fsync_s,
+        split_bytes=round(split_mib * 2**20), split_s=split_s,
+    )  # fmt: skip
     loaded = load_checked(rig)
     if exposures is not None and duration is not None:
         raise typer.BadParameter("give --exposures or --duration, not both")
@@ -181,6 +198,7 @@ def record(
             note=note,
             calibration=calibration or "",
             overwrite=overwrite,
+            options=options,
             stop=stop,
             progress=lambda done: tell("exposures", done),
         )
@@ -192,7 +210,9 @@ def record(
         print(json.dumps(tables.session_as_json(report), allow_nan=False))
     else:
         stdout.print(tables.session(report))
-        text = f"{output}: {report.exposures} exposures, {report.ended}; look at it: {program()} view {output}"
+        written = report.files[0] if report.files else output
+        parts = f" in {len(report.files)} files" if len(report.files) > 1 else ""
+        text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; look at it: {program()} view {written}"
         stdout.print(text, markup=False)
     stop.exit_if_asked()
 

@@ -57,6 +57,9 @@ class Recording:
     ----------
     path:
         The file.
+    rig:
+        Use this instead of the rig that is in the file: what is estimated from it then is by another model.
+        Estimates that are in the file cannot be read with it.
     check:
         Read every byte at once, so that `losses` is known from the start. Without it, damage in the
         middle of a file that has its index is noticed when it is read.
@@ -67,7 +70,7 @@ class Recording:
         The file cannot be read, or is not a recording of aolink.
     """
 
-    def __init__(self, path: str | Path, *, check: bool = False) -> None:
+    def __init__(self, path: str | Path, *, rig: Rig | None = None, check: bool = False) -> None:
         self.path = Path(path)
         self.metadata: dict[str, str] = {}
         """Facts about the session, from its start and its end."""
@@ -87,9 +90,13 @@ class Recording:
         if rig_text is None:
             raise RecordingError(f"{self.path} is an MCAP file but not a recording of aolink: it holds no rig file")
         try:
-            self.rig: Rig = parse_rig(rig_text)
+            recorded_rig = parse_rig(rig_text)
         except RigError as error:
-            raise RecordingError(f"{self.path} holds a rig file that this aolink does not take: {error}") from None
+            if rig is None:
+                raise RecordingError(f"{self.path} holds a rig file that this aolink does not take: {error}") from None
+        else:
+            _check_replaces(rig, recorded_rig, self.path)
+        self.rig: Rig = rig or recorded_rig
 
     @property
     def losses(self) -> list[Loss]:
@@ -279,6 +286,20 @@ class Recording:
 
     def _lose(self, loss: Loss) -> None:
         self._losses.setdefault(loss.offset, loss)
+
+
+def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:
+    """Raise RigError where another rig cannot stand in for the one that a recording was made with."""
+    if rig is None:
+        return
+    for name, ours, theirs in (
+        ("mirror inputs", rig.n_inputs, recorded.n_inputs),
+        ("rows and columns of pixels", rig.sensor.shape, recorded.sensor.shape),
+        ("fast steps in an exposure", rig.timing.exposure_steps, recorded.timing.exposure_steps),
+        ("seconds in a fast step", rig.timing.fast_step_s, recorded.timing.fast_step_s),
+    ):
+        if ours != theirs:
+            raise RigError(f"the rig file has {ours} {name}, but {path} was recorded with {theirs}")
 
 
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)

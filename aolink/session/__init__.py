@@ -16,6 +16,7 @@ from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig,
 from aolink.errors import AolinkError, DeviceError, PortError
 from aolink.estimation import Driver
 from aolink.recording import topics
+from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
 from aolink.session.loop import SessionLoop
@@ -84,6 +85,7 @@ def record(
     note: str = "",
     calibration: str = "",
     overwrite: bool = False,
+    options: WriteOptions | None = None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
 ) -> Report:
@@ -104,6 +106,8 @@ def record(
     calibration:
         What the camera is shown, of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
         mirror then holds its parked input, whatever the rig's drive.
+    options:
+        How the recording is cut into chunks and files.
     stop, progress:
         Asked, and told the number of exposures so far, at least ten times a second.
 
@@ -133,7 +137,9 @@ def record(
         }
         if calibration:
             facts[topics.CALIBRATION] = calibration
-        writer = RecordingWriter(path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual)
+        writer = RecordingWriter(
+            path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, options=options
+        )
         loop = SessionLoop(rig, hub, camera, mirror, writer, driver)
         report = loop.report
         report.warnings += warnings
@@ -153,4 +159,5 @@ def record(
             report.ended = "interrupted"
             report.warnings.append(str(error))
         writer.close(report.counts())
+    report.files = [str(each) for each in writer.paths]
     return report

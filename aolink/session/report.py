@@ -44,13 +44,15 @@ class Report:
     clock_frequency_ppm: float = float("nan")
     clock_sigma_ns: float = float("nan")
     warnings: list[str] = field(default_factory=list)
+    files: list[str] = field(default_factory=list)
+    """What was written."""
     latencies: list[pb.Latency] = field(default_factory=list)
     """The newest ones, `_KEPT_LATENCIES` at most; all of them are in the recording."""
 
     def counts(self) -> dict[str, str]:
         """Everything but the latencies, as text, for the recording's metadata."""
         facts = asdict(self)
-        del facts["latencies"], facts["warnings"]
+        del facts["latencies"], facts["warnings"], facts["files"]
         return {name: str(value) for name, value in facts.items()} | {"warnings": "; ".join(self.warnings)}
 
 
