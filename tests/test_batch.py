@@ -84,7 +84,7 @@ def test_two_names_that_are_one_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_rig_of_another_camera_is_refused(recorded: Session, tmp_path: Path) -> None:
-    with pytest.raises(RigError, match="but .*session.mcap was recorded with"):
+    with pytest.raises(RigError, match=r"but .*session.mcap was recorded with"):
         Recording(recorded.path, rig=load_rig("single-lenslet"))
 
 

@@ -1,4 +1,4 @@
-"""Commands that run with devices: rig, devices, record, calibrate, demo."""
+"""Commands that run with devices: rig, devices, record, replay, calibrate, demo."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ from dataclasses import replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
 from aolink.cli.common import (
     EstimatorOption,
+    FileArgument,
     JsonOption,
     OverwriteOption,
     RigArgument,
     app,
     load_checked,
+    open_recording,
     program,
     stderr,
     stdout,
@@ -27,6 +29,9 @@ from aolink.cli.common import (
 from aolink.errors import AolinkError, RigError
 from aolink.rig import Rig, load_rig, parse_light
 from aolink.terminal import StopRequest, ask, input_ended, progress_bar
+
+if TYPE_CHECKING:
+    from aolink.recording.reader import Recording
 
 MOST_EXPOSURES = 2**32 - 1
 
@@ -214,6 +219,101 @@ def record(
         parts = f" in {len(report.files)} files" if len(report.files) > 1 else ""
         text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; look at it: {program()} view {written}"
         stdout.print(text, markup=False)
+    stop.exit_if_asked()
+
+
+@app.command(
+    epilog="Examples: aolink replay session.mcap --rate 1 --estimator moments --view"
+    "  |  aolink replay session.mcap --to-rig --camera /dev/pts/3 --mirror /dev/pts/4 -o again.mcap"
+)
+def replay(
+    file: FileArgument,
+    estimator: EstimatorOption = None,
+    rate: Annotated[
+        float, typer.Option(min=0, metavar="X", help="X times as fast as it was recorded; 0 for as fast as it goes.")
+    ] = 0.0,
+    start: Annotated[float, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")] = 0.0,
+    end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show it in Rerun as it goes on.")] = False,
+    to_rig: Annotated[bool, typer.Option("--to-rig", help="Send its commands to a rig, record anew.")] = False,
+    camera: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the camera, with --to-rig.")] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, with --to-rig.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="The new recording, with --to-rig.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Play a recording again: through the estimators as if it were live, or to a rig."""
+    recording = open_recording(file)
+    names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
+    if to_rig:
+        if not (camera and mirror and output):
+            raise typer.BadParameter("--to-rig needs --camera PORT, --mirror PORT and -o FILE")
+        _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
+        return
+    if camera or mirror or output:
+        raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
+    from contextlib import nullcontext
+
+    from aolink import tables, viewing
+    from aolink.estimation import Scorer
+    from aolink.session.replay import replay as replay_recording
+
+    scorers = {name: Scorer() for name in names}
+    viewer = viewing.live_viewer(recording.rig, names) if view else nullcontext()
+    with viewer as shown, StopRequest().installed() as stop:
+        total = recording.counts.get("/camera/image", 0)
+        with progress_bar(stderr, total if end is None and not start else None) as tell:
+            series = replay_recording(
+                recording, names, rate=rate, start_s=start, end_s=math.inf if end is None else end, stop=stop
+            )
+            for number, (exposure, estimates) in enumerate(series, 1):
+                for estimate in estimates:
+                    scorers[estimate.estimator].add(exposure, estimate)
+                if shown is not None:
+                    shown.show(exposure, estimates)
+                tell("replay", number)
+        scores = {name: scorer.result() for name, scorer in scorers.items()}
+        if as_json:
+            print(json.dumps(tables.scores_as_json(scores), allow_nan=False), flush=True)
+        else:
+            stdout.print(tables.scores(scores))
+    stop.exit_if_asked()
+
+
+def _replay_to_rig(
+    recording: Recording,
+    names: list[str],
+    camera: str,
+    mirror: str,
+    output: Path,
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    from aolink import session, tables
+    from aolink.recording.compare import compare
+    from aolink.recording.reader import Recording
+    from aolink.session.replay import RecordedCommands
+
+    commands = RecordedCommands(recording)
+    with StopRequest().installed() as stop, progress_bar(stderr, commands.exposures) as tell:
+        report = session.record(
+            recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
+            inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
+            progress=lambda done: tell("exposures", done),
+        )  # fmt: skip
+    for warning in report.warnings:
+        stderr.print(f"aolink: warning: {escape(warning)}")
+    only = ("/mirror/", "/camera/", "/estimate/", "/truth")
+    found = compare(recording, Recording(output), only=only)
+    if as_json:
+        print(json.dumps(tables.comparison_as_json(found, same_rig=True), allow_nan=False))
+    else:
+        stdout.print(tables.session(report))
+        stdout.print(tables.comparison(found))
+        stdout.print(f"{output}: {report.exposures} exposures, {report.ended}", markup=False)
     stop.exit_if_asked()
 
 

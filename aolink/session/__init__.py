@@ -19,7 +19,7 @@ from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
-from aolink.session.loop import SessionLoop
+from aolink.session.loop import Inputs, SessionLoop
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.hub import Hub
@@ -84,6 +84,7 @@ def record(
     exposures: int = 0,
     note: str = "",
     calibration: str = "",
+    inputs: Inputs | None = None,
     overwrite: bool = False,
     options: WriteOptions | None = None,
     stop: Callable[[], bool] = lambda: False,
@@ -106,6 +107,8 @@ def record(
     calibration:
         What the camera is shown, of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
         mirror then holds its parked input, whatever the rig's drive.
+    inputs:
+        What to command, instead of the rig's drive.
     options:
         How the recording is cut into chunks and files.
     stop, progress:
@@ -140,7 +143,7 @@ def record(
         writer = RecordingWriter(
             path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, options=options
         )
-        loop = SessionLoop(rig, hub, camera, mirror, writer, driver)
+        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs)
         report = loop.report
         report.warnings += warnings
         try:

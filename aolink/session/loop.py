@@ -11,8 +11,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 
+import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
+from numpy.typing import NDArray
 
 from aolink.assembly import Assembler, Frame
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
@@ -42,15 +44,27 @@ _NOT_YET = 1 << 63
 """The first fast step of a session that has not begun."""
 
 
+Inputs = Callable[[int, int], NDArray[np.float64]]
+"""First fast step since the session's start and number of steps -> what to command, (n_steps, n_inputs)."""
+
+
 class SessionLoop:
     """One session, from the first command to the last frame."""
 
     def __init__(
-        self, rig: Rig, hub: Hub, camera: Camera, mirror: Mirror, writer: RecordingWriter, driver: Driver
+        self,
+        rig: Rig,
+        hub: Hub,
+        camera: Camera,
+        mirror: Mirror,
+        writer: RecordingWriter,
+        driver: Driver,
+        inputs: Inputs | None = None,
     ) -> None:
         self.report = Report(virtual_time=hub.virtual)
         self._rig, self._hub, self._camera, self._mirror = rig, hub, camera, mirror
         self._writer, self._driver = writer, driver
+        self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
         self._first_step = _NOT_YET
@@ -168,7 +182,7 @@ class SessionLoop:
         while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
             n_steps = block_steps if end_step is None else min(block_steps, end_step - self._queued_until)
             since_start = self._queued_until - self._first_step
-            u = self._rig.drive.inputs(since_start, n_steps, self._rig.timing.fast_step_s)
+            u = self._inputs(since_start, n_steps)
             now = self._hub.now_ns()
             block = self._mirror.send_block(self._queued_until, u, self._newest_frame, now)
             self._assembler.add_command(block)

@@ -111,13 +111,15 @@ def log_history(
     exposures: Sequence[Exposure],
     paths: Paths,
     top: float,
+    *,
+    since: int = 0,
 ) -> None:
     """The last `HISTORY` exposures under each other with the paths through them: ``/camera/history``.
 
     Parameters
     ----------
     exposures:
-        In order. Each gets a picture of itself and those before it in this sequence.
+        In order. Each from number ``since`` on gets a picture of itself and those before it in this sequence.
     top:
         Density that is drawn brightest.
     """
@@ -126,19 +128,20 @@ def log_history(
     grey = np.clip(np.nan_to_num(profiles) / top, 0, 1) ** 0.7 * _BRIGHTEST
     rows = np.repeat(grey[:, :, None], 3, axis=2).astype(np.uint8)
     rows[np.isnan(profiles)] = MISSING
-    pictures = np.empty((len(exposures), HISTORY, n, 3), dtype=np.uint8)
+    drawn = range(since, len(exposures))
+    pictures = np.empty((len(drawn), HISTORY, n, 3), dtype=np.uint8)
     pictures[:] = MISSING
-    for j, exposure in enumerate(exposures):
-        pictures[j, : max(0, HISTORY - 1 - (exposure.frame_id - exposures[0].frame_id))] = NOTHING
+    for picture, j in zip(pictures, drawn, strict=True):
+        picture[: max(0, HISTORY - 1 - (exposures[j].frame_id - exposures[0].frame_id))] = NOTHING
         for k, row in _visible(exposures, j):
-            pictures[j, row] = rows[k]
+            picture[row] = rows[k]
     layout = rr.components.ImageFormat(width=n, height=HISTORY, color_model="RGB", channel_datatype="U8")
     stream.log("camera/history", rr.Image.from_fields(format=layout), static=True)
-    buffers = pictures.reshape(len(exposures), -1)
-    _send_at_starts(stream, "camera/history", timebase, exposures, rr.Image.columns(buffer=buffers))
-    _log_centroids(stream, sensor, timebase, exposures, profiles)
+    buffers = pictures.reshape(len(drawn), -1)
+    _send_at_starts(stream, "camera/history", timebase, exposures[since:], rr.Image.columns(buffer=buffers))
+    _log_centroids(stream, sensor, timebase, exposures, profiles, drawn)
     for name, by_frame in paths.items():
-        _log_history_path(stream, sensor, timebase, exposures, name, by_frame)
+        _log_history_path(stream, sensor, timebase, exposures, name, by_frame, drawn)
 
 
 def log_profile_axes(stream: rr.RecordingStream, sensor: Sensor, top: float) -> None:
@@ -221,7 +224,7 @@ def _visible(exposures: Sequence[Exposure], j: int) -> list[tuple[int, int]]:
 
 def _log_history_path(
     stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
-    by_frame: Mapping[int, FloatArray],
+    by_frame: Mapping[int, FloatArray], shown: range,
 ) -> None:  # fmt: skip
     drawn: dict[int, NDArray[np.float32]] = {}
     for k, exposure in enumerate(exposures):
@@ -231,20 +234,23 @@ def _log_history_path(
             drawn[k] = np.stack([x, (some + 0.5) / len(path)], axis=1).astype(np.float32)
     strips = [
         [drawn[k] + np.array([0, row], dtype=np.float32) for k, row in _visible(exposures, j) if k in drawn]
-        for j in range(len(exposures))
+        for j in shown
     ]
-    _send_strips(stream, f"camera/history/path/{name}", timebase, exposures, strips, colour_of(name), 1.5)
+    _send_strips(
+        stream, f"camera/history/path/{name}", timebase, exposures[shown.start :], strips, colour_of(name), 1.5
+    )
 
 
 def _log_centroids(
-    stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], profiles: FloatArray
-) -> None:
+    stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure],
+    profiles: FloatArray, shown: range,
+) -> None:  # fmt: skip
     x = [(centroid(sensor, p) - sensor.field[0]) / sensor.pixel_width for p in profiles]
-    points = [[(x[k], row + 0.5) for k, row in _visible(exposures, j)] for j in range(len(exposures))]
+    points = [[(x[k], row + 0.5) for k, row in _visible(exposures, j)] for j in shown]
     path = "camera/history/centroid"
     stream.log(path, rr.Points2D.from_fields(colors=(235, 235, 235), radii=rr.Radius.ui_points(2.5)), static=True)
     columns = rr.Points2D.columns(positions=np.concatenate([np.array(p, dtype=np.float32) for p in points]))
-    _send_at_starts(stream, path, timebase, exposures, columns.partition([len(p) for p in points]))
+    _send_at_starts(stream, path, timebase, exposures[shown.start :], columns.partition([len(p) for p in points]))
 
 
 def _send_strips(

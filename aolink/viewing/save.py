@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +18,7 @@ from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
 from aolink.exposure import Exposure
-from aolink.rig import SpotSensor
+from aolink.rig import Rig, SpotSensor
 from aolink.viewing import camera, devices, motion
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.palette import by_rank
@@ -81,7 +82,7 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
     names = by_rank(list(recording.estimators))
     estimates = {name: recording.estimates(name) for name in names}
 
-    top = _send_camera(stream, recording, timebase, exposures, estimates)
+    top = send_camera(stream, rig, timebase, exposures, estimates)
     motion.log_truth(stream, timebase, exposures)
     for sequence in estimates.values():
         motion.log_estimates(stream, timebase, sequence)
@@ -114,30 +115,38 @@ def _whole(path: Path) -> bool:
             return False
 
 
-def _send_camera(
+def send_camera(
     stream: rr.RecordingStream,
-    recording: Recording,
+    rig: Rig,
     timebase: Timebase,
     exposures: list[Exposure],
-    estimates: dict[str, list[Estimate]],
+    estimates: Mapping[str, Sequence[Estimate]],
+    *,
+    top: float | None = None,
+    since: int = 0,
 ) -> float:
-    """Send frames, history and profiles; the density at the top of the profile's plot."""
-    sensor = recording.rig.sensor
+    """Send frames, history and profiles of the exposures from number ``since`` on.
+
+    Gives the density at the top of the profile's plot, found from the exposures if ``top`` is not given.
+    """
+    sensor = rig.sensor
+    new = exposures[since:]
     outputs = {"truth": {e.frame_id: e.truth.path for e in exposures if e.truth is not None}}
     outputs |= {name: {e.frame_id: e.path for e in sequence} for name, sequence in estimates.items()}
-    camera.log_frames(stream, timebase, exposures)
+    camera.log_frames(stream, timebase, new)
     if isinstance(sensor, SpotSensor):
         for name, by_frame in outputs.items():
-            camera.log_spot_paths(stream, sensor, timebase, exposures, name, by_frame)
+            camera.log_spot_paths(stream, sensor, timebase, new, name, by_frame)
     # What follows is one slope over time: the first one.
     paths = {name: {k: path[0] for k, path in by_frame.items()} for name, by_frame in outputs.items()}
     line, seen = sensor.profile, camera.first_profiles(sensor, exposures)
-    top = camera.density_top(line, seen)
-    camera.log_history(stream, line, timebase, seen, paths, top)
-    camera.log_profile_axes(stream, line, top)
-    camera.log_measured_profile(stream, line, timebase, seen, top)
+    if top is None:
+        top = camera.density_top(line, seen)
+        camera.log_profile_axes(stream, line, top)
+    camera.log_history(stream, line, timebase, seen, paths, top, since=since)
+    camera.log_measured_profile(stream, line, timebase, seen[since:], top)
     for name, first in paths.items():
-        camera.log_predicted_profile(stream, line, timebase, seen, name, first, top)
+        camera.log_predicted_profile(stream, line, timebase, seen[since:], name, first, top)
     return top
 
 

@@ -96,7 +96,7 @@ def headless_viewer(
     path = _existing(rrd_path)
     port = free_port()
     options = ["--headless", "--port", str(port), "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
-    with tempfile.TemporaryFile() as said, _rerun(options, said) as process:
+    with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
         client = _connected(process, port, said)
         try:
             client.open(str(path))
@@ -135,7 +135,7 @@ def open_viewer(rrd_path: str | Path) -> None:
     path = _existing(rrd_path)
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
-    with tempfile.TemporaryFile() as said, _rerun([str(path), "--port", "auto"], said) as process:
+    with tempfile.TemporaryFile() as said, running_rerun([str(path), "--port", "auto"], said) as process:
         if process.wait() != 0:
             raise ViewerError(_why_it_ended(said))
 
@@ -155,7 +155,7 @@ def serve_web(rrd_path: str | Path, port: int = 9090, *, on_ready: Callable[[str
         raise ViewerError(f"port {port} is in use: stop what uses it or choose another one")
     data_port = free_port()
     options = [str(path), "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
-    with tempfile.TemporaryFile() as said, _rerun(options, said) as process:
+    with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
         for listening in (port, data_port):
             _wait_for(lambda p=listening: not _is_free(p), process, said)  # type: ignore[misc]
         if on_ready is not None:
@@ -172,7 +172,7 @@ def free_port() -> int:
 
 
 @contextmanager
-def _rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
+def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
     """Rerun's program, ended with the block."""
     process = subprocess.Popen(
         [str(_program()), "--bind", HOST, *options],
@@ -241,6 +241,11 @@ def _wait_for(ready: Callable[[], bool], process: subprocess.Popen[bytes], said:
         if time.monotonic() > deadline:
             raise ViewerError(f"Rerun did not answer within {_START_S:g} s")
         time.sleep(_POLL_S)
+
+
+def wait_for_server(port: int, process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
+    """Wait until a viewer listens. Raises `ViewerError` if it does not."""
+    _wait_for(lambda: not _is_free(port), process, said)
 
 
 def _until_loaded(client: ViewerClient) -> None:

@@ -308,3 +308,34 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> No
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session, tmp_path: Path) -> None:
+    """Frames, histories, paths and errors are those of `save_rrd`; only the brightness follows the first frame."""
+    import rerun as rr
+
+    from aolink.session.replay import replay
+    from aolink.viewing import LiveView
+
+    recording = Recording(recorded.path)
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "live.rrd")
+    live = LiveView(stream, recording.rig, recording.estimators)
+    for exposure, estimates in replay(recording, recording.estimators):
+        live.show(exposure, estimates)
+    stream.disconnect()
+    save_rrd(recording, tmp_path / "file.rrd")
+    live_entities, file_entities = (read_rrd(tmp_path / name) for name in ("live.rrd", "file.rrd"))
+    for entity, component in (
+        ("/camera/image", "Image:buffer"),
+        ("/camera/history/path/o3", "LineStrips2D:strips"),
+        ("/path/o3/mean", "Scalars:scalars"),
+        ("/error/path/o1", "Scalars:scalars"),
+        ("/status/o3", "StateChange:state"),
+    ):
+        for column in (component, "fast_step"):
+            ours, theirs = (
+                [v for v in each[entity][column] if v is not None] for each in (live_entities, file_entities)
+            )
+            assert ours == theirs, (entity, column)
+            assert ours

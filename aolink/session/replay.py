@@ -1,0 +1,112 @@
+"""A recording again: through the driver that ran live, at its own pace or another, or through a rig."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RecordingError
+from aolink.estimation import Driver, Estimate
+from aolink.exposure import Exposure
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.wire import messages_pb2 as wire
+
+
+def replay(
+    recording: Recording,
+    names: Sequence[str],
+    *,
+    rate: float = 0.0,
+    start_s: float = 0.0,
+    end_s: float = float("inf"),
+    stop: Callable[[], bool] = lambda: False,
+    now_s: Callable[[], float] = time.monotonic,
+    sleep: Callable[[float], None] = time.sleep,
+) -> Iterator[tuple[Exposure, list[Estimate]]]:
+    """Run estimators over a recording, exposure by exposure, as a session does.
+
+    Parameters
+    ----------
+    rate:
+        How much faster than it was recorded; 0 for as fast as it goes.
+    start_s, end_s:
+        Exposures that began before or after these times, in s from the first one, are left out.
+    now_s, sleep:
+        The clock that the pace is kept by.
+
+    Raises
+    ------
+    RecordingError
+        There is no exposure between the two times.
+    """
+    driver = Driver(recording.rig, names)
+    step_s = recording.rig.timing.fast_step_s
+    first_step: int | None = None
+    began: tuple[float, float] | None = None
+    for exposure in recording.exposures():
+        if first_step is None:
+            first_step = exposure.first_step
+        at_s = (exposure.first_step - first_step) * step_s
+        if not start_s <= at_s:
+            continue
+        if at_s >= end_s or stop():
+            break
+        if began is None:
+            began = (at_s, now_s())
+        elif rate > 0:
+            sleep(max(0.0, began[1] + (at_s - began[0]) / rate - now_s()))
+        yield exposure, driver.step(exposure)
+    if began is None and not stop():
+        raise RecordingError(f"{recording.path} has no exposure between {start_s:g} s and {end_s:g} s")
+
+
+class RecordedCommands:
+    """The inputs that a session commanded, for a rig to be given again.
+
+    Raises
+    ------
+    RecordingError
+        There are no commands in the recording.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._park = recording.rig.mirror.park
+        self._blocks = (
+            each.message for each in recording.messages(topics.COMMAND) if isinstance(each.message, wire.CommandBlock)
+        )
+        self._first: int | None = None
+        self._rows: dict[int, NDArray[np.float64]] = {}
+        self._known = 0
+        """First step, since the start, that no block read so far covers."""
+        if not self._read():
+            raise RecordingError(f"{recording.path} holds no commands to send again")
+        first = last = None
+        for each in recording.messages(topics.EXPOSURE):
+            last = each.message.first_step  # type: ignore[attr-defined]
+            first = last if first is None else first
+        period = recording.rig.timing.frame_period_steps
+        self.exposures = 0 if first is None or last is None else 1 + (last - first) // period
+        """How many the session had, lost ones too."""
+
+    def inputs(self, first_step: int, n_steps: int) -> NDArray[np.float64]:
+        """Inputs of fast steps counted from the session's first, (n_steps, n_inputs); must be asked for in order."""
+        while self._known < first_step + n_steps and self._read():
+            pass
+        rows = [self._rows.pop(k, self._park) for k in range(first_step, first_step + n_steps)]
+        return np.array(rows)
+
+    def _read(self) -> bool:
+        block = next(self._blocks, None)
+        if block is None:
+            return False
+        if self._first is None:
+            self._first = block.first_step
+        rows = np.array(block.u, dtype=np.float64).reshape(block.n_steps, -1)
+        since = block.first_step - self._first
+        self._rows.update(zip(range(since, since + block.n_steps), rows, strict=True))
+        self._known = max(self._known, since + block.n_steps)
+        return True

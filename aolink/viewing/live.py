@@ -1,0 +1,94 @@
+"""A session or a replay as it goes on, in a viewer: the functions that show a file, fed exposure by exposure."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import rerun as rr
+
+from aolink.errors import ViewerError
+from aolink.estimation import Estimate
+from aolink.exposure import Exposure
+from aolink.rig import Rig
+from aolink.viewing import motion
+from aolink.viewing.blueprint import Contents, blueprint
+from aolink.viewing.camera import HISTORY
+from aolink.viewing.palette import by_rank
+from aolink.viewing.save import APPLICATION, send_camera
+from aolink.viewing.timebase import Timebase
+from aolink.viewing.viewer import HOST, free_port, running_rerun, wait_for_server
+
+
+class LiveView:
+    """Sends exposures with their estimates to a viewer, one after the other."""
+
+    def __init__(self, stream: rr.RecordingStream, rig: Rig, estimators: Sequence[str]) -> None:
+        self._stream, self._rig, self._names = stream, rig, by_rank(list(estimators))
+        self._exposures: list[Exposure] = []
+        """The last ones, as many as the picture of the last exposures shows."""
+        self._estimates: dict[str, list[Estimate]] = {name: [] for name in self._names}
+        self._timebase: Timebase | None = None
+        self._top: float | None = None
+
+    def show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
+        """Show the next exposure."""
+        self._exposures = [*self._exposures[-HISTORY + 1 :], exposure]
+        for each in estimates:
+            self._estimates[each.estimator] = [*self._estimates[each.estimator][-HISTORY + 1 :], each]
+        if self._timebase is None:
+            self._timebase = Timebase.of(self._rig, [exposure])
+        since, stream, timebase = len(self._exposures) - 1, self._stream, self._timebase
+        first = self._top is None
+        self._top = send_camera(
+            stream, self._rig, timebase, self._exposures, self._estimates, top=self._top, since=since
+        )  # fmt: skip
+        motion.log_truth(stream, timebase, [exposure])
+        truths = {exposure.frame_id: exposure.truth} if exposure.truth is not None else {}
+        for each in estimates:
+            motion.log_estimates(stream, timebase, [each])
+            motion.log_errors(stream, timebase, [each], truths)
+        if first:
+            self._lay_out(exposure, estimates)
+
+    def _lay_out(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
+        contents = Contents(
+            rig=self._rig,
+            estimators=self._names,
+            measuring=[each.estimator for each in estimates if each.innovation.shape[1]],
+            density_top=self._top or 1.0,
+            truth=exposure.truth is not None,
+            commands=False,
+            clock=False,
+            link=False,
+            latency=False,
+            log=False,
+        )
+        self._stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
+
+
+@contextmanager
+def live_viewer(rig: Rig, estimators: Sequence[str]) -> Iterator[LiveView]:
+    """Open the native viewer and give what feeds it; the viewer stays until its window is closed.
+
+    Raises
+    ------
+    ViewerError
+        There is no display, or the viewer does not start.
+    """
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("there is no display for --view: record or replay without it, then `aolink view --web`")
+    port = free_port()
+    with tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process:
+        wait_for_server(port, process, said)
+        stream = rr.RecordingStream(APPLICATION)
+        stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
+        try:
+            yield LiveView(stream, rig, estimators)
+            stream.flush()
+            process.wait()
+        finally:
+            stream.disconnect()

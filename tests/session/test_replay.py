@@ -1,0 +1,95 @@
+"""A recording again: what live estimators gave, at a pace, in parts, and through a rig."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.demo import simulated_rig
+from aolink.errors import RecordingError
+from aolink.recording import topics
+from aolink.recording.compare import compare
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference
+from aolink.session.replay import RecordedCommands, replay
+from tests.conftest import ESTIMATORS, EXPOSURES, Session
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def test_a_replay_gives_what_the_session_gave(recorded: Session) -> None:
+    recording = Recording(recorded.path)
+    found = list(replay(recording, ESTIMATORS))
+    assert len(found) == EXPOSURES
+    for k, name in enumerate(ESTIMATORS):
+        assert first_difference([each[k] for _, each in found], recording.estimates(name)) is None
+
+
+class Clock:
+    """Time that passes only while one sleeps, or works."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.slept: list[float] = []
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds
+
+
+@pytest.mark.parametrize("rate", [1.0, 4.0])
+def test_the_pace_is_that_of_the_exposures(recorded: Session, rate: float) -> None:
+    clock, times = Clock(), []
+    for _ in replay(Recording(recorded.path), ["o1"], rate=rate, now_s=lambda: clock.now, sleep=clock.sleep):
+        times.append(clock.now)
+        clock.now += 0.01 / rate  # work takes time too, and does not add up
+    np.testing.assert_allclose(np.diff(times), 0.2 / rate, rtol=1e-9)
+
+
+def test_as_fast_as_it_goes_nobody_sleeps(recorded: Session) -> None:
+    clock = Clock()
+    list(replay(Recording(recorded.path), ["o1"], now_s=lambda: clock.now, sleep=clock.sleep))
+    assert clock.slept == []
+
+
+def test_a_part_only(recorded: Session) -> None:
+    frames = [each.frame_id for each, _ in replay(Recording(recorded.path), ["o1"], start_s=0.4, end_s=1.0)]
+    assert frames == [3, 4, 5]
+    with pytest.raises(RecordingError, match="no exposure between 90 s and inf s"):
+        list(replay(Recording(recorded.path), ["o1"], start_s=90.0))
+
+
+def test_the_commands_are_those_of_the_session(recorded: Session) -> None:
+    recording = Recording(recorded.path)
+    commands = RecordedCommands(recording)
+    assert commands.exposures == EXPOSURES
+    whole = np.concatenate([each.inputs for each in recording.exposures()])
+    asked = np.concatenate([commands.inputs(k, 70) for k in range(0, len(whole) + 70, 70)])
+    np.testing.assert_array_equal(recording.rig.mirror.quantise(asked[: len(whole)]), whole)
+    assert np.array_equal(asked[-1], recording.rig.mirror.park), "after the last command the mirror rests"
+
+
+def test_through_a_rig_again(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    """The simulated rig of the same seed does the same again: the two recordings are one."""
+    with simulated_rig("section-vi-lively") as (camera, mirror):
+        result = aolink(
+            "replay", recorded.path, "--to-rig", "--camera", camera, "--mirror", mirror, "-o", "again.mcap", "--json"
+        )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout)["same"] is True
+    found = compare(Recording(recorded.path), Recording(tmp_path / "again.mcap"))
+    assert {topics.IMAGE, topics.APPLIED, topics.TRUTH, "/estimate/o3"} <= found.keys()
+    assert all(each.same for each in found.values())
+
+
+def test_the_command_line(aolink: Run, recorded: Session) -> None:
+    result = aolink("replay", recorded.path, "-e", "o1", "--start", "0.4", "--json")
+    assert json.loads(result.stdout)["o1"]["exposures"] == EXPOSURES - 2
+    wrong = aolink("replay", recorded.path, "--to-rig")
+    assert wrong.returncode == 2
+    assert "--to-rig needs" in wrong.stderr
