@@ -1,0 +1,136 @@
+"""Figures of recordings: what a crash costs, what damage costs, how long the loop waits for the recorder."""
+
+from __future__ import annotations
+
+import os
+import signal
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from benchmarks.row import Row
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.reader import make_reader
+
+from aolink.recording import schemas_pb2, topics
+from aolink.recording.editing import recover
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.reader import Recording
+from aolink.recording.writer import RecordingWriter, begin_recording
+from aolink.rig import load_rig
+from aolink.wire import messages_pb2 as wire
+
+KILLS = 100
+_LOOP_S = 20.0
+
+
+def _session(path: Path, seconds: float, options: WriteOptions | None = None) -> list[float]:
+    """A 1 kHz loop that records a command, a report and, 50 times a second, a frame; times of its calls, s."""
+    image = np.random.default_rng(1).integers(100, 200, (64, 64), dtype=np.uint16)
+    spent = []
+    with RecordingWriter(path, load_rig("section-vi"), {}, time.time_ns(), options=options) as writer:
+        begin, k = time.monotonic(), 0
+        while time.monotonic() - begin < seconds:
+            now, start = time.time_ns(), time.perf_counter()
+            writer.write(topics.COMMAND, wire.CommandBlock(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
+            writer.write(topics.APPLIED, wire.Applied(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
+            if k % 20 == 0:
+                writer.write(topics.EXPOSURE, schemas_pb2.ExposureInfo(frame_id=k // 20 + 1), now)
+                frame = RawImage(width=64, height=64, encoding="mono16", step=128, data=image.tobytes())
+                writer.write(topics.IMAGE, frame, now)
+            spent.append(time.perf_counter() - start)
+            k += 1
+            time.sleep(max(0.0, begin + k * 1e-3 - time.monotonic()))
+    return spent
+
+
+def kill_at_any_moment() -> Row:
+    """SIGKILL at random moments of a session that records in real time: the age of the oldest message lost."""
+    rng = np.random.default_rng(1)
+    ages, unreadable = [], 0
+    with tempfile.TemporaryDirectory() as folder:
+        for k in range(KILLS):
+            path = Path(folder) / f"{k}.mcap"
+            child = os.fork()
+            if not child:
+                _session(path, 60.0)
+                os._exit(0)
+            time.sleep(0.3 + 0.4 * rng.random())
+            killed = time.time_ns()
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            try:
+                result = recover(path, Path(folder) / "whole.mcap", overwrite=True)
+                recording = Recording(result.path)
+                sequences = [each.sequence for each in recording.messages()]
+                assert sequences == list(range(1, len(sequences) + 1))
+                ages.append((killed - recording.end_ns) / 1e6)
+            except Exception as error:
+                print(f"kill {k}: {error!r}")
+                unreadable += 1
+    worst = max(ages) if not unreadable else float("inf")
+    ours = f"{worst:.0f} ms lost at worst, median {statistics.median(ages):.0f}"
+    return Row(f"kill -9 at a random moment, {KILLS} times, all recovered", ours, "limit 200 ms", 200 / worst, 1.0)
+
+
+def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
+    """A recording of several MB, and of each chunk its first byte, the byte after its last, and its messages."""
+    path = folder / "long.mcap"
+    file = McapFile(path, WriteOptions())
+    begin_recording(file, load_rig("section-vi"), {}, 0)
+    rng = np.random.default_rng(2)
+    for k in range(3000):
+        data = RawImage(width=32, height=32, encoding="mono16", step=64, data=rng.bytes(2048)).SerializeToString()
+        file.add(topics.IMAGE, schema_of(RawImage), data, k * 5_000_000, k + 1)
+    file.finish()
+    with path.open("rb") as opened:
+        reader = make_reader(opened)
+        summary = reader.get_summary()
+        counts = [
+            sum(1 for _ in reader.iter_messages(starting_at=each.message_start_time, ending_at=each.message_end_time))
+            for each in summary.chunk_indexes
+        ]
+    spans = [(each.chunk_start_offset, each.chunk_start_offset + each.chunk_length) for each in summary.chunk_indexes]
+    return path.read_bytes(), [(*span, count) for span, count in zip(spans, counts, strict=True)]
+
+
+def truncation() -> Row:
+    """Cut off at 500 sampled bytes of the last megabyte: messages that come back of those in whole chunks."""
+    with tempfile.TemporaryDirectory() as name:
+        data, chunks = _many_chunks(Path(name))
+        due = found = 0
+        for size in np.random.default_rng(3).integers(len(data) - (1 << 20), len(data), 500):
+            (path := Path(name) / "cut.mcap").write_bytes(data[:size])
+            due += sum(count for _, end, count in chunks if end <= size)
+            found += sum(Recording(path).counts.values())
+    return Row(
+        "cut off at 500 bytes of the last MB", f"{found} messages back", f"{due} in whole chunks", found / due, 1.0
+    )
+
+
+def flipped_bits() -> Row:
+    """20 random bits flipped, 200 times: messages that come back of those in chunks that were not hit."""
+    rng = np.random.default_rng(4)
+    with tempfile.TemporaryDirectory() as name:
+        data, chunks = _many_chunks(Path(name))
+        due = found = 0
+        for _ in range(200):
+            damaged, hits = bytearray(data), rng.integers(16, len(data), 20)
+            for byte in hits:
+                damaged[byte] ^= 1 << int(rng.integers(8))
+            (path := Path(name) / "flipped.mcap").write_bytes(damaged)
+            due += sum(count for start, end, count in chunks if not ((start <= hits) & (hits < end)).any())
+            found += sum(Recording(path, check=True).counts.values())
+    return Row("20 bits flipped, 200 times", f"{found} messages back", f"{due} in whole chunks", found / due, 1.0)
+
+
+def loop_stall() -> Row:
+    """The longest time that a 1 kHz loop waits for the recorder, in 20 s."""
+    with tempfile.TemporaryDirectory() as folder:
+        spent = np.array(_session(Path(folder) / "a.mcap", _LOOP_S)) * 1e3
+    p999, worst = np.percentile(spent, 99.9), spent.max()
+    return Row(
+        "loop's wait for the recorder, 1 kHz", f"worst {worst:.2f} ms, 99.9 % {p999:.2f}", "limit 5 ms", 5 / worst, 1.0
+    )
