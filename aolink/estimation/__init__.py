@@ -9,6 +9,7 @@ from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.observation import PathMoments
 from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.windowed import Profile, WindowedMoments
+from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.estimation.windows import Window, measure_windows
 
 __all__ = [
@@ -25,9 +26,11 @@ __all__ = [
     "Profile",
     "Score",
     "Scorer",
+    "SpotWindows",
     "Status",
     "Window",
     "WindowedMoments",
+    "WindowedSpots",
     "exposure_model",
     "make_estimator",
     "measure_moments",

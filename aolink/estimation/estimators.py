@@ -27,9 +27,11 @@ from aolink.estimation.moments import (
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
 from aolink.estimation.spots import centroid_noise, measure_spots
 from aolink.estimation.windowed import Basis, Profile, WindowedMoments
+from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
 from aolink.rig import Rig, SpotSensor
+from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 Engine = Literal["aolink", "filterpy"]
@@ -136,7 +138,7 @@ class Estimator:
 
 def measure(
     rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options
-) -> tuple[Measurement | Profile | None, str]:
+) -> tuple[Measurement | Profile | SpotWindows | None, str]:
     """What an observation takes of an exposure, or nothing; and what there is to say about it."""
     if observation is None:
         return None, ""
@@ -242,10 +244,9 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
         engine = FilterpyMoments if options.engine == "filterpy" else PathMoments
         return engine(rig.plant.n_outputs, _PAPER_ORDERS[name], gain)
     if rig.plant.n_outputs > 1:
-        raise EstimatorError(
-            f"{name} looks at one output of each copy of the plant, {rig.name} has {rig.plant.n_outputs}: use"
-            f" {', '.join(_PAPER_ORDERS)}"
-        )
+        assert isinstance(rig.sensor, SpotSensor)
+        spots = rig.plant.n_outputs // 2
+        return WindowedSpots(rig.sensor, spots, options.orders, basis=options.basis, flux=options.flux)
     return WindowedMoments(rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux)
 
 
@@ -261,8 +262,15 @@ def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     if sensor.photoelectrons:
         # y_2 / photoelectrons, of a spot where the plant's prior has it.
         spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
-        noise = noise + np.diag(spread + sensor.kernel.variance) / sensor.photoelectrons
+        noise = noise + np.diag(spread + _kernel_variances(sensor, plant.n_outputs)) / sensor.photoelectrons
     return steady_gain(model, added_noise(model, options.process_noise), noise)
+
+
+def _kernel_variances(sensor: BaseSensor, n_outputs: int) -> FloatArray:
+    """Variance of the kernel along each output of one copy, (n_outputs,)."""
+    if n_outputs == 1:
+        return np.array([sensor.kernel.variance])
+    return np.tile(np.diag(sensor.kernel.covariance), n_outputs // 2)
 
 
 # From good to bad; the worst of all axes is the estimate's status.
