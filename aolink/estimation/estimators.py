@@ -90,7 +90,7 @@ class Estimator:
 
         ``response``, to the exposure's inputs, saves computing it again.
         """
-        model = exposure_model(self.rig.plant, exposure.n_steps)
+        model = exposure_model(self.rig.plant, exposure.n_steps, exposure.start_offset)
         reasons = self._bridge(exposure)
         response = response or model.response(exposure.inputs)
         measured, remark = measure(self.rig, exposure, self._observation, self.options)
@@ -222,7 +222,8 @@ class Driver:
 
     def step(self, exposure: Exposure) -> list[Estimate]:
         """What each of them says about an exposure, in the order of the names."""
-        response = exposure_model(self.rig.plant, exposure.n_steps).response(exposure.inputs)
+        model = exposure_model(self.rig.plant, exposure.n_steps, exposure.start_offset)
+        response = model.response(exposure.inputs)
         return [estimator.step(exposure, response) for estimator in self.estimators]
 
 
@@ -252,7 +253,7 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file; None where there is none."""
-    model = exposure_model(rig.plant, rig.timing.exposure_steps)
+    model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
     sensor, plant = rig.sensor, rig.plant
     if isinstance(sensor, SpotSensor):
         noise = centroid_noise(sensor, plant.n_outputs)

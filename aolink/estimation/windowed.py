@@ -342,11 +342,17 @@ def _nodes(model: ExposureModel, response: InputResponse, most: int = _MOST_NODE
     length = -(-model.n_steps // most)
     first = np.arange(0, model.n_steps, length)
     sizes = np.diff(np.append(first, model.n_steps))
-    return Nodes(
-        basis=np.add.reduceat(model.basis, first, axis=1) / sizes[:, None],
-        weights=sizes / model.n_steps,
-        inputs=np.add.reduceat(response.path, first, axis=2) / sizes,
-    )
+    basis = np.add.reduceat(model.basis, first, axis=1) / sizes[:, None]
+    weights = sizes / model.n_steps
+    inputs = np.add.reduceat(response.path, first, axis=2) / sizes
+    if model.moved:
+        # So much of the first step is not in the exposure, but in the step after its last.
+        ends = (model.basis[:, 0], model.plant.C @ model.end_rows)
+        late = (response.path[:, :, 0], model.last_response(response.end))
+        basis = np.concatenate([basis, np.stack(ends, axis=1)], axis=1)
+        weights = np.append(weights, [-model.moved, model.moved])
+        inputs = np.concatenate([inputs, np.stack(late, axis=2)], axis=2)
+    return Nodes(basis=basis, weights=weights, inputs=inputs)
 
 
 def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
