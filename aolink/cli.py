@@ -50,6 +50,13 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 _MOST_EXPOSURES = 2**32 - 1
 
 
+class Engine(StrEnum):
+    """What o1 to o3 run on."""
+
+    AOLINK = "aolink"
+    FILTERPY = "filterpy"
+
+
 class Light(StrEnum):
     """What a recording for a calibration shows."""
 
@@ -333,6 +340,9 @@ def estimate(
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="A copy with the new estimates.")
     ] = None,
+    engine: Annotated[
+        Engine, typer.Option(help="What the filters run on; filterpy: o1 to o3, a plant of one axis, slowly.")
+    ] = Engine.AOLINK,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -351,12 +361,15 @@ def estimate(
     total = recording.counts.get("/camera/image", 0)
     with progress_bar(_err, total) as tell:
         if output is not None:
-            write_reestimated(recording, names, output, overwrite=overwrite, progress=lambda n: tell("estimate", n))
+            write_reestimated(
+                recording, names, output,
+                overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
+            )  # fmt: skip
             written = Recording(output)
             each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
             series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
         else:
-            series = reestimated(recording, names, lambda n: tell("estimate", n))
+            series = reestimated(recording, names, lambda n: tell("estimate", n), engine.value)
         scores, differences = scored_and_compared(recording, series, names)
     if as_json:
         print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))

@@ -1,7 +1,7 @@
 """Estimation: the motion inside each exposure, from its blur. Pure: no time, no files, no ports."""
 
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.estimators import ESTIMATOR_NAMES, Driver, Estimator, Options, make_estimator, run
+from aolink.estimation.estimators import ESTIMATOR_NAMES, Driver, Engine, Estimator, Options, make_estimator, run
 from aolink.estimation.exposure_model import ExposureModel, exposure_model, path_from_coefficients
 from aolink.estimation.filter import BlurFilter
 from aolink.estimation.moments import Measurement, measure_moments
@@ -17,6 +17,7 @@ __all__ = [
     "BlurFilter",
     "Consistency",
     "Driver",
+    "Engine",
     "Estimate",
     "Estimator",
     "ExposureModel",

@@ -209,16 +209,19 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
     if chosen.engine == "filterpy" and (name not in _PAPER_ORDERS or rig.plant.axes != 1):
-        raise EstimatorError(f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, not this")
+        raise EstimatorError(
+            f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, this is {name} with"
+            f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
+        )
     return Estimator(rig, name, chosen)
 
 
 class Driver:
-    """Several estimators side by side, exposure by exposure."""
+    """Several estimators side by side, exposure by exposure, on one engine."""
 
-    def __init__(self, rig: Rig, names: Sequence[str]) -> None:
+    def __init__(self, rig: Rig, names: Sequence[str], engine: Engine = "aolink") -> None:
         self.rig = rig
-        self.estimators = [make_estimator(rig, name) for name in names]
+        self.estimators = [make_estimator(rig, name, engine=engine) for name in names]
 
     def step(self, exposure: Exposure) -> list[Estimate]:
         """What each of them says about an exposure, in the order of the names."""
