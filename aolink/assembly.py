@@ -40,13 +40,15 @@ class Frame:
     host_start_ns: int = 0
     """Start of the exposure on the host's clock, as estimated; 0 where there is no estimate."""
     clock_sigma_ns: float = float("nan")
+    exposure_offset_ns: int = 0
+    """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
 
 
 class FrameReassembly:
     """Chunks of frames of ``shape`` (rows, columns) become frames. Lost chunks leave masked pixels."""
 
-    def __init__(self, shape: tuple[int, int]) -> None:
-        self._shape = shape
+    def __init__(self, shape: tuple[int, int], fast_step_ns: int) -> None:
+        self._shape, self._fast_step_ns = shape, fast_step_ns
         self._parts: list[pb.FrameChunk] = []
         self._first_byte_ns = self._last_byte_ns = 0
         self._last_id: int | None = None
@@ -82,6 +84,7 @@ class FrameReassembly:
             and (chunk.height, chunk.width) == self._shape
             and chunk.first_step == first.first_step
             and chunk.last_step >= chunk.first_step
+            and chunk.exposure_offset_ns == first.exposure_offset_ns < self._fast_step_ns
         )
 
     def _close(self) -> Frame:
@@ -107,6 +110,7 @@ class FrameReassembly:
             device_end_ns=first.exposure_end_ns,
             host_first_byte_ns=self._first_byte_ns,
             host_receive_ns=self._last_byte_ns,
+            exposure_offset_ns=first.exposure_offset_ns,
         )
 
 
@@ -175,6 +179,7 @@ class Assembler:
 
     def __init__(self, rig: Rig) -> None:
         self._history = _InputHistory(rig.n_inputs, rig.mirror.park)
+        self._fast_step_ns = rig.timing.fast_step_ns
         self._frames: deque[Frame] = deque()
         self._end: int | None = None
 
@@ -218,6 +223,7 @@ class Assembler:
             mask=frame.mask,
             inputs=inputs,
             lead_inputs=lead,
+            start_offset=frame.exposure_offset_ns / self._fast_step_ns,
             inputs_assumed=assumed + lead_assumed,
             chunks_lost=frame.chunks_lost,
             device_start_ns=frame.device_start_ns,

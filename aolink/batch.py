@@ -21,7 +21,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from aolink.errors import AolinkError, RigError
-from aolink.estimation import Scorer
+from aolink.estimation import Engine, Scorer
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import recorded_estimates, write_reestimated
 from aolink.rig import parse_rig
@@ -62,6 +62,7 @@ class Job:
     estimators: tuple[str, ...]
     """Empty: those that the recording has."""
     output: Path
+    engine: Engine = "aolink"
 
     @property
     def record(self) -> Path:
@@ -71,8 +72,20 @@ class Job:
     def digest(self) -> str:
         """Of everything that the result depends on: a job with the same digest need not be done again."""
         status = self.source.stat()
-        facts = [str(self.source.resolve()), status.st_size, status.st_mtime_ns, version("aolink"), self.estimators]
-        facts += [self.model.rig_text, [[key, str(value)] for key, value in self.model.changes]]
+        facts = [
+            str(self.source.resolve()),
+            status.st_size,
+            status.st_mtime_ns,
+            version("aolink"),
+            self.estimators,
+            self.engine,
+        ]
+        facts += [
+            self.estimators,
+            self.engine,
+            self.model.rig_text,
+            [[key, str(value)] for key, value in self.model.changes],
+        ]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
 
@@ -108,13 +121,19 @@ def models(rig_text: str | None, settings: Sequence[str]) -> list[Model]:
     ]
 
 
-def jobs(sources: Sequence[Path], each: Sequence[Model], estimators: Sequence[str], folder: Path) -> list[Job]:
+def jobs(
+    sources: Sequence[Path],
+    each: Sequence[Model],
+    estimators: Sequence[str],
+    folder: Path,
+    engine: Engine = "aolink",
+) -> list[Job]:
     """Every recording with every model. Raises RigError if two would write the same file."""
     made = []
     for source, model in itertools.product(sources, each):
         suffix = "".join(c if c.isalnum() or c in "=.-_" else "-" for c in model.name.replace("plant.", ""))
         name = f"{source.stem}-{suffix}" if suffix else source.stem
-        made.append(Job(source, model, tuple(dict.fromkeys(estimators)), folder / f"{name}.mcap"))
+        made.append(Job(source, model, tuple(dict.fromkeys(estimators)), folder / f"{name}.mcap", engine))
     names = [job.output for job in made]
     if doubled := {name for name in names if names.count(name) > 1}:
         raise RigError(f"two recordings would be written as {doubled.pop().name}: give them different names")
@@ -231,7 +250,7 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     if text != recording.rig.toml:
         recording = Recording(job.source, rig=parse_rig(text))
     names = list(job.estimators or recording.estimators or ["o3"])
-    write_reestimated(recording, names, target, overwrite=True)
+    write_reestimated(recording, names, target, overwrite=True, engine=job.engine)
     seconds = time.perf_counter() - begin
     written = Recording(target)
     scorers, not_ok = {name: Scorer() for name in names}, dict.fromkeys(names, 0)

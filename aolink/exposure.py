@@ -38,7 +38,7 @@ class Exposure:
     first_step: int
     """Fast step at which the exposure starts."""
     n_steps: int
-    """Fast steps in the exposure."""
+    """N, the exposure's length in fast steps."""
     pixels: NDArray[np.uint16]
     """Counts, (rows, columns)."""
     mask: NDArray[np.bool_]
@@ -49,6 +49,12 @@ class Exposure:
     """Inputs from the end of the exposure before this one to its start, (k, n_inputs).
 
     Empty where exposures follow each other without a gap; a lost frame or dead time makes it longer.
+    """
+    start_offset: float = 0.0
+    """f, how far into its first fast step the exposure starts, in fast steps, 0 <= f < 1.
+
+    It ends as far into the step after its last, and takes 1 - f of the first and f of that one. States and path
+    are those of whole fast steps all the same: the start state at ``first_step``, the end state ``n_steps`` later.
     """
     inputs_assumed: int = 0
     """Steps of ``inputs`` and ``lead_inputs`` that the device's report is missing for: they hold what was commanded."""

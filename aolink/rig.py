@@ -71,7 +71,7 @@ class Plant:
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """Fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j * ``frame_period_steps``."""
+    """Fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j * ``frame_period_steps`` on."""
 
     fast_step_s: float
     """T_f, s."""
@@ -79,10 +79,16 @@ class Timing:
     """N, fast steps in one exposure."""
     frame_period_steps: int
     """Fast steps from the start of one exposure to the start of the next; at least N."""
+    exposure_offset: float = 0.0
+    """How far into its first fast step an exposure starts, in fast steps, below one; it ends as far into a step."""
 
     @property
     def fast_step_ns(self) -> int:
         return round(self.fast_step_s * 1e9)
+
+    @property
+    def exposure_offset_ns(self) -> int:
+        return round(self.exposure_offset * self.fast_step_ns)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -317,8 +323,16 @@ def _timing(table: Table) -> Timing:
         raise RigError(f"timing.frame_period_steps = {period} is shorter than timing.exposure_steps = {steps}")
     if abs(fast_step_s * 1e9 - round(fast_step_s * 1e9)) > 1e-6:
         raise RigError(f"timing.fast_step_s = {fast_step_s!r} is not a whole number of nanoseconds")
+    offset = table.number("exposure_offset", 0.0, low=0.0)
+    if offset >= 1:
+        raise RigError(f"timing.exposure_offset = {offset:g} is a part of a fast step: it must be below 1")
+    offset_ns = offset * fast_step_s * 1e9
+    if abs(offset_ns - round(offset_ns)) > 1e-6:
+        raise RigError(f"timing.exposure_offset = {offset!r} of a fast step is not a whole number of nanoseconds")
     table.finish()
-    return Timing(fast_step_s=fast_step_s, exposure_steps=steps, frame_period_steps=period)
+    return Timing(
+        fast_step_s=fast_step_s, exposure_steps=steps, frame_period_steps=period, exposure_offset=offset
+    )  # fmt: skip
 
 
 def _mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:

@@ -23,16 +23,27 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Kernel:
-    """Image kernel Psi, the spot that a resting beam makes; of unit mass. On a plane it is round."""
+    """Image kernel Psi, the spot that a resting beam makes; of unit mass."""
 
     shape: Literal["gaussian"]
     sigma: float
-    """Width, slope units, in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2."""
+    """Width, slope units, in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2.
+
+    Of a kernel that is not round, that of the round one whose variance is the mean of both directions'.
+    """
+    matrix: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """Sigma of Psi = exp(-w' Sigma^-2 w) / (pi |Sigma|), Mishra & Wen (4), symmetric; None where it is round."""
 
     @property
     def variance(self) -> float:
-        """Variance of the kernel, slope units squared."""
+        """Variance of the kernel in one direction, slope units squared."""
         return self.sigma**2 / 2
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the kernel on a plane, Sigma^2/2, slope units squared, (2, 2)."""
+        width = self.sigma * np.eye(2) if self.matrix is None else np.array(self.matrix)
+        return np.asarray(width @ width / 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +196,12 @@ class SpotSensor(BaseSensor):
     @property
     def peak_density(self) -> float:
         """Density of a pixel at whose middle a spot rests, one over slope units squared."""
-        return (math.erf(self.pixel_width / 2 / self.kernel.sigma) / self.pixel_width) ** 2
+        half = self.pixel_width / 2
+        if self.kernel.matrix is None:
+            return (math.erf(half / self.kernel.sigma) / self.pixel_width) ** 2
+        # To the second order in a pixel's width over the kernel's.
+        covariance = self.kernel.covariance + np.eye(2) * half**2 / 3
+        return 1 / (2 * math.pi * math.sqrt(float(np.linalg.det(covariance))))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +238,10 @@ def _line(table: Table, outputs: int) -> Sensor:
         raise RigError(
             f"sensor.kind = 'line' sees one slope, but the plant has {outputs} (plant.axes times the rows of plant.C)"
         )
-    return Sensor(kind="line", pixels=table.integer("pixels", low=2, high=65_536), **_read_out(table))
+    sensor = Sensor(kind="line", pixels=table.integer("pixels", low=2, high=65_536), **_read_out(table))
+    if sensor.kernel.matrix is not None:
+        raise RigError("sensor.kernel.sigma is a matrix, but a line sensor sees one direction: give a number")
+    return sensor
 
 
 def _spots(table: Table, axes: int, n_outputs: int) -> SpotSensor:
@@ -239,7 +258,13 @@ def _spots(table: Table, axes: int, n_outputs: int) -> SpotSensor:
         raise RigError(
             f"plant.C has {n_outputs} rows: for sensor.kind = 'spots' it needs one, or two for each spot that it moves"
         )
-    return SpotSensor(kind="spots", grid=(rows, columns), window=(height, width), **_read_out(table))
+    sensor = SpotSensor(kind="spots", grid=(rows, columns), window=(height, width), **_read_out(table))
+    if sensor.kernel.matrix is not None and n_outputs == 1:
+        raise RigError(
+            "sensor.kernel.sigma is a matrix, but each copy of the plant moves a spot along one direction only: give a"
+            " number, or a plant.C with two rows for each spot that a copy moves"
+        )
+    return sensor
 
 
 def _read_out(table: Table) -> dict[str, Any]:
@@ -248,7 +273,7 @@ def _read_out(table: Table) -> dict[str, Any]:
     if field[0] >= field[1]:
         raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
     kernel_table = table.table("kernel")
-    kernel = Kernel(shape=kernel_table.choice("shape", ("gaussian",)), sigma=kernel_table.number("sigma", above=0.0))
+    kernel = _kernel(kernel_table)
     kernel_table.finish()
     return {
         "field": (float(field[0]), float(field[1])),
@@ -259,6 +284,18 @@ def _read_out(table: Table) -> dict[str, Any]:
         "counts_per_density": table.number("counts_per_density", above=0.0),
         "photoelectrons": table.number("photoelectrons", 0.0, low=0.0),
     }
+
+
+def _kernel(table: Table) -> Kernel:
+    shape = table.choice("shape", ("gaussian",))
+    if not isinstance(table.get("sigma"), list):
+        return Kernel(shape=shape, sigma=table.number("sigma", above=0.0))
+    width = table.matrix("sigma", (2, 2), "Sigma of the plane, or a number for a round kernel")
+    if width[0, 1] != width[1, 0] or float(np.linalg.eigvalsh(width).min()) <= 0:
+        raise RigError(f"{table.key('sigma')} = {width.tolist()} must be symmetric and positive definite")
+    (xx, xy), (_, yy) = width.tolist()
+    mean = math.sqrt((xx * xx + yy * yy) / 2 + xy * xy)  # of Sigma^2's diagonal
+    return Kernel(shape=shape, sigma=mean, matrix=((xx, xy), (xy, yy)))
 
 
 def read_calibration(table: Table) -> CalibrationTable:

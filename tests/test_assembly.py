@@ -40,7 +40,7 @@ def feed(reassembly: FrameReassembly, parts: list[pb.FrameChunk]) -> list[Frame]
 
 
 def test_a_whole_frame() -> None:
-    (frame,) = feed(FrameReassembly(SHAPE), chunks(5))
+    (frame,) = feed(FrameReassembly(SHAPE, 1_000_000), chunks(5))
     assert np.array_equal(frame.pixels, PICTURE)
     assert frame.mask.all()
     assert (frame.frame_id, frame.first_step, frame.last_step, frame.chunks_lost) == (5, 1000, 1199, 0)
@@ -50,7 +50,7 @@ def test_a_whole_frame() -> None:
 
 @given(st.sets(st.integers(0, 5), max_size=5), st.integers(60, 200))
 def test_lost_chunks_are_masked_and_counted(lost: set[int], size: int) -> None:
-    reassembly = FrameReassembly(SHAPE)
+    reassembly = FrameReassembly(SHAPE, 1_000_000)
     parts = chunks(1, size)
     kept = [part for i, part in enumerate(parts) if i not in lost]
     frames = feed(reassembly, kept) + reassembly.flush()
@@ -70,14 +70,14 @@ def test_lost_chunks_are_masked_and_counted(lost: set[int], size: int) -> None:
 
 
 def test_a_lost_last_chunk_shows_with_the_next_frame() -> None:
-    reassembly = FrameReassembly(SHAPE)
+    reassembly = FrameReassembly(SHAPE, 1_000_000)
     assert feed(reassembly, chunks(1)[:-1]) == []
     first, second = feed(reassembly, chunks(2))
     assert (first.chunks_lost, second.chunks_lost) == (1, 0)
 
 
 def test_lost_frames_are_counted() -> None:
-    frames = feed(FrameReassembly(SHAPE), chunks(1) + chunks(2) + chunks(6))
+    frames = feed(FrameReassembly(SHAPE, 1_000_000), chunks(1) + chunks(2) + chunks(6))
     assert [frame.frames_lost_before for frame in frames] == [0, 0, 3]
 
 
@@ -89,15 +89,16 @@ def test_a_chunk_that_makes_no_sense_is_refused() -> None:
         {"total": 602},
         {"width": 2**31, "total": 2**32 - 1},
         {"last_step": 0},
+        {"exposure_offset_ns": 1_000_000},
         {"data": b""},
     ):
-        reassembly, bad = FrameReassembly(SHAPE), pb.FrameChunk()
+        reassembly, bad = FrameReassembly(SHAPE, 1_000_000), pb.FrameChunk()
         bad.CopyFrom(good[0])
         for name, value in change.items():
             setattr(bad, name, value)
         assert reassembly.add(bad, 0) == []
         assert reassembly.refused == 1, change
-    reassembly = FrameReassembly(SHAPE)
+    reassembly = FrameReassembly(SHAPE, 1_000_000)
     feed(reassembly, good)
     assert feed(reassembly, good[:2]) == []  # the frame is over
     assert reassembly.refused == 2

@@ -229,3 +229,37 @@ def test_check_says_what_is_wrong_and_what_is_lost(
     assert result.returncode == 0, result.stdout + result.stderr
     assert re.search(r"warning .*10(\.0+)? Hz", result.stdout), result.stdout
     assert "warning: timing.exposure_steps: the centroid" in aolink("rig", "lost.toml", "--listen", "nonsense").stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "sigma", "message"),
+    [
+        (
+            "single-lenslet",
+            "[[0.1, 0.02], [0.02, 0.1]]",
+            "each copy of the plant moves a spot along one direction only",
+        ),
+        ("section-vi", "[[0.1, 0.02], [0.02, 0.1]]", "a line sensor sees one direction: give a number"),
+        ("single-lenslet", "[[0.1, 0.02], [0.03, 0.1]]", "must be symmetric and positive definite"),
+        ("single-lenslet", "[[0.1, 0.2], [0.2, 0.1]]", "must be symmetric and positive definite"),
+        ("single-lenslet", "[0.1, 0.02]", r"sensor.kernel.sigma has shape 2, expected 2 x 2 \(Sigma of the plane"),
+    ],
+)
+def test_a_kernel_that_cannot_be_is_refused(name, sigma, message):
+    text = re.sub(r"\nsigma = [0-9.]+", f"\nsigma = {sigma}", load_rig(name).toml)
+    with pytest.raises(RigError, match=message):
+        parse_rig(text)
+
+
+def test_a_kernel_on_a_plane_is_that_of_equation_4():
+    text = load_rig("single-lenslet").toml
+    for old, new in (
+        ("axes = 2", "axes = 1"), ("C = [[1.0, 0.0]]", "C = [[1.0, 0.0], [0.5, 0.1]]"),
+        ("amplitude = [0.0087, 0.0044]", "amplitude = 0.0087"), ("sigma = 0.1", "sigma = [[0.12, 0.03], [0.03, 0.08]]"),
+    ):  # fmt: skip
+        assert old in text
+        text = text.replace(old, new)
+    kernel = parse_rig(text).sensor.kernel
+    width = np.array([[0.12, 0.03], [0.03, 0.08]])
+    np.testing.assert_allclose(kernel.covariance, width @ width / 2)
+    assert kernel.variance == pytest.approx(np.trace(kernel.covariance) / 2)

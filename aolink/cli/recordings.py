@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,6 +32,13 @@ if TYPE_CHECKING:
     from aolink.recording.editing import Edited
 
 
+class Engine(StrEnum):
+    """What o1 to o3 run on."""
+
+    AOLINK = "aolink"
+    FILTERPY = "filterpy"
+
+
 @app.command(epilog="Example: aolink info session.mcap --json")
 def info(
     file: FileArgument,
@@ -51,7 +59,7 @@ def info(
 
 
 @app.command(
-    epilog="Examples: aolink estimate session.mcap -e o1 -e o3 -o again.mcap"
+    epilog="Example: aolink estimate session.mcap -e o1 -e o3 -o again.mcap"
     "  |  aolink estimate *.mcap -e moments --set plant.process_noise=0.2,0.4 --jobs 2 -o results/"
 )
 def estimate(
@@ -73,6 +81,9 @@ def estimate(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE,...", help="Change a value of the rig file; each value is a model."),
     ] = None,
+    engine: Annotated[
+        Engine, typer.Option(help="What the filters run on; filterpy: o1 to o3, a plant of one axis, slowly.")
+    ] = Engine.AOLINK,
     jobs: Annotated[int, typer.Option(min=1, help="How many recordings at once.")] = 1,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write the table as Parquet, not as CSV.")] = False,
     overwrite: OverwriteOption = False,
@@ -84,7 +95,7 @@ def estimate(
     fails does not stop the others (exit code 1 then).
     """
     if len(files) == 1 and not rig and not settings and not (output and output.is_dir()):
-        _estimate_one(files[0], estimator, output, overwrite=overwrite, as_json=as_json)
+        _estimate_one(files[0], estimator, output, engine, overwrite=overwrite, as_json=as_json)
         return
     from aolink import batch, tables
     from aolink.rig import load_rig
@@ -92,7 +103,7 @@ def estimate(
     if output is None:
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
     models = batch.models(load_rig(rig).toml if rig else None, settings or [])
-    todo = batch.jobs(files, models, estimator or [], output)
+    todo = batch.jobs(files, models, estimator or [], output, engine.value)
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -131,7 +142,7 @@ def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _estimate_one(
-    file: Path, estimator: Sequence[str] | None, output: Path | None, *, overwrite: bool, as_json: bool
+    file: Path, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *, overwrite: bool, as_json: bool
 ) -> None:
     from aolink import tables
     from aolink.recording.reader import Recording
@@ -147,12 +158,15 @@ def _estimate_one(
     total, known = recording.counts.get("/camera/image", 0), recording.damage
     with progress_bar(stderr, total) as tell:
         if output is not None:
-            write_reestimated(recording, names, output, overwrite=overwrite, progress=lambda n: tell("estimate", n))
+            write_reestimated(
+                recording, names, output,
+                overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
+            )  # fmt: skip
             written = Recording(output)
             each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
             series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
         else:
-            series = reestimated(recording, names, lambda n: tell("estimate", n))
+            series = reestimated(recording, names, lambda n: tell("estimate", n), engine.value)
         scores, differences = scored_and_compared(recording, series, names)
     if recording.damage != known:
         stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)

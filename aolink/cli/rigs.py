@@ -223,7 +223,7 @@ def record(
 
 
 @app.command(
-    epilog="Examples: aolink replay session.mcap --rate 1 --estimator moments --view"
+    epilog="Example: aolink replay session.mcap --rate 1 --estimator moments --view"
     "  |  aolink replay session.mcap --to-rig --camera /dev/pts/3 --mirror /dev/pts/4 -o again.mcap"
 )
 def replay(

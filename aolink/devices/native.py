@@ -64,7 +64,7 @@ class NativeCamera(_NativeDevice):
 
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
         super().__init__(hub, link, identity)
-        self._frames = FrameReassembly((identity.camera.height, identity.camera.width))
+        self._frames = FrameReassembly((identity.camera.height, identity.camera.width), identity.fast_step_ns)
         self._truths = TruthReassembly()
 
     def start(self, first_step: int, exposures: int) -> None:

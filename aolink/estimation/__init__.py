@@ -1,7 +1,7 @@
 """Estimation: the motion inside each exposure, from its blur. Pure: no time, no files, no ports."""
 
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.estimators import ESTIMATOR_NAMES, Driver, Estimator, Options, make_estimator, run
+from aolink.estimation.estimators import ESTIMATOR_NAMES, Driver, Engine, Estimator, Options, make_estimator, run
 from aolink.estimation.exposure_model import ExposureModel, exposure_model, path_from_coefficients
 from aolink.estimation.filter import BlurFilter
 from aolink.estimation.moments import Measurement, measure_moments
@@ -9,6 +9,7 @@ from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.observation import PathMoments
 from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.windowed import Profile, WindowedMoments
+from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.estimation.windows import Window, measure_windows
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "BlurFilter",
     "Consistency",
     "Driver",
+    "Engine",
     "Estimate",
     "Estimator",
     "ExposureModel",
@@ -25,9 +27,11 @@ __all__ = [
     "Profile",
     "Score",
     "Scorer",
+    "SpotWindows",
     "Status",
     "Window",
     "WindowedMoments",
+    "WindowedSpots",
     "exposure_model",
     "make_estimator",
     "measure_moments",

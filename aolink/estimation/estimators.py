@@ -27,9 +27,11 @@ from aolink.estimation.moments import (
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
 from aolink.estimation.spots import centroid_noise, measure_spots
 from aolink.estimation.windowed import Basis, Profile, WindowedMoments
+from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
 from aolink.rig import Rig, SpotSensor
+from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 Engine = Literal["aolink", "filterpy"]
@@ -88,7 +90,7 @@ class Estimator:
 
         ``response``, to the exposure's inputs, saves computing it again.
         """
-        model = exposure_model(self.rig.plant, exposure.n_steps)
+        model = exposure_model(self.rig.plant, exposure.n_steps, exposure.start_offset)
         reasons = self._bridge(exposure)
         response = response or model.response(exposure.inputs)
         measured, remark = measure(self.rig, exposure, self._observation, self.options)
@@ -136,7 +138,7 @@ class Estimator:
 
 def measure(
     rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options
-) -> tuple[Measurement | Profile | None, str]:
+) -> tuple[Measurement | Profile | SpotWindows | None, str]:
     """What an observation takes of an exposure, or nothing; and what there is to say about it."""
     if observation is None:
         return None, ""
@@ -207,20 +209,24 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
     if chosen.engine == "filterpy" and (name not in _PAPER_ORDERS or rig.plant.axes != 1):
-        raise EstimatorError(f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, not this")
+        raise EstimatorError(
+            f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, this is {name} with"
+            f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
+        )
     return Estimator(rig, name, chosen)
 
 
 class Driver:
-    """Several estimators side by side, exposure by exposure."""
+    """Several estimators side by side, exposure by exposure, on one engine."""
 
-    def __init__(self, rig: Rig, names: Sequence[str]) -> None:
+    def __init__(self, rig: Rig, names: Sequence[str], engine: Engine = "aolink") -> None:
         self.rig = rig
-        self.estimators = [make_estimator(rig, name) for name in names]
+        self.estimators = [make_estimator(rig, name, engine=engine) for name in names]
 
     def step(self, exposure: Exposure) -> list[Estimate]:
         """What each of them says about an exposure, in the order of the names."""
-        response = exposure_model(self.rig.plant, exposure.n_steps).response(exposure.inputs)
+        model = exposure_model(self.rig.plant, exposure.n_steps, exposure.start_offset)
+        response = model.response(exposure.inputs)
         return [estimator.step(exposure, response) for estimator in self.estimators]
 
 
@@ -242,16 +248,15 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
         engine = FilterpyMoments if options.engine == "filterpy" else PathMoments
         return engine(rig.plant.n_outputs, _PAPER_ORDERS[name], gain)
     if rig.plant.n_outputs > 1:
-        raise EstimatorError(
-            f"{name} looks at one output of each copy of the plant, {rig.name} has {rig.plant.n_outputs}: use"
-            f" {', '.join(_PAPER_ORDERS)}"
-        )
+        assert isinstance(rig.sensor, SpotSensor)
+        spots = rig.plant.n_outputs // 2
+        return WindowedSpots(rig.sensor, spots, options.orders, basis=options.basis, flux=options.flux)
     return WindowedMoments(rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux)
 
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file; None where there is none."""
-    model = exposure_model(rig.plant, rig.timing.exposure_steps)
+    model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
     sensor, plant = rig.sensor, rig.plant
     if isinstance(sensor, SpotSensor):
         noise = centroid_noise(sensor, plant.n_outputs)
@@ -261,8 +266,15 @@ def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     if sensor.photoelectrons:
         # y_2 / photoelectrons, of a spot where the plant's prior has it.
         spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
-        noise = noise + np.diag(spread + sensor.kernel.variance) / sensor.photoelectrons
+        noise = noise + np.diag(spread + _kernel_variances(sensor, plant.n_outputs)) / sensor.photoelectrons
     return steady_gain(model, added_noise(model, options.process_noise), noise)
+
+
+def _kernel_variances(sensor: BaseSensor, n_outputs: int) -> FloatArray:
+    """Variance of the kernel along each output of one copy, (n_outputs,)."""
+    if n_outputs == 1:
+        return np.array([sensor.kernel.variance])
+    return np.tile(np.diag(sensor.kernel.covariance), n_outputs // 2)
 
 
 # From good to bad; the worst of all axes is the estimate's status.

@@ -5,10 +5,16 @@ With z = (x(k0), xi), xi ~ N(0, I) the coefficients of the process noise inside 
     path = basis z + c(u),     x(k0 + N) = end_rows z + d(u) + remainder.
 
 Every estimator is an update of z; they differ in what they observe, and in whether they model xi.
+
+The spot rests where theta(k) has it for the whole of a fast step, as the sum in Mishra & Wen (3) takes it. An exposure
+that starts a part f of a step late loses as much of its first step and gains as much of the one after its last:
+a mean over it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end state and path stay those
+of whole steps.
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -57,6 +63,26 @@ class ExposureModel:
         """C-bar, (n_outputs, n_states)."""
         self.quadratic = np.einsum("oij,oik->ojk", self.state_rows, self.state_rows) / n_steps
         """M = mean_i (C A^i)'(C A^i) for each output, (n_outputs, n_states, n_states)."""
+        self.moved = 0.0
+        """f/N: the share of the exposure that is in the step after its last, and not in its first."""
+
+    def starting(self, offset: float) -> ExposureModel:
+        """The same for exposures that start so far into their first fast step, in fast steps, 0 <= offset < 1."""
+        if not 0 <= offset < 1:
+            raise ValueError(f"an exposure starts from 0 to 1 fast step into its first one, not {offset:g}")
+        _ = self._with_noise  # made once, for all offsets
+        model = copy(self)
+        model.moved = offset / self.n_steps
+        first, last = self.plant.C, self.last_rows
+        model.mean_row = self.mean_row + model.moved * (last - first)
+        squares = last[:, :, None] * last[:, None, :] - first[:, :, None] * first[:, None, :]
+        model.quadratic = self.quadratic + model.moved * squares
+        return model
+
+    @cached_property
+    def last_rows(self) -> FloatArray:
+        """C A^N, outputs in the step after the last, (n_outputs, n_states)."""
+        return np.asarray(self.plant.C @ self.transition)
 
     @property
     def n_coefficients(self) -> int:
@@ -107,25 +133,41 @@ class ExposureModel:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
         # Column by column, so that the products lie in memory as they are summed.
-        slope = [stacked.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
-        return InputResponse(
-            path=path,
-            end=stacked.batch_last(end),
-            mean=stacked.mean_over_path(path),
-            slope=np.stack(slope, axis=-1),
-            square=stacked.mean_over_path(path * path),
+        columns = [stacked.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
+        mean, slope, square = (
+            stacked.mean_over_path(path),
+            np.stack(columns, axis=-1),
+            stacked.mean_over_path(path * path),
         )
+        if self.moved:
+            # Inputs have done nothing yet in the first step.
+            late = self.moved * self.last_response(end)
+            mean, square = mean + late, square + late * late / self.moved
+            slope = slope + late[..., None] * self.last_rows
+        return InputResponse(path=path, end=stacked.batch_last(end), mean=mean, slope=slope, square=square)
+
+    def last_response(self, end: FloatArray) -> FloatArray:
+        """c_N, response of the outputs in the step after the last to that of the end state, (axes, n_outputs)."""
+        return stacked.matvec(self.plant.C, end)
 
     def cross_quadratic(self, first: int, second: int) -> FloatArray:
         """Symmetric M with mean(theta_1 theta_2) = x'Mx for two outputs without inputs, (n_states, n_states)."""
         product = self.state_rows[first].T @ self.state_rows[second] / self.n_steps
+        if self.moved:
+            C, last = self.plant.C, self.last_rows
+            product = product + self.moved * (np.outer(last[first], last[second]) - np.outer(C[first], C[second]))
         return np.asarray((product + product.T) / 2)
 
     def cross_response(self, response: InputResponse, first: int, second: int) -> tuple[FloatArray, FloatArray]:
         """What inputs add to the mean product of two outputs: slope (axes, n_states) and constant (axes,)."""
         c, rows = response.path, self.state_rows
         both = c[:, first, None] * rows[second].T + c[:, second, None] * rows[first].T
-        return stacked.mean_over_path(both), stacked.mean_over_path(c[:, first] * c[:, second])
+        slope, product = stacked.mean_over_path(both), stacked.mean_over_path(c[:, first] * c[:, second])
+        if self.moved:
+            late, last = self.last_response(response.end), self.last_rows
+            mixed = late[:, first, None] * last[second] + late[:, second, None] * last[first]
+            slope, product = slope + self.moved * mixed, product + self.moved * late[:, first] * late[:, second]
+        return slope, product
 
     def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
         """basis @ coefficients + c; coefficients (axes, any first ones), c and result (axes, n_outputs, n_steps)."""
@@ -151,10 +193,14 @@ class ExposureModel:
         return np.ascontiguousarray(self.basis.transpose(2, 0, 1))
 
 
+def exposure_model(plant: Plant, n_steps: int, offset: float = 0.0) -> ExposureModel:
+    """The model of exposures of so many fast steps that start ``offset`` of a step into their first, made once."""
+    return _made_once(plant, n_steps, float(offset))
+
+
 @lru_cache(maxsize=16)
-def exposure_model(plant: Plant, n_steps: int) -> ExposureModel:
-    """The exposure model of a plant, made once."""
-    return ExposureModel(plant, n_steps)
+def _made_once(plant: Plant, n_steps: int, offset: float) -> ExposureModel:
+    return exposure_model(plant, n_steps).starting(offset) if offset else ExposureModel(plant, n_steps)
 
 
 def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:

@@ -25,8 +25,8 @@ from aolink.estimation.moments import (
 )
 from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.windowed import Profile
+from aolink.estimation.windowed_spots import SpotWindows
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
-from aolink.optics.plane import kernel_covariance
 from aolink.rig import Plant, Sensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -61,7 +61,7 @@ def windows(sensor: SpotSensor, frame: NDArray[Any]) -> NDArray[Any]:
 def measure_spots(
     sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, orders: Sequence[int] | None,
     flux: Flux, *, least_usable: float, least_significance: float,
-) -> tuple[Measurement | Profile | None, str]:  # fmt: skip
+) -> tuple[Measurement | Profile | SpotWindows | None, str]:  # fmt: skip
     """What a frame says of each axis, or nothing; and how many axes it says nothing of, and why.
 
     Parameters
@@ -69,21 +69,29 @@ def measure_spots(
     pixels, arrived:
         The frame and which of it there is, (rows, columns).
     orders:
-        Of the moments to take, which need whole profiles; None for the profiles themselves.
+        Of the moments to take, which need whole profiles; None for the profiles themselves, or where a copy
+        of the plant moves whole spots, the windows about them.
     least_usable:
         Share of a profile's pixels that the profiles themselves can do with.
     least_significance:
         By how many standard deviations of noise a spot must stand out.
     """
     saturated = is_saturated(sensor, pixels) & arrived
-    found = profiles(sensor, pixels, arrived & ~saturated)
-    share = found.mask.mean(axis=1)
-    whole = share == 1 if orders else share >= least_usable
-    density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)  # type: ignore[arg-type] # sums
+    seen: SpotWindows | None = None
+    if orders is None and plant.n_outputs > 1:
+        seen = _spot_windows(sensor, plant, pixels, arrived & ~saturated)
+        light = seen.density.reshape(sensor.spots, *sensor.window) * sensor.pixel_width
+        share = np.asarray(np.repeat(seen.mask.reshape(sensor.spots, -1).mean(axis=1), 2))
+        density = np.stack([light.sum(axis=1), light.sum(axis=2)], axis=1).reshape(2 * sensor.spots, -1)
+    else:
+        found = profiles(sensor, pixels, arrived & ~saturated)
+        share = found.mask.mean(axis=1)
+        density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)  # type: ignore[arg-type] # sums
+    whole: BoolArray = share == 1 if orders else share >= least_usable
     lit = brightest_stretch(sensor.profile, density) >= least_significance
     if orders and flux == "measured":
         lit &= _enough_light(sensor.profile, found.counts)
-    usable = (whole & lit).reshape(plant.axes, plant.n_outputs).all(axis=1)
+    usable: BoolArray = np.asarray((whole & lit).reshape(plant.axes, plant.n_outputs).all(axis=1))
     reasons = [
         (int((~arrived).sum()), f"of {pixels.size} pixels are missing"),
         (int(saturated.sum()), f"of {pixels.size} pixels are at an end of the scale"),
@@ -96,8 +104,10 @@ def measure_spots(
         remark += ": left out"
     if not usable.any():
         return None, remark
-    measured: Measurement | Profile | str
-    if orders is None:
+    measured: Measurement | Profile | SpotWindows | str
+    if seen is not None:
+        measured = seen
+    elif orders is None:
         # An axis without a measurement needs one that can be computed with.
         measured = Profile(density=density, mask=found.mask | ~usable[:, None])
     elif plant.n_outputs == 1:
@@ -110,6 +120,12 @@ def measure_spots(
     if not usable.all():
         measured = replace(_spread(measured, usable), usable=usable)
     return measured, remark
+
+
+def _spot_windows(sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], good: BoolArray) -> SpotWindows:
+    shape = (plant.axes, plant.n_outputs // 2, *sensor.window)
+    density = np.where(good, to_density(sensor, pixels), 0.0)
+    return SpotWindows(density=windows(sensor, density).reshape(shape), mask=windows(sensor, good).reshape(shape))
 
 
 def brightest_stretch(line: Sensor, density: FloatArray) -> FloatArray:
@@ -142,10 +158,10 @@ def _coupled_moments(
     """Moments where one copy of the plant moves whole spots: a spot's two slopes share the noise of its pixels."""
     spots = plant.n_outputs // 2
     density = windows(sensor, to_density(sensor, pixels))[np.repeat(usable, spots)]
-    edges, width = sensor.profile.edges, sensor.kernel.sigma * np.eye(2)
+    edges = sensor.profile.edges
     along = [(p, 0) for p in orders] + [(0, p) for p in orders]
     noise = effective_noise_density(sensor)
-    found = measure_moments_2d(density, edges, edges, kernel_covariance(width), noise, along, flux)
+    found = measure_moments_2d(density, edges, edges, sensor.kernel.covariance, noise, along, flux)
     if isinstance(found, str):
         return found
     copies, m = len(density) // spots, len(along)
@@ -156,9 +172,9 @@ def _coupled_moments(
     return Measurement(value=found.value.reshape(copies, size), covariance=covariance.reshape(copies, size, size))
 
 
-def _spread(measured: Measurement | Profile, usable: BoolArray) -> Measurement | Profile:
+def _spread(measured: Measurement | Profile | SpotWindows, usable: BoolArray) -> Measurement | Profile | SpotWindows:
     """Moments of the usable axes in the places of these; the others get zero with unit covariance."""
-    if isinstance(measured, Profile):
+    if not isinstance(measured, Measurement):
         return measured
     m = measured.value.shape[1]
     value, covariance = np.zeros((len(usable), m)), np.tile(np.eye(m), (len(usable), 1, 1))

@@ -18,9 +18,10 @@ filter that follows a resonance believes in one of several phases that the blur 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from aolink.estimation.moments import LEAST_FLUX, Flux
 from aolink.estimation.observation import Belief, Correction, corrected
 from aolink.optics.camera import effective_noise_density
 from aolink.rig import Sensor
+from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 Basis = Literal["monomial", "legendre", "fourier"]
@@ -49,6 +51,16 @@ _AT_ONCE = 8
 _NOT_BELIEVED = 1e12
 
 
+class Seen(Protocol):
+    """What an exposure shows of each axis; its parts can be taken."""
+
+    def part(self: Self, axes: slice) -> Self:
+        """Of these axes alone."""
+
+
+Light = TypeVar("Light", bound=Seen)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Profile:
     """Densities of one row of pixels for each axis."""
@@ -59,6 +71,26 @@ class Profile:
     """True where the pixel can be used, (axes, pixels)."""
     usable: NDArray[np.bool_] | None = None
     """False for axes of which nothing was measured, (axes,); None if there are none."""
+
+    def part(self, axes: slice) -> Profile:
+        """Of these axes alone."""
+        return Profile(density=self.density[axes], mask=self.mask[axes])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Nodes:
+    """The path in blocks of steps: few enough to look at each two of them together."""
+
+    basis: FloatArray
+    """Means of the exposure basis over each block, (n_outputs, nodes, n_coefficients)."""
+    weights: FloatArray
+    """Each block's share of the exposure, (nodes,)."""
+    inputs: FloatArray
+    """Means of the response to the inputs, (axes, n_outputs, nodes)."""
+
+    def part(self, axes: slice) -> Nodes:
+        """Of these axes alone."""
+        return Nodes(basis=self.basis, weights=self.weights, inputs=self.inputs[axes])
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,65 +105,50 @@ class Regression:
     """Omega, covariance of what is not linear, (axes, m, m)."""
 
 
-class WindowedMoments:
-    """Windowed moments of line-sensor profiles, one output for each axis.
+class Windowed(ABC, Generic[Light]):
+    """Iterated statistical linearisation: what line sensors and spots on a plane have in common.
 
     Parameters
     ----------
-    orders:
-        Which functions of the basis; 0 is the light in the window.
     basis:
         Of u in [-1, 1] across the window: "monomial" u^p, "legendre" P_p(u), or "fourier", where
         orders 2q - 1 and 2q are sin(pi q u) and cos(pi q u).
     flux:
-        "known": the light of a frame sums to one; "measured": all is divided by the light in the window
-        (order 0 is left out).
+        "known": the light of a frame sums to one; "measured": all is divided by the light in the window,
+        and order 0 left out.
+    lights:
+        Which of the sums are the light in a window.
+    light_of:
+        The light that belongs to each sum, (sums,).
     """
 
     models_noise = True
+    most_nodes = _MOST_NODES
 
-    def __init__(
-        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
-        flux: Flux = "known",
-    ) -> None:  # fmt: skip
-        self.sensor, self.basis, self.flux = sensor, basis, flux
-        # A ratio to the light in the window needs the light first.
-        self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
-        self.n_measurements = len(self.orders) - (flux == "measured")
+    def __init__(self, basis: Basis, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
+        self.basis, self.flux = basis, flux
+        self._lights, self._light_of = list(lights), np.array(light_of)
+        self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
 
-    def correct(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Profile) -> Correction:
+    def correct(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        first, basis, weights = _nodes(model)
-        inputs = np.add.reduceat(response.path[:, 0], first, axis=1) / (weights * model.n_steps)
+        nodes, memory = _nodes(model, response, self.most_nodes), _memory(model)
         parts = [
-            self._correct(
-                model,
-                (basis, weights, inputs[s]),
-                Belief(prior.mean[s], prior.covariance[s]),
-                Profile(density=measured.density[s], mask=measured.mask[s]),
-            )
-            for s in (slice(k, k + _AT_ONCE) for k in range(0, len(inputs), _AT_ONCE))
+            self._correct(memory, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
+            for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
         ]
         if len(parts) == 1:
             return parts[0]
         joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
         return Correction(Belief(joined[0], joined[1]), *joined[2:])
 
-    def _correct(
-        self, model: ExposureModel, nodes: tuple[FloatArray, FloatArray, FloatArray], prior: Belief, measured: Profile
-    ) -> Correction:
-        basis, weights, inputs = nodes
-        memory = _memory(model)
+    def _correct(self, memory: float, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
         about = prior
         for _ in range(_PASSES):
-            mean = stacked.matvec(basis, about.mean) + inputs
-            spread = stacked.congruence(basis, about.covariance)
-            W = self.window_weights(mean, np.einsum("akk->ak", spread), measured.mask)
-            fit = self.regression(W, mean, spread, basis, weights)
-            y, noise = self.measured(W, measured.density, fit)
-            light = y[:, 0] / np.sqrt(noise[:, 0, 0])
+            y, noise, fit = self.look(nodes, about, measured)
             if self.flux == "measured":
-                y, noise, fit = _ratios(y, noise, fit)
+                light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, self._lights].min(axis=1)
+                y, noise, fit = self._ratios(y, noise, fit)
             innovation = y - fit.expected - stacked.matvec(fit.slope, prior.mean - about.mean)
             done = corrected(prior, innovation, fit.slope, noise + memory * fit.remainder)
             about = done.posterior
@@ -143,11 +160,26 @@ class WindowedMoments:
             nis = np.where(light < LEAST_FLUX, _NOT_BELIEVED, nis)
         return Correction(about, innovation, S, nis)
 
-    def window_weights(self, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
-        """Weights of the pixels about a path, (axes, m, pixels), from its mean and variance, both (axes, nodes)."""
-        sensor = self.sensor
+    @abstractmethod
+    def look(self, nodes: Nodes, about: Belief, measured: Light) -> tuple[FloatArray, FloatArray, Regression]:
+        """The sums (axes, sums), their noise (axes, sums, sums), and their regression on the coefficients."""
+
+    def window(
+        self, sensor: Sensor, kernel: float, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """u in [-1, 1] across the window about a path, and the pixels that are in it, both (axes, pixels).
+
+        Parameters
+        ----------
+        kernel:
+            Variance of the kernel in this direction, slope units squared.
+        mean, variance:
+            Of the path at its nodes, (axes, nodes).
+        mask:
+            True where a pixel can be used, (axes, pixels).
+        """
         sd = np.sqrt(np.maximum(variance, 0.0))
-        margin = _KERNEL_REACH * math.sqrt(sensor.kernel.variance + sensor.pixel_width**2 / 12)
+        margin = _KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
         # A window needs room on the sensor, wherever the path is believed to be.
         room = max(margin, 2 * sensor.pixel_width)
         low = np.minimum((mean - _PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
@@ -155,16 +187,71 @@ class WindowedMoments:
         low, high = np.maximum(low, sensor.field[0]), np.minimum(high, sensor.field[1])
         edges = sensor.edges
         inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
-        u = (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2)
-        return np.stack([self._function(p, u) * inside for p in self.orders], axis=1)
+        return (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2), inside
 
-    def _function(self, order: int, u: FloatArray) -> FloatArray:
+    def function(self, order: int, u: FloatArray) -> FloatArray:
+        """The basis' function of an order, (...) -> (...)."""
         if self.basis == "fourier":
             turn = np.pi * ((order + 1) // 2) * u
             return np.asarray(np.sin(turn) if order % 2 else np.cos(turn))
         if self.basis == "monomial":
             return np.asarray(u**order)
         return np.asarray(np.polynomial.legendre.legval(u, np.eye(order + 1)[order]))
+
+    def _ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
+        """Everything divided by the light that belongs to it, to first order."""
+        kept = [k for k in range(y.shape[1]) if k not in self._lights]
+        lights = self._light_of[kept]
+
+        def divided(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+            light = values[:, lights]
+            # Without any light there is no ratio; the NIS says so.
+            light = np.where(light == 0, 1.0, light)
+            ratio = values[:, kept] / light
+            J = np.zeros((*ratio.shape, values.shape[1]))
+            rows = np.arange(len(kept))
+            J[:, rows, kept], J[:, rows, lights] = 1 / light, -ratio / light
+            return ratio, J
+
+        (ratio, at_measured), (expected, at_expected) = divided(y), divided(fit.expected)
+        remainder = stacked.congruence(at_expected, fit.remainder)
+        slope = stacked.matmul(at_expected, fit.slope)
+        return ratio, stacked.congruence(at_measured, noise), Regression(expected, slope, remainder)
+
+
+class WindowedMoments(Windowed[Profile]):
+    """Windowed moments of line-sensor profiles, one output for each axis.
+
+    Parameters
+    ----------
+    orders:
+        Which functions of the basis; 0 is the light in the window.
+    basis, flux:
+        As of `Windowed`.
+    """
+
+    def __init__(
+        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
+        flux: Flux = "known",
+    ) -> None:  # fmt: skip
+        self.sensor = sensor
+        # A ratio to the light in the window needs the light first.
+        self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
+        super().__init__(basis, flux, lights=[0], light_of=[0] * len(self.orders))
+
+    def look(self, nodes: Nodes, about: Belief, measured: Profile) -> tuple[FloatArray, FloatArray, Regression]:
+        """The weighted sums, their noise, and their regression on the coefficients."""
+        basis = nodes.basis[0]
+        mean = stacked.matvec(basis, about.mean) + nodes.inputs[:, 0]
+        spread = stacked.congruence(basis, about.covariance)
+        W = self.window_weights(mean, np.einsum("akk->ak", spread), measured.mask)
+        y, noise = self.measured(W, measured.density)
+        return y, noise, self.regression(W, mean, spread, basis, nodes.weights)
+
+    def window_weights(self, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
+        """Weights of the pixels about a path, (axes, sums, pixels), from its mean and variance, both (axes, nodes)."""
+        u, inside = self.window(self.sensor, self.sensor.kernel.variance, mean, variance, mask)
+        return np.stack([self.function(p, u) * inside for p in self.orders], axis=1)
 
     def regression(
         self, W: FloatArray, mean: FloatArray, spread: FloatArray, basis: FloatArray, weights: FloatArray
@@ -181,7 +268,7 @@ class WindowedMoments:
             Rows of the exposure basis at the nodes, (nodes, n_coefficients), and the nodes' weights, (nodes,).
         """
         variance = np.maximum(np.einsum("akk->ak", spread), 0.0)
-        g = _expected_response(self.sensor, W, mean, variance)
+        g = expected_response(self.sensor.kernel.variance, self.sensor.edges, W, mean, variance)
         light = weights[:, None]
         # Mehler: Cov(g(a), g(b)) is the sum over j of C^j / j! times the means of the j-th derivatives.
         square = spread * spread
@@ -192,37 +279,80 @@ class WindowedMoments:
         slope = stacked.matmul(stacked.transpose(light * g[1]), np.broadcast_to(basis, (len(W), *basis.shape)))
         return Regression((light * g[0]).sum(axis=1), slope, stacked.symmetric(np.asarray(remainder)))
 
-    def measured(self, W: FloatArray, density: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray]:
+    def measured(self, W: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The weighted sums, (axes, m), and the covariance of their pixels' noise, (axes, m, m)."""
-        D = self.sensor.pixel_width
-        y = stacked.matvec(W, density * D)
-        variance = np.full_like(density, effective_noise_density(self.sensor) * D)
-        if self.sensor.photoelectrons:
-            variance += np.maximum(density, 0.0) * (D / self.sensor.photoelectrons)
-        noise = stacked.matmul(W * variance[:, None], stacked.transpose(W))
-        # Where a window has too few pixels for its functions, their sums hang together.
-        noise += 1e-12 * np.eye(len(self.orders)) * noise.max(axis=(1, 2), keepdims=True)
-        return y, noise
+        return weighted_sums(self.sensor, W, density)
 
 
-def _expected_response(sensor: Sensor, W: FloatArray, mean: FloatArray, variance: FloatArray) -> list[FloatArray]:
-    """E[g], E[g'], E[g''], E[g'''] for theta ~ N(mean, variance), each (axes, nodes, m)."""
-    width = np.sqrt(sensor.kernel.sigma**2 + 2 * variance)[..., None]
-    u = (sensor.edges - mean[..., None]) / width
+def weighted_sums(sensor: BaseSensor, W: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weighted sums of pixels and the covariance of the pixels' noise in them.
+
+    Parameters
+    ----------
+    W:
+        (..., m, pixels)
+    density:
+        (..., pixels), zero where a pixel cannot be used; its weights are zero as well.
+
+    Returns
+    -------
+    (..., m) and (..., m, m)
+    """
+    D = sensor.pixel_size
+    y = stacked.matvec(W, density * D)
+    variance = np.full_like(density, effective_noise_density(sensor) * D)
+    if sensor.photoelectrons:
+        variance += np.maximum(density, 0.0) * (D / sensor.photoelectrons)
+    noise = stacked.matmul(W * variance[..., None, :], stacked.transpose(W))
+    # Where a window has too few pixels for its functions, their sums hang together.
+    noise += 1e-12 * np.eye(W.shape[-2]) * noise.max(axis=(-2, -1), keepdims=True)
+    return y, noise
+
+
+def expected_response(
+    kernel_variance: float, edges: FloatArray, W: FloatArray, mean: FloatArray, variance: FloatArray, highest: int = 3
+) -> list[FloatArray]:
+    """Expectations of g and its derivatives up to ``highest`` for theta ~ N(mean, variance), each (..., nodes, m).
+
+    Parameters
+    ----------
+    W:
+        Weights of the pixels, (..., m, pixels).
+    mean, variance:
+        (..., nodes)
+    """
+    width = np.sqrt(2 * kernel_variance + 2 * variance)[..., None]
+    u = (edges - mean[..., None]) / width
     bell = np.exp(-u * u) / (math.sqrt(math.pi) * width)
     # The sum over pixels of W_i times a difference of edges, summed by edges instead.
-    padded = np.concatenate([np.zeros((*W.shape[:2], 1)), W, np.zeros((*W.shape[:2], 1))], axis=2)
-    steps = stacked.transpose(-np.diff(padded, axis=2))
-    derivatives = (erf(u) / 2, -bell, -2 * u / width * bell, -(4 * u * u - 2) / width**2 * bell)
-    return [stacked.matmul(d, steps) for d in derivatives]
+    padded = np.zeros((*W.shape[:-1], W.shape[-1] + 2))
+    padded[..., 1:-1] = W
+    steps = stacked.transpose(-np.diff(padded, axis=-1))
+    derivatives = [erf(u) / 2, -bell]
+    # Hermite's polynomials: H_n = 2u H_(n-1) - 2(n-1) H_(n-2), here over width^n.
+    before, last = np.zeros_like(u), np.ones_like(u)
+    for n in range(1, highest):
+        before, last = last, 2 * u / width * last - 2 * (n - 1) / width**2 * before
+        derivatives.append(-last * bell)
+    return [stacked.matmul(d, steps) for d in derivatives[: highest + 1]]
 
 
-def _nodes(model: ExposureModel) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-    """First steps of the path's blocks, the basis' mean over each, and each block's share of the exposure."""
-    length = -(-model.n_steps // _MOST_NODES)
+def _nodes(model: ExposureModel, response: InputResponse, most: int = _MOST_NODES) -> Nodes:
+    """The path in no more than ``most`` blocks of steps."""
+    length = -(-model.n_steps // most)
     first = np.arange(0, model.n_steps, length)
     sizes = np.diff(np.append(first, model.n_steps))
-    return first, np.add.reduceat(model.basis[0], first, axis=0) / sizes[:, None], sizes / model.n_steps
+    basis = np.add.reduceat(model.basis, first, axis=1) / sizes[:, None]
+    weights = sizes / model.n_steps
+    inputs = np.add.reduceat(response.path, first, axis=2) / sizes
+    if model.moved:
+        # So much of the first step is not in the exposure, but in the step after its last.
+        ends = (model.basis[:, 0], model.plant.C @ model.end_rows)
+        late = (response.path[:, :, 0], model.last_response(response.end))
+        basis = np.concatenate([basis, np.stack(ends, axis=1)], axis=1)
+        weights = np.append(weights, [-model.moved, model.moved])
+        inputs = np.concatenate([inputs, np.stack(late, axis=2)], axis=2)
+    return Nodes(basis=basis, weights=weights, inputs=inputs)
 
 
 def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
@@ -234,16 +364,3 @@ def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
 def _memory(model: ExposureModel) -> float:
     rho = float(np.abs(np.linalg.eigvals(model.transition)).max())
     return min(_MOST_MEMORY, (1 + rho) / max(1 - rho, 1e-9))
-
-
-def _ratios(y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
-    """Everything divided by the first measurement, the light, to first order."""
-    ratio, expected = y[:, 1:] / y[:, :1], fit.expected[:, 1:] / fit.expected[:, :1]
-
-    def derivative(values: FloatArray, light: FloatArray) -> FloatArray:
-        eye = np.broadcast_to(np.eye(values.shape[1]), (len(values), values.shape[1], values.shape[1]))
-        return np.concatenate([-values[..., None], eye], axis=2) / light[:, :, None]
-
-    J = derivative(expected, fit.expected[:, :1])
-    noise = stacked.congruence(derivative(ratio, y[:, :1]), noise)
-    return ratio, noise, Regression(expected, stacked.matmul(J, fit.slope), stacked.congruence(J, fit.remainder))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.optics.kernel import exposure_density, pixel_mass
+from aolink.optics.plane import exposure_density_2d
 from aolink.sensor import BaseSensor, Kernel, Sensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -38,7 +39,11 @@ def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
     """
     if isinstance(sensor, SpotSensor):
         rows, columns = sensor.grid
-        windows = spots_density(sensor.kernel, sensor.profile.edges, path.reshape(sensor.spots, 2, -1))
+        edges, paths = sensor.profile.edges, path.reshape(sensor.spots, 2, -1)
+        if sensor.kernel.matrix is None:
+            windows = spots_density(sensor.kernel, edges, paths)
+        else:
+            windows = exposure_density_2d(sensor.kernel.covariance, edges, edges, paths.swapaxes(1, 2))
         tiled = windows.reshape(rows, columns, *sensor.window).swapaxes(1, 2)
         return np.asarray(np.ascontiguousarray(tiled).reshape(sensor.shape))
     assert isinstance(sensor, Sensor)

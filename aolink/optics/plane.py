@@ -62,6 +62,27 @@ def pixel_mass_2d(
     return np.asarray(np.einsum("...cn,...cnr->...rc", across, along))
 
 
+def exposure_density_2d(
+    covariance: FloatArray, x_edges: FloatArray, y_edges: FloatArray, paths: FloatArray
+) -> FloatArray:
+    """Mean density in the pixels about each spot after an exposure, without noise.
+
+    Parameters
+    ----------
+    covariance, x_edges, y_edges:
+        As of `pixel_mass_2d`.
+    paths:
+        Positions at each fast step, slope units, (spots, n_steps, 2).
+
+    Returns
+    -------
+    One over slope units squared, (spots, rows, columns).
+    """
+    # Spot by spot: the quadrature of all at once would not fit into memory.
+    light = np.stack([pixel_mass_2d(covariance, x_edges, y_edges, path).mean(axis=0) for path in paths])
+    return np.asarray(light / np.outer(np.diff(y_edges), np.diff(x_edges)))
+
+
 def kernel_moments_2d(covariance: FloatArray, pixel: tuple[float, float], highest: int) -> FloatArray:
     """E[x^p y^q] of a resting spot about its position, as sums over pixel centres find it, by p and q.
 

@@ -36,6 +36,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
         missing_offset=2 * offsets,
         missing_length=2 * lengths,
         frames_lost_before=frame.frames_lost_before,
+        exposure_offset_ns=frame.exposure_offset_ns,
     )
     image = RawImage(frame_id="camera", width=width, height=height, encoding="mono16", step=2 * width)
     image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
@@ -68,6 +69,7 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
         host_receive_ns=info.host_receive_ns,
         host_start_ns=info.host_start_ns,
         clock_sigma_ns=info.clock_sigma_ns,
+        exposure_offset_ns=info.exposure_offset_ns,
     )
 
 

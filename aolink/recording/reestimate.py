@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aolink.estimation import Driver, Estimate, Score, Scorer
+from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.reader import Recording
@@ -29,10 +29,13 @@ def reestimate(
 
 
 def reestimated(
-    recording: Recording, names: Sequence[str], progress: Callable[[int], None] = lambda exposures: None
+    recording: Recording,
+    names: Sequence[str],
+    progress: Callable[[int], None] = lambda exposures: None,
+    engine: Engine = "aolink",
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
     """The same exposure by exposure, estimates in the order of ``names``; nothing of it stays in memory."""
-    driver = Driver(recording.rig, names)
+    driver = Driver(recording.rig, names, engine)
     for number, exposure in enumerate(recording.exposures(), 1):
         yield exposure, driver.step(exposure)
         progress(number)
@@ -87,6 +90,7 @@ def write_reestimated(
     *,
     overwrite: bool = False,
     progress: Callable[[int], None] = lambda exposures: None,
+    engine: Engine = "aolink",
 ) -> None:
     """Copy a recording with new estimates in the place of those that it has.
 
@@ -97,13 +101,15 @@ def write_reestimated(
     RecordingError
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
-    driver, done = Driver(recording.rig, names), 0
+    driver, done = Driver(recording.rig, names, engine), 0
     metadata = recording.metadata | {
         "aolink_version": version("aolink"),
         "estimators": " ".join(names),
         "estimated_from": recording.path.name,
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
+    if engine != "aolink":
+        metadata["engine"] = engine
     with RecordingWriter(
         path, recording.rig, metadata, recording.start_ns, overwrite=overwrite, deterministic=True
     ) as writer:

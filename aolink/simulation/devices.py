@@ -271,6 +271,7 @@ class SimulatedDevices:
     def _send_frame(self, frame: CameraFrame) -> None:
         height, width = frame.pixels.shape
         last_step = frame.first_step + frame.n_steps - 1
+        late_ns = self.rig.timing.exposure_offset_ns
         data = frame.pixels.astype("<u2").tobytes()
         for offset in range(0, len(data), MAX_CHUNK):
             picture = pb.FrameChunk(
@@ -281,8 +282,9 @@ class SimulatedDevices:
                 height=height,
                 first_step=frame.first_step,
                 last_step=last_step,
-                exposure_start_ns=self.device_ns(frame.first_step),
-                exposure_end_ns=self.device_ns(last_step + 1),
+                exposure_start_ns=self.device_ns(frame.first_step) + late_ns,
+                exposure_end_ns=self.device_ns(last_step + 1) + late_ns,
+                exposure_offset_ns=late_ns,
                 data=data[offset : offset + MAX_CHUNK],
             )
             self._say("camera", picture, last_step)

@@ -107,7 +107,7 @@ class RigModel:
         sensor = self.rig.sensor
         path = np.concatenate(self._pieces).T.copy()
         self._frames += 1
-        path, density = self._illuminate(path)
+        path, density = self._illuminate(path, end_state)
         if sensor.photoelectrons:
             density_of_one = shot_gain(sensor)
             density = np.asarray(self._electrons.poisson(density / density_of_one) * density_of_one)
@@ -121,7 +121,7 @@ class RigModel:
             truth=Truth(start_state=self._start_state.copy(), end_state=end_state.copy(), path=path),
         )
 
-    def _illuminate(self, path: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _illuminate(self, path: FloatArray, end_state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The path that the camera sees and the mean densities, (n_outputs, steps) and (rows, columns)."""
         sensor, light = self.rig.sensor, self._light
         if light.kind == "dark":
@@ -132,7 +132,14 @@ class RigModel:
         if light.kind == "still":
             self._rest = path[:, :1] if self._rest is None else self._rest
             path = np.repeat(self._rest, path.shape[1], axis=1)
-        return path, frame_density(sensor, path)
+            return path, frame_density(sensor, path)
+        density, offset = frame_density(sensor, path), self.rig.timing.exposure_offset
+        if offset:
+            # Each step is held: so much of the first one is not in the exposure, but in the step after its last.
+            after = (self.rig.plant.C @ end_state[..., None]).reshape(-1, 1)
+            gained = frame_density(sensor, after) - frame_density(sensor, path[:, :1])
+            density = np.maximum(density + offset / path.shape[1] * gained, 0.0)
+        return path, density
 
 
 def simulate(
@@ -176,7 +183,7 @@ def simulate(
 def _exposure(rig: Rig, frame: CameraFrame, inputs: FloatArray, after: int) -> Exposure:
     """The exposure of a frame; ``after`` is the end of the one before it."""
     start, end = frame.first_step, frame.first_step + frame.n_steps
-    step_ns = rig.timing.fast_step_ns
+    step_ns, late_ns = rig.timing.fast_step_ns, rig.timing.exposure_offset_ns
     return Exposure(
         frame_id=frame.frame_id,
         first_step=start,
@@ -185,10 +192,11 @@ def _exposure(rig: Rig, frame: CameraFrame, inputs: FloatArray, after: int) -> E
         mask=np.ones(frame.pixels.shape, dtype=np.bool_),
         inputs=inputs[start:end].copy(),
         lead_inputs=inputs[after:start].copy(),
-        device_start_ns=start * step_ns,
-        device_end_ns=end * step_ns,
-        host_start_ns=start * step_ns,
-        host_receive_ns=end * step_ns,
+        start_offset=late_ns / step_ns,
+        device_start_ns=start * step_ns + late_ns,
+        device_end_ns=end * step_ns + late_ns,
+        host_start_ns=start * step_ns + late_ns,
+        host_receive_ns=end * step_ns + late_ns,
         clock_sigma_ns=0.0,
         truth=frame.truth,
     )

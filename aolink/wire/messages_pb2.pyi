@@ -181,7 +181,7 @@ class Ack(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., code: _Optional[_Union[Code, str]] = ..., text: _Optional[str] = ...) -> None: ...
 
 class FrameChunk(_message.Message):
-    __slots__ = ("frame_id", "offset", "total", "width", "height", "first_step", "last_step", "exposure_start_ns", "exposure_end_ns", "data")
+    __slots__ = ("frame_id", "offset", "total", "width", "height", "first_step", "last_step", "exposure_start_ns", "exposure_end_ns", "data", "exposure_offset_ns")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     OFFSET_FIELD_NUMBER: _ClassVar[int]
     TOTAL_FIELD_NUMBER: _ClassVar[int]
@@ -192,6 +192,7 @@ class FrameChunk(_message.Message):
     EXPOSURE_START_NS_FIELD_NUMBER: _ClassVar[int]
     EXPOSURE_END_NS_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
+    EXPOSURE_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     offset: int
     total: int
@@ -202,7 +203,8 @@ class FrameChunk(_message.Message):
     exposure_start_ns: int
     exposure_end_ns: int
     data: bytes
-    def __init__(self, frame_id: _Optional[int] = ..., offset: _Optional[int] = ..., total: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., first_step: _Optional[int] = ..., last_step: _Optional[int] = ..., exposure_start_ns: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
+    exposure_offset_ns: int
+    def __init__(self, frame_id: _Optional[int] = ..., offset: _Optional[int] = ..., total: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., first_step: _Optional[int] = ..., last_step: _Optional[int] = ..., exposure_start_ns: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., data: _Optional[bytes] = ..., exposure_offset_ns: _Optional[int] = ...) -> None: ...
 
 class ClockQuery(_message.Message):
     __slots__ = ("query_id", "host_send_ns")

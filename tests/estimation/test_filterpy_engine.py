@@ -1,6 +1,7 @@
 """filterpy as the engine: the same estimates, and really filterpy's."""
 
 import dataclasses
+import json
 
 import filterpy.kalman
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from aolink.errors import EstimatorError
 from aolink.estimation import make_estimator
+from aolink.recording.reader import Recording
 from aolink.simulation.model import simulate
 
 
@@ -47,3 +49,22 @@ def test_filterpy_does_one_axis_of_the_papers_filters(rig):
     many = dataclasses.replace(rig, plant=dataclasses.replace(rig.plant, axes=2))
     with pytest.raises(EstimatorError, match="one axis"):
         make_estimator(many, "o1", engine="filterpy")
+
+
+def test_the_command_line_runs_it_and_says_where_it_cannot(aolink, recorded, tmp_path):
+    def scores(*arguments):
+        result = aolink("estimate", recorded.path, "-e", "o1", "-e", "o3", "--json", *arguments)
+        assert result.returncode == 0, result.stderr
+        return json.loads(result.stdout)
+
+    ours, theirs = scores(), scores("--engine", "filterpy")
+    for name in ("o1", "o3"):
+        assert ours["differs_from_recorded"][name] is None
+        assert theirs["differs_from_recorded"][name] is not None  # other roundings: it did run on something else
+        assert theirs[name]["path_rmse"] == pytest.approx(ours[name]["path_rmse"], abs=1e-9)
+    copied = aolink("estimate", recorded.path, "-e", "o3", "--engine", "filterpy", "-o", "a.mcap")
+    assert copied.returncode == 0, copied.stderr
+    assert Recording(tmp_path / "a.mcap").metadata["engine"] == "filterpy"
+    refused = aolink("estimate", recorded.path, "-e", "moments", "--engine", "filterpy")
+    assert refused.returncode != 0
+    assert "engine 'filterpy' runs o1, o2, o3 on a plant of one axis, this is moments" in refused.stderr

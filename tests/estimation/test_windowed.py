@@ -67,7 +67,8 @@ def spread_prior(axes=2):
 def test_regression_is_that_of_samples(basis):
     model, prior = spread_prior()
     observation = WindowedMoments(SENSOR, (0, 1, 2, 3), basis=basis)
-    _, rows, weights = _nodes(model)
+    nodes = _nodes(model, model.response(np.zeros((model.n_steps, model.plant.axes))))
+    rows, weights = nodes.basis[0], nodes.weights
     mean = prior.mean @ rows.T
     spread = rows @ prior.covariance @ rows.T
     W = observation.window_weights(mean, np.einsum("akk->ak", spread), np.ones((2, 40), bool))
@@ -91,7 +92,8 @@ def test_regression_is_that_of_samples(basis):
 def test_slope_is_the_derivative_of_what_is_expected():
     model, prior = spread_prior(1)
     observation = WindowedMoments(SENSOR)
-    _, rows, weights = _nodes(model)
+    nodes = _nodes(model, model.response(np.zeros((model.n_steps, model.plant.axes))))
+    rows, weights = nodes.basis[0], nodes.weights
     spread = rows @ prior.covariance @ rows.T
     W = observation.window_weights(prior.mean @ rows.T, np.einsum("akk->ak", spread), np.ones((1, 40), bool))
 
@@ -117,7 +119,7 @@ def test_expected_sums_are_those_of_a_noiseless_frame(basis, flux):
     observation = WindowedMoments(SENSOR, basis=basis, flux=flux)
     W = observation.window_weights(path[None], np.zeros((1, 200)), mask)
     fit = observation.regression(W, path[None], np.zeros((1, 200, 200)), np.zeros((200, 3)), np.full(200, 1 / 200))
-    y, _ = observation.measured(W, density, fit)
+    y, _ = observation.measured(W, density)
     np.testing.assert_allclose(y, fit.expected, atol=1e-12)
     assert W[0, 0, 24] == 0
 
@@ -131,14 +133,15 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
     sd = np.sqrt(pixel_noise_variance(sensor, clean))
     observation = WindowedMoments(sensor)
     W = observation.window_weights(path[None], np.full((1, 200), 0.001), np.ones((1, 40), bool))
-    _, noise = observation.measured(W, clean[None], None)
+    _, noise = observation.measured(W, clean[None])
     spread = np.cov((clean + sd * rng.standard_normal((20_000, 40))) @ W[0].T * SENSOR.pixel_width, rowvar=False)
     np.testing.assert_allclose(noise[0], spread, atol=0.03 * spread.max())
 
 
 def test_blocks_of_steps_keep_the_mean_of_the_path():
     model = exposure_model(RIG.plant, 1037)
-    _, rows, weights = _nodes(model)
+    nodes = _nodes(model, model.response(np.zeros((model.n_steps, model.plant.axes))))
+    rows, weights = nodes.basis[0], nodes.weights
     assert len(weights) <= 100
     np.testing.assert_allclose(weights @ rows, model.basis[0].mean(axis=0), atol=1e-14)
 

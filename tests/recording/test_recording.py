@@ -151,6 +151,7 @@ def test_frames_survive_the_recording(mask: list[bool], counts: list[int]) -> No
         host_receive_ns=10**18 + 1,
         host_start_ns=10**18 - 1,
         clock_sigma_ns=1.5,
+        exposure_offset_ns=999_999,
     )
     again = convert.frame_from_messages(*convert.frame_messages(frame))
     for name, value in vars(frame).items():

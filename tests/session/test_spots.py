@@ -65,6 +65,35 @@ def test_looking_at_the_frames_is_better_than_not_looking(spots: Session) -> Non
     assert rmse["moments"] < 0.5 * rmse["o3"]
 
 
+def test_one_mirror_with_a_tilted_spot_that_is_exposed_between_fast_steps(tmp_path: Path) -> None:
+    """One copy of the plant for both slopes, a kernel that couples them, and exposures 0.375 of a step late."""
+    text = load_rig("single-lenslet").toml
+    for old, new in (
+        ("axes = 2", "axes = 1"),
+        ("C = [[1.0, 0.0]]", "C = [[1.0, 0.0], [0.6, 0.01]]"),
+        ("[timing]", "[timing]\nexposure_offset = 0.375"),
+        ("amplitude = [0.0087, 0.0044]", "amplitude = 0.0087"),
+        ("sigma = 0.1 ", "sigma = [[0.12, 0.03], [0.03, 0.09]] "),
+    ):
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    rig_file, path = tmp_path / "tilted.toml", tmp_path / "a.mcap"
+    rig_file.write_text(text)
+    with simulated_rig(rig_file) as (camera, mirror):
+        report = record(load_rig(rig_file), camera, mirror, path, estimators=["o1", "o3", "moments"], exposures=12)
+    assert report.ended == "complete"
+    recording = Recording(path)
+    exposures = list(recording.exposures())
+    for ours, theirs in zip(exposures, aolink.simulate(recording.rig, 12), strict=True):
+        assert np.array_equal(ours.pixels, theirs.pixels)
+        assert ours.start_offset == theirs.start_offset == 0.375
+        assert ours.device_end_ns - ours.device_start_ns == 200_000_000
+    for name, again in reestimate(recording, ["o1", "o3", "moments"]).items():
+        assert first_difference(recording.estimates(name), again) is None
+    rmse = {name: score(exposures, recording.estimates(name), skip=2).path_rmse for name in ("o3", "moments")}
+    assert rmse["moments"] < 0.6 * rmse["o3"]
+
+
 def test_over_a_bad_link_frames_come_in_part_and_the_rest_of_them_is_used(tmp_path: Path) -> None:
     rig_file, path = tmp_path / "faulty.toml", tmp_path / "a.mcap"
     rig_file.write_text(load_rig("sh-4x4").toml + FAULTY)

@@ -29,6 +29,7 @@ SECTIONS = (
     "Misprints, each with the number that shows it",
     "Remarks 1 and 2",
     "The map o3/o1",
+    "A shake faster than the frames",
 )
 NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
 
@@ -230,6 +231,15 @@ def test_the_map_is_whole_and_says_where_y_2_helps(out: Path) -> None:
     assert at[0.5, 0.01, 10]["path_high"] < 0.95
     assert at[0, 0.1, 0.1]["path"] == pytest.approx(1, abs=0.01)
     assert at[0.5, 0.01, 10]["end"] == pytest.approx(1, abs=0.03)
+
+
+def test_a_shake_is_seen_in_the_blur(page: str) -> None:
+    head, rows = table(page, "A shake faster than the frames")
+    assert len(rows) == 12
+    quiet = next(dict(zip(head, r, strict=True)) for r in rows if r[:2] == ["12", "0.001"])
+    assert measured(quiet["moments"])[0] < 0.8 * measured(quiet["o1"])[0]
+    for r in rows:
+        assert measured(dict(zip(head, r, strict=True))["NEES of open loop"])[0] == pytest.approx(2, abs=1.8)
 
 
 def test_without_matplotlib_it_says_what_to_install() -> None:

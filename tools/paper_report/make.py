@@ -17,6 +17,7 @@ from paper_report import numbers as n
 from paper_report.blocks import as_html, as_markdown
 from paper_report.ensemble import Cell, map_cells
 from paper_report.page import Results, build
+from paper_report.shake import shake_table
 
 
 @contextmanager
@@ -55,6 +56,8 @@ def compute(effort: n.Effort) -> Results:
         forms = {rig.name: n.form_table(rig, effort) for rig in (printed, lively)}
     with _timed("remarks"):
         first, second = n.remark_1(printed, effort.frequencies), n.remark_2(lively, effort)
+    with _timed("shake"):
+        shake = shake_table(printed, effort)
     with _timed("map"):
         mechanism = n.mechanism(lively, effort)
         cells = map_cells(
@@ -63,7 +66,7 @@ def compute(effort: n.Effort) -> Results:
         )  # fmt: skip
     return Results(
         printed=printed, lively=lively, effort=effort, rows=rows, norms=norms, errors=errors, forms=forms,
-        remark_1=first, remark_2=second, mechanism=mechanism, cells=cells,
+        remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, cells=cells,
     )  # fmt: skip
 
 

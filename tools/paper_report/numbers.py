@@ -37,6 +37,7 @@ class Effort:
     """Of runs with the slow input: ``skip`` and half a period, to one side and back."""
     skip: int = 15
     map_runs: int = 200
+    shake_runs: int = 200
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     densities: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003, 0.001)
     process_noises: tuple[float, ...] = (0.1, 1.0, 10.0)
@@ -46,7 +47,7 @@ class Effort:
 
 FULL = Effort()
 QUICK = Effort(
-    noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16,
+    noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
     offsets=(0.0, 0.5), densities=(0.1, 0.01), process_noises=(0.1, 10.0), frequencies=100, dpi=70,
 )  # fmt: skip
 

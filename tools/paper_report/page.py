@@ -26,6 +26,7 @@ from paper_report.numbers import (
     late_input_error,
     number,
 )
+from paper_report.shake import ShakeRow, shake_section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +45,7 @@ class Results:
     remark_1: Remark1
     remark_2: Remark2
     mechanism: Mechanism
+    shake: list[ShakeRow]
     cells: list[Cell]
 
 
@@ -75,6 +77,7 @@ def build(results: Results) -> list[Block]:
         *_misprints(results),
         *_remarks(results),
         *_map(results),
+        *shake_section(results.shake, results.effort),
     ]
 
 

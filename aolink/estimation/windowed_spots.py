@@ -1,0 +1,226 @@
+"""Windowed moments of spots on a plane, for plants of which one copy moves whole spots.
+
+A moment is sum_rc a(c) b(r) Y_rc, a function a of the columns times one b of the rows, in a window about the spot
+in both directions. Kernel and prior together displace the spot by a Gaussian (X, Y) from where the path's mean has
+it, and E[a(X) b(Y)] is, by Mehler's series, the sum over j of c^j / j! E[a^(j)(X)] E[b^(j)(Y)], c their covariance:
+a kernel that couples the two directions is one that adds to c. Each factor is in closed form, as
+for a line sensor; so are the regression on the coefficients and what it leaves out.
+
+All sums of all spots of one copy are one observation. The cross moment y_11 belongs to it: it tells motion along
+one diagonal from motion along the other, which the moments of the two directions by themselves do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation import stacked
+from aolink.estimation.moments import Flux
+from aolink.estimation.observation import Belief
+from aolink.estimation.windowed import Basis, Nodes, Regression, Windowed, expected_response, weighted_sums
+from aolink.rig import SpotSensor
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Each two of them meet, in two directions of each two spots: fewer than of a line sensor's one path.
+_MOST_NODES = 40
+# Terms of Mehler's series: what the fifth adds is in the rounding unless the two directions are one.
+_TERMS = 5
+_HIGHEST = 7
+# A row of pixels of which more are missing is left out; so is, of the rest, a column with any missing.
+_LEAST_OF_A_ROW = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpotWindows:
+    """Densities of the pixels about each spot of each copy of the plant."""
+
+    density: FloatArray
+    """One over slope units squared, zero where the mask is, (axes, spots, rows, columns)."""
+    mask: BoolArray
+    """True where the pixel can be used, (axes, spots, rows, columns)."""
+    usable: BoolArray | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
+
+    def part(self, axes: slice) -> SpotWindows:
+        """Of these axes alone."""
+        return SpotWindows(density=self.density[axes], mask=self.mask[axes])
+
+
+@dataclass(frozen=True, eq=False)
+class _Expectations:
+    """E[f] and its derivatives by where the spot is, for each sum of each spot at each node."""
+
+    value: FloatArray
+    """(axes, spots, nodes, m)"""
+    first: FloatArray
+    """By x and y, (axes, spots, nodes, 2, m)."""
+    second: FloatArray
+    """(axes, spots, nodes, 2, 2, m)"""
+    third: FloatArray
+    """(axes, spots, nodes, 2, 2, 2, m)"""
+
+
+class WindowedSpots(Windowed[SpotWindows]):
+    """Windowed moments of all spots that one copy of the plant moves.
+
+    Parameters
+    ----------
+    spots:
+        Of one copy; its outputs are spot 0's x and y, spot 1's x and y, ...
+    orders:
+        Which functions of the basis, along x and along y; 0 is the light in the window.
+    crosses:
+        Whether the product of both directions' first functions belongs to the sums, y_11.
+    basis, flux:
+        As of `Windowed`.
+    """
+
+    most_nodes = _MOST_NODES
+
+    def __init__(
+        self, sensor: SpotSensor, spots: int, orders: Sequence[int] = (0, 1, 2, 3), *, crosses: bool = True,
+        basis: Basis = "monomial", flux: Flux = "known",
+    ) -> None:  # fmt: skip
+        self.sensor, self.spots = sensor, spots
+        beyond = [p for p in orders if p]
+        light = [(0, 0)] if flux == "measured" or 0 in orders else []
+        self.orders = [*light, *((p, 0) for p in beyond), *((0, p) for p in beyond), *([(1, 1)] if crosses else [])]
+        each = len(self.orders)
+        lights = [k * each for k in range(spots)]
+        super().__init__(basis, flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
+
+    def look(self, nodes: Nodes, about: Belief, measured: SpotWindows) -> tuple[FloatArray, FloatArray, Regression]:
+        """The weighted sums, their noise, and their regression on the coefficients."""
+        axes, (_, count, size) = len(about.mean), nodes.basis.shape
+        rows = nodes.basis.reshape(self.spots, 2, count, size).swapaxes(1, 2).reshape(-1, size)
+        inputs = nodes.inputs.reshape(axes, self.spots, 2, count).swapaxes(2, 3).reshape(axes, -1)
+        mean = (stacked.matvec(rows, about.mean) + inputs).reshape(axes, self.spots, count, 2)
+        spread = stacked.congruence(rows, about.covariance).reshape(axes, *(self.spots, count, 2) * 2)
+        own = np.einsum("askdske->askde", spread)
+        along, across = self.window_functions(mean, np.einsum("askdd->askd", own), measured.mask)
+        fit = self.regression(along, across, mean, spread, rows, nodes.weights)
+        y, noise = self.measured(along, across, measured.density)
+        return y, noise, fit
+
+    def window_functions(
+        self, mean: FloatArray, variance: FloatArray, mask: BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Functions of the columns and of the rows, both (axes, spots, m, pixels).
+
+        Parameters
+        ----------
+        mean, variance:
+            Of the path, (axes, spots, nodes, 2).
+        mask:
+            (axes, spots, rows, columns)
+        """
+        good_rows = mask.mean(axis=3) > _LEAST_OF_A_ROW
+        good_columns = (mask | ~good_rows[..., None]).all(axis=2)
+        line, kernel, out = self.sensor.profile, self.sensor.kernel.covariance, []
+        for direction, good in enumerate((good_columns, good_rows)):
+            flat = (-1, mean.shape[2])
+            u, inside = self.window(
+                line,
+                kernel[direction, direction],
+                mean[..., direction].reshape(flat),
+                variance[..., direction].reshape(flat),
+                good.reshape(-1, good.shape[-1]),
+            )
+            functions = [self.function(order[direction], u) * inside for order in self.orders]
+            out.append(np.stack(functions, axis=1).reshape(*mean.shape[:2], len(self.orders), -1))
+        return out[0], out[1]
+
+    def expectations(self, along: FloatArray, across: FloatArray, mean: FloatArray, own: FloatArray) -> _Expectations:
+        """E[f] and its derivatives under the prior.
+
+        Parameters
+        ----------
+        along, across:
+            (axes, spots, m, pixels)
+        mean, own:
+            Mean and covariance of a spot at a node, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, 2).
+        """
+        kernel, edges = self.sensor.kernel.covariance, self.sensor.profile.edges
+        variance = np.maximum(np.einsum("askdd->askd", own), 0.0)
+        A, B = (
+            expected_response(kernel[d, d], edges, each, mean[..., d], variance[..., d], _HIGHEST)
+            for d, each in enumerate((along, across))
+        )
+        shared = (own[..., 0, 1] + kernel[0, 1])[..., None]
+        powers = [shared**j / math.factorial(j) for j in range(_TERMS)]
+
+        def derivative(x: int, y: int) -> FloatArray:
+            terms = min(_TERMS, _HIGHEST + 1 - max(x, y))
+            return np.asarray(sum(powers[j] * (A[j + x] * B[j + y]) for j in range(terms)))
+
+        def tensor(order: int) -> FloatArray:
+            kinds = [derivative(order - k, k) for k in range(order + 1)]
+            shape = (2,) * order
+            every = [kinds[sum(index)] for index in np.ndindex(shape)]
+            stack = np.stack(every, axis=3)
+            return stack.reshape(*stack.shape[:3], *shape, stack.shape[-1])
+
+        return _Expectations(derivative(0, 0), tensor(1), tensor(2), tensor(3))
+
+    def regression(
+        self, along: FloatArray, across: FloatArray, mean: FloatArray, spread: FloatArray, rows: FloatArray,
+        weights: FloatArray,
+    ) -> Regression:  # fmt: skip
+        """Regression of the weighted sums on the coefficients.
+
+        Parameters
+        ----------
+        along, across:
+            Functions of columns and rows, (axes, spots, m, pixels).
+        mean, spread:
+            Of the path, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, spots, nodes, 2).
+        rows:
+            Of the exposure basis, (spots * nodes * 2, n_coefficients).
+        weights:
+            Of the nodes, (nodes,).
+        """
+        axes, spots, count, _ = mean.shape
+        f = self.expectations(along, across, mean, np.einsum("askdske->askde", spread))
+        size = f.value.shape[-1]
+
+        def weighted(tensor: FloatArray) -> FloatArray:
+            shape = (count, *(1,) * (tensor.ndim - 3))
+            return (tensor * weights.reshape(shape)).reshape(axes, spots, -1, size)
+
+        first, second, third = (stacked.transpose(weighted(t)) for t in (f.first, f.second, f.third))
+        of_spot = rows.reshape(spots, -1, rows.shape[-1])
+        slope = stacked.matmul(first, np.broadcast_to(of_spot, (axes, *of_spot.shape)))
+        remainder = np.empty((axes, spots, size, spots, size))
+        # Mehler again, between two spots at two nodes: the j-th derivatives meet over the j-th power of C, over j!.
+        for s in range(spots):
+            for t in range(s, spots):
+                C = spread[:, s, :, :, t]
+                square = np.einsum("akdle,akflg->akdfleg", C, C)
+                cube = np.einsum("akdfleg,akhlm->akdfhlegm", square, C).reshape(axes, count * 8, count * 8)
+                square = square.reshape(axes, count * 4, count * 4)
+                block = sum(
+                    stacked.matmul(stacked.matmul(each[:, s], power), stacked.transpose(each[:, t])) / factor
+                    for each, power, factor in ((second, square, 2), (third, cube, 6))
+                )
+                remainder[:, s, :, t] = block
+                remainder[:, t, :, s] = stacked.transpose(np.asarray(block))
+        joined = remainder.reshape(axes, spots * size, spots * size)
+        expected = (f.value * weights[:, None]).sum(axis=2).reshape(axes, -1)
+        return Regression(expected, slope.reshape(axes, spots * size, -1), stacked.symmetric(joined))
+
+    def measured(self, along: FloatArray, across: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The weighted sums, (axes, spots * m), and their noise, which spots do not share, (axes, ., .)."""
+        axes, spots, size, _ = along.shape
+        W = (across[..., :, None] * along[..., None, :]).reshape(axes, spots, size, -1)
+        y, noise = weighted_sums(self.sensor, W, density.reshape(axes, spots, -1))
+        joint = np.zeros((axes, spots, size, spots, size))
+        for k in range(spots):
+            joint[:, k, :, k] = noise[:, k]
+        return y.reshape(axes, -1), joint.reshape(axes, spots * size, spots * size)
