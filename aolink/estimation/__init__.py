@@ -9,7 +9,6 @@ from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.observation import PathMoments
 from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.windowed import Profile, WindowedMoments
-from aolink.estimation.windows import Window, measure_windows
 
 __all__ = [
     "ESTIMATOR_NAMES",
@@ -26,13 +25,11 @@ __all__ = [
     "Score",
     "Scorer",
     "Status",
-    "Window",
     "WindowedMoments",
     "exposure_model",
     "make_estimator",
     "measure_moments",
     "measure_moments_2d",
-    "measure_windows",
     "path_from_coefficients",
     "run",
     "score",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
@@ -95,7 +94,6 @@ class Estimator:
         posterior = self._filter.step(model, response, measured)
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
-        shape = (self.rig.n_outputs, exposure.n_steps)
         return Estimate(
             estimator=self.name,
             frame_id=exposure.frame_id,
@@ -109,8 +107,8 @@ class Estimator:
             end_covariance=posterior.end.covariance,
             coefficients=coefficients,
             coefficient_covariance=covariance,
-            path=model.path(coefficients, response.path).reshape(shape),
-            path_sd=model.path_sd(covariance).reshape(shape),
+            inputs=exposure.inputs,
+            model=model,
             innovation=posterior.innovation,
             innovation_covariance=posterior.innovation_covariance,
             nis=posterior.nis,
@@ -270,7 +268,8 @@ _BY_GRAVITY = (Status.PREDICTED, Status.OK, Status.REINITIALISED, Status.GATED, 
 
 
 def _worst(status: NDArray[np.int64]) -> Status:
-    return max((Status(int(s)) for s in np.unique(status)), key=_BY_GRAVITY.index)
+    counts = np.bincount(status)
+    return max((Status(int(s)) for s in np.flatnonzero(counts)), key=_BY_GRAVITY.index)
 
 
 def _told(posterior: Posterior) -> list[str]:
@@ -280,7 +279,7 @@ def _told(posterior: Posterior) -> list[str]:
         Status.DIVERGED: "too far from the prediction several times in a row: it starts again",
         Status.REINITIALISED: "started again from the plant's prior",
     }
-    counts = Counter(Status(int(s)) for s in posterior.status)
+    counts = np.bincount(posterior.status, minlength=len(Status))
     axes = len(posterior.status)
     told = []
     for status, text in words.items():

@@ -37,19 +37,32 @@ BoolArray = NDArray[np.bool_]
 class Profiles:
     """What the frame shows of each output of the rig, as counts of `SpotSensor.profile`."""
 
-    counts: NDArray[np.int64]
-    """(n_outputs, pixels), zero where the mask is."""
+    counts: FloatArray
+    """Whole numbers, zero where the mask is, (n_outputs, pixels); contiguous in memory along the outputs."""
     mask: BoolArray
-    """True where all pixels summed can be used, (n_outputs, pixels)."""
+    """True where all pixels summed can be used, (n_outputs, pixels), alike."""
 
 
 def profiles(sensor: SpotSensor, pixels: NDArray[np.uint16], usable: BoolArray) -> Profiles:
     """Sums of each window over its rows (x) and over its columns (y); both arguments are (rows, columns)."""
-    counts, good = windows(sensor, pixels.astype(np.int64)), windows(sensor, usable)
-    n_outputs = 2 * sensor.spots
-    sums = np.stack([counts.sum(axis=1), counts.sum(axis=2)], axis=1).reshape(n_outputs, -1)
-    mask = np.stack([good.all(axis=1), good.all(axis=2)], axis=1).reshape(n_outputs, -1)
-    return Profiles(counts=np.where(mask, sums, 0), mask=mask)
+    # 256 counts of 16 bits, which a window has at most along a side, make a sum that single precision holds exactly.
+    light = pixels.astype(np.float32)
+    counts = _summed(sensor, light)
+    if usable.all():
+        return Profiles(counts=counts, mask=np.ones_like(counts, dtype=bool))
+    mask = _summed(sensor, (~usable).astype(np.float32)) == 0
+    return Profiles(counts=np.where(mask, counts, 0.0), mask=mask)
+
+
+def _summed(sensor: SpotSensor, light: NDArray[np.float32]) -> FloatArray:
+    """Sums of each window over its rows and over its columns, (n_outputs, pixels)."""
+    (rows, columns), (height, width) = sensor.grid, sensor.window
+    sums = np.empty((width, rows, columns, 2))
+    sums[..., 0] = np.add.reduce(light.reshape(rows, height, columns, width), axis=1).transpose(2, 0, 1)
+    # As a product: NumPy takes several times as long to sum over a short last axis.
+    along_rows = light.reshape(-1, width) @ np.ones(width, np.float32)
+    sums[..., 1] = along_rows.reshape(rows, height, columns).transpose(1, 0, 2)
+    return sums.reshape(width, -1).T
 
 
 def windows(sensor: SpotSensor, frame: NDArray[Any]) -> NDArray[Any]:
@@ -77,17 +90,16 @@ def measure_spots(
     """
     saturated = is_saturated(sensor, pixels) & arrived
     found = profiles(sensor, pixels, arrived & ~saturated)
-    share = found.mask.mean(axis=1)
-    whole = share == 1 if orders else share >= least_usable
-    density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)  # type: ignore[arg-type] # sums
+    whole = np.count_nonzero(found.mask, axis=1) >= sensor.profile.pixels * (1 if orders else least_usable)
+    density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)
     lit = brightest_stretch(sensor.profile, density) >= least_significance
     if orders and flux == "measured":
         lit &= _enough_light(sensor.profile, found.counts)
     usable = (whole & lit).reshape(plant.axes, plant.n_outputs).all(axis=1)
     reasons = [
-        (int((~arrived).sum()), f"of {pixels.size} pixels are missing"),
-        (int(saturated.sum()), f"of {pixels.size} pixels are at an end of the scale"),
-        (int((whole & ~lit).sum()), f"of {len(lit)} profiles show no spot"),
+        (pixels.size - np.count_nonzero(arrived), f"of {pixels.size} pixels are missing"),
+        (np.count_nonzero(saturated), f"of {pixels.size} pixels are at an end of the scale"),
+        (np.count_nonzero(whole & ~lit), f"of {len(lit)} profiles show no spot"),
     ]
     remark = ", ".join(f"{count} {what}" for count, what in reasons if count)
     if not usable.all():
@@ -101,8 +113,8 @@ def measure_spots(
         # An axis without a measurement needs one that can be computed with.
         measured = Profile(density=density, mask=found.mask | ~usable[:, None])
     elif plant.n_outputs == 1:
-        chosen: NDArray[Any] = found.counts[usable]
-        measured = measure_moments(sensor.profile, chosen, orders, flux)
+        counts = found.counts if usable.all() else found.counts[usable]
+        measured = measure_moments(sensor.profile, counts, orders, flux)
     else:
         measured = _coupled_moments(sensor, plant, pixels, usable, orders, flux)
     if isinstance(measured, str):
@@ -114,11 +126,12 @@ def measure_spots(
 
 def brightest_stretch(line: Sensor, density: FloatArray) -> FloatArray:
     """`spot_significance` of each of many profiles, (n, pixels) -> (n,)."""
-    light = np.concatenate([np.zeros((len(density), 1)), np.cumsum(density, axis=1)], axis=1) * line.pixel_width
-    sd = np.sqrt(effective_noise_density(line) * line.pixel_width)
+    light = np.zeros((line.pixels + 1, len(density)))
+    for k in range(line.pixels):
+        np.add(light[k], density[:, k], out=light[k + 1])
     lengths = [2**k for k in range(line.pixels.bit_length()) if 2**k <= line.pixels]
-    gained = [(light[:, n:] - light[:, :-n]).max(axis=1) / (sd * np.sqrt(n)) for n in lengths]
-    return np.asarray(np.max(gained, axis=0))
+    gained = [(light[n:] - light[:-n]).max(axis=0) / np.sqrt(n) for n in lengths]
+    return np.asarray(np.max(gained, axis=0) * np.sqrt(line.pixel_width / effective_noise_density(line)))
 
 
 def centroid_noise(sensor: SpotSensor, n_outputs: int) -> FloatArray:
@@ -132,8 +145,12 @@ def centroid_noise(sensor: SpotSensor, n_outputs: int) -> FloatArray:
 
 
 def _enough_light(line: Sensor, counts: NDArray[Any]) -> BoolArray:
-    sd = np.sqrt(effective_noise_density(line) * noise_integrals(line, 0)[0])
-    return np.asarray(raw_moments(line, counts, 0)[:, 0] >= LEAST_FLUX * sd)
+    """Whether moments can be divided by the light of each profile, (n_outputs,)."""
+    total = raw_moments(line, counts, 0)[:, 0]
+    variance = effective_noise_density(line) * noise_integrals(line, 0)[0]
+    if line.photoelectrons:
+        variance = variance + np.maximum(total, 0.0) / line.photoelectrons
+    return np.asarray(total >= LEAST_FLUX * np.sqrt(variance))
 
 
 def _coupled_moments(

@@ -16,6 +16,7 @@ from aolink.estimation import (
     run,
     score,
 )
+from aolink.estimation.estimate import COMPARED
 from aolink.estimation.estimators import Options, measure
 from aolink.estimation.observation import PathMoments
 from aolink.plant import lift
@@ -36,7 +37,9 @@ def estimates(rig, exposures):
 
 
 def arrays(estimate):
-    return {f.name: v for f in dataclasses.fields(estimate) if isinstance(v := getattr(estimate, f.name), np.ndarray)}
+    """All but the inputs, which are the exposure's."""
+    values = {name: getattr(estimate, name) for name in COMPARED if name != "inputs"}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 def assert_sound(estimate):
