@@ -97,6 +97,18 @@ def congruence(a: Matrix, p: Matrix, plus: Matrix) -> Matrix:
     return symmetric_times_transposed(times_transposed(a, p), a, plus)
 
 
+def congruence_by_numbers(a: Sequence[Sequence[float]], p: Matrix, plus: Matrix) -> Matrix:
+    """`congruence` with one matrix of numbers for all axes: the products of its entries are numbers, too."""
+    n = len(p)
+    upper = [p[k][m] for k in range(n) for m in range(k, n)]
+    out: Matrix = [[0.0] * len(a) for _ in a]
+    for i, row in enumerate(a):
+        for j, other in enumerate(a[: i + 1]):
+            share = [row[k] * other[m] + (row[m] * other[k] if m > k else 0.0) for k in range(n) for m in range(k, n)]
+            out[i][j] = out[j][i] = dot(share, upper) + plus[i][j]
+    return out
+
+
 def one_minus(a: Matrix) -> Matrix:
     """I - A"""
     return [[1.0 - x if i == j else -x for j, x in enumerate(row)] for i, row in enumerate(a)]
