@@ -87,11 +87,10 @@ class FrameReassembly:
     def _close(self) -> Frame:
         parts, self._parts = self._parts, []
         first = parts[0]
-        data, arrived = bytearray(first.total), np.zeros(first.total, dtype=bool)
+        data, arrived = np.zeros(first.total, dtype=np.uint8), np.zeros(first.total, dtype=bool)
         for part in parts:
-            end = part.offset + len(part.data)
-            data[part.offset : end] = part.data
-            arrived[part.offset : end] = True
+            some = slice(part.offset, part.offset + len(part.data))
+            data[some], arrived[some] = np.frombuffer(part.data, np.uint8), True
         size = max(len(part.data) for part in parts)
         lost_before = 0 if self._last_id is None else first.frame_id - self._last_id - 1
         self._last_id = first.frame_id
@@ -99,9 +98,9 @@ class FrameReassembly:
             frame_id=first.frame_id,
             first_step=first.first_step,
             last_step=first.last_step,
-            pixels=np.frombuffer(bytes(data), dtype="<u2").astype(np.uint16).reshape(self._shape),
-            mask=arrived.reshape(-1, 2).all(axis=1).reshape(self._shape),
-            chunks_lost=-(-int((~arrived).sum()) // size),
+            pixels=data.view("<u2").astype(np.uint16, copy=False).reshape(self._shape),
+            mask=(arrived[::2] & arrived[1::2]).reshape(self._shape),
+            chunks_lost=-(-(first.total - int(np.count_nonzero(arrived))) // size),
             frames_lost_before=lost_before,
             device_start_ns=first.exposure_start_ns,
             device_end_ns=first.exposure_end_ns,
@@ -115,17 +114,17 @@ class TruthReassembly:
 
     def __init__(self) -> None:
         self._frame_id = 0
-        self._data = b""
+        self._data = bytearray()
 
     def add(self, chunk: pb.TruthChunk) -> pb.Truth | None:
         """Take a chunk; gives the truth that it completes."""
         if chunk.offset == 0:
-            self._frame_id, self._data = chunk.frame_id, b""
+            self._frame_id, self._data = chunk.frame_id, bytearray()
         if chunk.frame_id != self._frame_id or chunk.offset != len(self._data):
             self._frame_id = 0
             return None
         self._data += chunk.data
-        return pb.Truth.FromString(self._data) if len(self._data) == chunk.total else None
+        return pb.Truth.FromString(bytes(self._data)) if len(self._data) == chunk.total else None
 
 
 class _InputHistory:

@@ -229,3 +229,12 @@ def test_check_says_what_is_wrong_and_what_is_lost(
     assert result.returncode == 0, result.stdout + result.stderr
     assert re.search(r"warning .*10(\.0+)? Hz", result.stdout), result.stdout
     assert "warning: timing.exposure_steps: the centroid" in aolink("rig", "lost.toml", "--listen", "nonsense").stderr
+
+
+def test_a_row_of_inputs_and_their_limits_must_fit_into_a_message() -> None:
+    text = load_rig("sh-4x4").toml.replace("axes = 32", "axes = 6272").replace("grid = [4, 4]", "grid = [56, 56]")
+    text = text.replace("block_steps = 10 ", "")
+    assert parse_rig(text).mirror.block_steps == 1
+    text = text.replace("B = [[0.0], [1.0]]", "B = [[0.0, 0.0], [1.0, 1.0]]")
+    with pytest.raises(RigError, match="the mirror has 12544 inputs"):
+        parse_rig(text)
