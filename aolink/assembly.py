@@ -127,13 +127,17 @@ class TruthReassembly:
         return pb.Truth.FromString(bytes(self._data)) if len(self._data) == chunk.total else None
 
 
+_Blocks = list[tuple[int, NDArray[np.float64]]]
+"""First steps and inputs of runs of steps, (k, n_inputs), in the order in which they came."""
+
+
 class _InputHistory:
     """What the mirror held, and what it was told, for every fast step not yet used."""
 
     def __init__(self, n_inputs: int, park: NDArray[np.float64]) -> None:
         self._n_inputs = n_inputs
-        self._applied: dict[int, NDArray[np.float64]] = {}
-        self._commanded: dict[int, NDArray[np.float64]] = {}
+        self._applied: _Blocks = []
+        self._commanded: _Blocks = []
         self._last = park
         self.reported_until = 0
         """First step that no report covers yet."""
@@ -145,24 +149,29 @@ class _InputHistory:
     def add_command(self, message: pb.CommandBlock) -> None:
         self._add(self._commanded, message)
 
-    def _add(self, steps: dict[int, NDArray[np.float64]], message: pb.Applied | pb.CommandBlock) -> None:
-        if len(message.u) == message.n_steps * self._n_inputs:
-            rows = np.array(message.u, dtype=np.float64).reshape(message.n_steps, self._n_inputs)
-            steps.update(zip(range(message.first_step, message.first_step + message.n_steps), rows, strict=True))
+    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock) -> None:
+        if message.n_steps and len(message.u) == message.n_steps * self._n_inputs:
+            u = np.array(message.u, dtype=np.float64).reshape(message.n_steps, self._n_inputs)
+            blocks.append((message.first_step, u))
 
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
-        """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``."""
-        rows, assumed = np.empty((max(0, end - first), self._n_inputs)), 0
-        for k in range(first, end):
-            row = self._applied.get(k)
-            if row is None:
-                assumed += 1
-                row = self._commanded.get(k, self._last)
-            rows[k - first] = self._last = row
-        for steps in (self._applied, self._commanded):
-            for k in [k for k in steps if k < end]:
-                del steps[k]
-        return rows, assumed
+        """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
+
+        The last word on a step counts; one that nothing is known of holds the input of the step before.
+        """
+        n = max(0, end - first)
+        rows, told, reported = np.empty((n, self._n_inputs)), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        for blocks, known in ((self._commanded, told), (self._applied, reported)):
+            for start, u in blocks:
+                some = slice(max(start - first, 0), max(start + len(u) - first, 0))
+                rows[some] = u[max(first - start, 0) :][: len(rows[some])]
+                known[some] = True
+            blocks[:] = [(max(start, end), u[max(end - start, 0) :]) for start, u in blocks if start + len(u) > end]
+        for k in np.flatnonzero(~(told | reported)):
+            rows[k] = rows[k - 1] if k else self._last
+        if n:
+            self._last = rows[-1].copy()
+        return rows, n - int(np.count_nonzero(reported))
 
 
 class Assembler:
