@@ -9,6 +9,7 @@ Every estimator is an update of z; they differ in what they observe, and in whet
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -105,16 +106,23 @@ class ExposureModel:
 
     def response(self, inputs: FloatArray) -> InputResponse:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
-        path, end = input_response(self.plant, by_axis(self.plant, inputs))
+        return self.responses([inputs])[0]
+
+    def responses(self, inputs: Sequence[FloatArray]) -> list[InputResponse]:
+        """`response` of many exposures, each to the same bits, for a fraction of the calls."""
+        path, end = input_response(self.plant, np.concatenate([by_axis(self.plant, each) for each in inputs]))
         # Column by column, so that the products lie in memory as they are summed.
         slope = [stacked.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
-        return InputResponse(
-            path=path,
-            end=stacked.batch_last(end),
-            mean=stacked.mean_over_path(path),
-            slope=np.stack(slope, axis=-1),
-            square=stacked.mean_over_path(path * path),
-        )
+        all_axes = {
+            "path": path,
+            "end": stacked.batch_last(end),
+            "mean": stacked.mean_over_path(path),
+            "slope": np.stack(slope, axis=-1),
+            "square": stacked.mean_over_path(path * path),
+        }
+        axes = self.plant.axes
+        own = [slice(k * axes, (k + 1) * axes) for k in range(len(inputs))]
+        return [InputResponse(**{name: values[some] for name, values in all_axes.items()}) for some in own]
 
     def cross_quadratic(self, first: int, second: int) -> FloatArray:
         """Symmetric M with mean(theta_1 theta_2) = x'Mx for two outputs without inputs, (n_states, n_states)."""

@@ -207,12 +207,20 @@ def moments_from_sums(
     )
 
 
-def spot_significance(sensor: Sensor, density: FloatArray) -> float:
-    """By how many standard deviations the light of the brightest stretch of a row stands out, over several lengths."""
-    light = np.concatenate([[0.0], np.cumsum(density)]) * sensor.pixel_width
-    lengths = [2**k for k in range(sensor.pixels.bit_length())]
-    sd = math.sqrt(effective_noise_density(sensor) * sensor.pixel_width)
-    return max(float((light[n:] - light[:-n]).max()) / (sd * math.sqrt(n)) for n in lengths if n <= sensor.pixels)
+def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
+    """By how many standard deviations the light of each row's brightest stretch stands out, over several lengths.
+
+    Densities (n, pixels) -> (n,).
+    """
+    light = np.zeros((sensor.pixels + 1, len(density)))
+    if len(density) < sensor.pixels:
+        np.cumsum(density.T, axis=0, out=light[1:])
+    else:  # the same sums; NumPy's own are slow across long rows
+        for k in range(sensor.pixels):
+            np.add(light[k], density[:, k], out=light[k + 1])
+    lengths = [2**k for k in range(sensor.pixels.bit_length()) if 2**k <= sensor.pixels]
+    gained = [(light[n:] - light[:-n]).max(axis=0) / math.sqrt(n) for n in lengths]
+    return np.asarray(np.max(gained, axis=0) * math.sqrt(sensor.pixel_width / effective_noise_density(sensor)))
 
 
 def least_significance(sensor: Sensor) -> float:

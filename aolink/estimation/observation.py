@@ -128,12 +128,12 @@ def _moment_entries(
     for o in range(model.plant.n_outputs):
         if 1 in orders:
             mean_row = model.mean_row[o].tolist()
-            moments.append(entries.dot(mean_row, x) + response.mean[:, o])
+            moments.append(entries.dot(mean_row, x) + entries.columns(response.mean)[o])
             slopes.append(mean_row)
         if 2 in orders:
             slope = entries.columns(response.slope[:, o])
             half = entries.add(_times_state(model.quadratic[o], state), slope)
-            moments.append(entries.dot(x, entries.add(half, slope)) + response.square[:, o])
+            moments.append(entries.dot(x, entries.add(half, slope)) + entries.columns(response.square)[o])
             slopes.append([2 * each for each in half])
     for o, p in itertools.combinations(range(model.plant.n_outputs), 2) if crosses else ():
         # mean (a'x + c)(b'x + d) = x'M_ab x + (b_ad + b_bc)'x + s_cd
@@ -185,9 +185,9 @@ def _corrected_small(
     keep = entries.one_minus(entries.times_transposed(K, entries.transpose(H)))
     from_noise = entries.symmetric_times_transposed(entries.times_transposed(K, noise), K)
     covariance = entries.congruence(keep, P, from_noise)
-    nis = np.asarray(entries.dot(innovation, entries.times_vector(S_inverse, innovation)))
+    nis = entries.dot(innovation, entries.times_vector(S_inverse, innovation))
     after = Belief(entries.pack_vector(mean, axes), entries.pack(covariance, axes))
-    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), nis)
+    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), entries.pack_one(nis, axes))
 
 
 def _corrected_two(prior: Belief, innovation: list[Entry], H: entries.Matrix, R: FloatArray) -> Correction:
@@ -200,20 +200,18 @@ def _corrected_two(prior: Belief, innovation: list[Entry], H: entries.Matrix, R:
     (p, q), (_, r) = entries.unpack(prior.covariance)
     (noise, shared), (_, rest) = entries.unpack(R)
     (f, g), (d, e) = H, innovation
-    share = shared / noise
+    share = shared * entries.reciprocal(noise)
     together = not isinstance(share, float) or share != 0.0
     if together:
         # The second measurement without what its noise shares with the first's: G is then the sum of two dyads.
-        g, e, rest = (
-            [second - share * first for first, second in zip(f, g, strict=True)],
-            e - share * d,
-            rest - share * shared,
-        )
+        g = [second - share * first for first, second in zip(f, g, strict=True)]
+        e, rest = e - share * d, rest - share * shared
     Pf, Pg = ([dot([p, q], h), dot([q, r], h)] for h in (f, g))
     s, t, both = dot(f, Pf), dot(g, Pg) + rest, dot(f, Pg)
-    determinant = np.abs(p * r - q * q)  # which rounding may make a little less than zero
+    # Rounding may make it a little less than zero.
+    determinant: Entry = abs(p * r - q * q)  # type: ignore[assignment] # of either it is its own kind
     root = f[0] * g[1] - f[1] * g[0]
-    inverse = 1.0 / (noise * t + s * rest + determinant * root * root)  # 1 / |S|
+    inverse = entries.reciprocal(noise * t + s * rest + determinant * root * root)  # 1 / |S|
     s = s + noise
 
     rest_f, noise_g = [rest * each for each in f], [noise * each for each in g]
@@ -226,12 +224,12 @@ def _corrected_two(prior: Belief, innovation: list[Entry], H: entries.Matrix, R:
     s_inverse, t_inverse, off = t * inverse, s * inverse, both * inverse
     gain = [[a * s_inverse - b * off, b * t_inverse - a * off] for a, b in zip(Pf, Pg, strict=True)]
     mean = [x + dot(row, [d, e]) for x, row in zip(entries.columns(prior.mean), gain, strict=True)]
-    nis = np.asarray(d * (s_inverse * d - 2.0 * (off * e)) + e * (t_inverse * e))
+    nis = d * (s_inverse * d - 2.0 * (off * e)) + e * (t_inverse * e)
     if together:
         both, t = both + share * s, t + share * (2.0 * both + share * s)
     S = [[s, both], [both, t]]
     after = Belief(entries.pack_vector(mean, axes), entries.pack([[p, q], [q, r]], axes))
-    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), nis)
+    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), entries.pack_one(nis, axes))
 
 
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:

@@ -22,6 +22,7 @@ from aolink.estimation.moments import (
     measure_moments,
     noise_integrals,
     raw_moments,
+    spot_significance,
 )
 from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.windowed import Profile
@@ -92,7 +93,7 @@ def measure_spots(
     found = profiles(sensor, pixels, arrived & ~saturated)
     whole = np.count_nonzero(found.mask, axis=1) >= sensor.profile.pixels * (1 if orders else least_usable)
     density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)
-    lit = brightest_stretch(sensor.profile, density) >= least_significance
+    lit = spot_significance(sensor.profile, density) >= least_significance
     if orders and flux == "measured":
         lit &= _enough_light(sensor.profile, found.counts)
     usable = (whole & lit).reshape(plant.axes, plant.n_outputs).all(axis=1)
@@ -122,16 +123,6 @@ def measure_spots(
     if not usable.all():
         measured = replace(_spread(measured, usable), usable=usable)
     return measured, remark
-
-
-def brightest_stretch(line: Sensor, density: FloatArray) -> FloatArray:
-    """`spot_significance` of each of many profiles, (n, pixels) -> (n,)."""
-    light = np.zeros((line.pixels + 1, len(density)))
-    for k in range(line.pixels):
-        np.add(light[k], density[:, k], out=light[k + 1])
-    lengths = [2**k for k in range(line.pixels.bit_length()) if 2**k <= line.pixels]
-    gained = [(light[n:] - light[:-n]).max(axis=0) / np.sqrt(n) for n in lengths]
-    return np.asarray(np.max(gained, axis=0) * np.sqrt(line.pixel_width / effective_noise_density(line)))
 
 
 def centroid_noise(sensor: SpotSensor, n_outputs: int) -> FloatArray:

@@ -33,8 +33,8 @@ def reestimated(
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
     """The same exposure by exposure, estimates in the order of ``names``; nothing of it stays in memory."""
     driver = Driver(recording.rig, names)
-    for number, exposure in enumerate(recording.exposures(), 1):
-        yield exposure, driver.step(exposure)
+    for number, done in enumerate(driver.steps(recording.exposures()), 1):
+        yield done
         progress(number)
 
 

@@ -13,7 +13,7 @@ from aolink.estimation.estimate import Status
 from aolink.estimation.moments import measure_moments, spot_significance
 from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.score import score
-from aolink.estimation.spots import brightest_stretch, centroid_noise, measure_spots, profiles, windows
+from aolink.estimation.spots import centroid_noise, measure_spots, profiles, windows
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, to_counts, to_density
 from aolink.optics.frame import frame_density
@@ -168,8 +168,14 @@ def test_a_coupled_plant_is_estimated_better_than_by_prediction():
 def test_the_significance_of_many_profiles_is_that_of_each():
     line, rng = SENSOR.profile, np.random.default_rng(5)
     density = rng.standard_normal((20, line.pixels))
-    each = [spot_significance(line, row) for row in density]
-    np.testing.assert_allclose(brightest_stretch(line, density), each)
+    each = []
+    for row in density:
+        stretches = [(row[k : k + n], n) for n in (1, 2, 4, 8, 16) for k in range(line.pixels - n + 1)]
+        sd = np.sqrt(effective_noise_density(line) * line.pixel_width)
+        each.append(max(light.sum() * line.pixel_width / (sd * np.sqrt(n)) for light, n in stretches))
+    np.testing.assert_allclose(spot_significance(line, density), each)
+    one_by_one = [spot_significance(line, row[None])[0] for row in np.tile(density, (4, 1))]
+    assert np.array_equal(spot_significance(line, np.tile(density, (4, 1))), one_by_one)
 
 
 @pytest.fixture(scope="module")
