@@ -200,8 +200,8 @@ def _corrected_two(prior: Belief, innovation: list[Entry], H: entries.Matrix, R:
     (p, q), (_, r) = entries.unpack(prior.covariance)
     (noise, shared), (_, rest) = entries.unpack(R)
     (f, g), (d, e) = H, innovation
-    share = shared * entries.reciprocal(noise)
-    together = not isinstance(share, float) or share != 0.0
+    together = bool(np.any(shared))
+    share = shared / noise if together else 0.0
     if together:
         # The second measurement without what its noise shares with the first's: G is then the sum of two dyads.
         g = [second - share * first for first, second in zip(f, g, strict=True)]
