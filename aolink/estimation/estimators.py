@@ -149,7 +149,8 @@ def measure_all(
 ) -> list[Measured]:
     """`measure` of many exposures, each to the same bits: line-sensor frames without a flaw all at once."""
     sensor, found = rig.sensor, dict[int, Measured]()
-    if len(exposures) > 1 and isinstance(sensor, Sensor) and isinstance(observation, PathMoments):
+    many = len(exposures) > 1 and sensor.shape[0] == 1
+    if many and isinstance(sensor, Sensor) and isinstance(observation, PathMoments):
         whole = [k for k, each in enumerate(exposures) if each.pixels.shape == sensor.shape and each.complete]
         pixels = np.concatenate([np.empty(sensor.shape, np.uint16)[:0], *(exposures[k].pixels for k in whole)])
         lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
