@@ -29,6 +29,9 @@ from aolink.toml_table import Table, shape_text
 
 FloatArray = NDArray[np.float64]
 
+# A row of them, and their limits, in one message of the protocol.
+_MOST_INPUTS = 10_000
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plant:
@@ -343,13 +346,17 @@ def _mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
     park = table.vector("park", n_inputs, "inputs", 0.0)
     if (park < low).any() or (park > high).any():
         raise RigError("mirror.park is outside mirror.input_min .. mirror.input_max: the safe input must be allowed")
-    # A block is one packet: 4 KiB of 8-byte numbers.
-    most = max(1, 4096 // (8 * n_inputs))
+    if n_inputs > _MOST_INPUTS:
+        raise RigError(
+            f"the mirror has {n_inputs} inputs (plant.axes times the columns of plant.B): at most {_MOST_INPUTS}"
+        )
+    # A block is one packet, 4 KiB of 8-byte numbers; where not even one step fits, it goes in parts.
+    in_packet, in_parts = 4096 // (8 * n_inputs), 65_536 // (8 * n_inputs)
+    most = in_packet or max(1, in_parts)
     block = table.integer("block_steps", min(50, most), low=1)
     if block > most:
-        raise RigError(
-            f"mirror.block_steps = {block} does not fit into one packet: at most {most} for {n_inputs} inputs"
-        )
+        room = "one packet" if in_packet else "64 KiB"
+        raise RigError(f"mirror.block_steps = {block} does not fit into {room}: at most {most} for {n_inputs} inputs")
     queue = table.integer("queue_steps", 8 * block, low=1)
     if queue < 2 * block:
         raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")

@@ -263,3 +263,12 @@ def test_a_kernel_on_a_plane_is_that_of_equation_4():
     width = np.array([[0.12, 0.03], [0.03, 0.08]])
     np.testing.assert_allclose(kernel.covariance, width @ width / 2)
     assert kernel.variance == pytest.approx(np.trace(kernel.covariance) / 2)
+
+
+def test_a_row_of_inputs_and_their_limits_must_fit_into_a_message() -> None:
+    text = load_rig("sh-4x4").toml.replace("axes = 32", "axes = 6272").replace("grid = [4, 4]", "grid = [56, 56]")
+    text = text.replace("block_steps = 10 ", "")
+    assert parse_rig(text).mirror.block_steps == 1
+    text = text.replace("B = [[0.0], [1.0]]", "B = [[0.0, 0.0], [1.0, 1.0]]")
+    with pytest.raises(RigError, match="the mirror has 12544 inputs"):
+        parse_rig(text)

@@ -10,7 +10,6 @@ from aolink.estimation.observation import PathMoments
 from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
-from aolink.estimation.windows import Window, measure_windows
 
 __all__ = [
     "ESTIMATOR_NAMES",
@@ -29,14 +28,12 @@ __all__ = [
     "Scorer",
     "SpotWindows",
     "Status",
-    "Window",
     "WindowedMoments",
     "WindowedSpots",
     "exposure_model",
     "make_estimator",
     "measure_moments",
     "measure_moments_2d",
-    "measure_windows",
     "path_from_coefficients",
     "run",
     "score",

@@ -264,7 +264,7 @@ def test_many_axes_become_percentiles(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     estimates = [
         replace(
-            e, path=rng.normal(size=(axes, N)), path_sd=np.ones((axes, N)), nis=rng.chisquare(2, size=axes),
+            e, drawn=rng.normal(size=(axes, N)), drawn_sd=np.ones((axes, N)), nis=rng.chisquare(2, size=axes),
             start_state=rng.normal(size=(axes, 2)), start_covariance=np.tile(np.eye(2), (axes, 1, 1)),
             end_state=rng.normal(size=(axes, 2)), end_covariance=np.tile(np.eye(2), (axes, 1, 1)),
         )
