@@ -182,8 +182,11 @@ def _parse_summary(data: bytes) -> Summary | None:
     return summary
 
 
-def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[McapRecord]:
-    """Every whole record of a file from its start to its footer, those in chunks too; losses go to ``on_loss``."""
+def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[McapRecord, bool]]:
+    """Every whole record of a file from its start to its index, those in chunks too; losses go to ``on_loss``.
+
+    With each record, whether a checksum says that it is what was written.
+    """
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     if file.read(len(_MAGIC)) != _MAGIC:
@@ -212,14 +215,14 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[McapRecor
             end = _next_chunk(file, position + 1, size, before=end) or end
             on_loss(replace(lost[0], length=end - position))
         elif isinstance(record, Chunk):
-            yield from broken_up(record, position, on_loss)
+            yield from ((each, True) for each in broken_up(record, position, on_loss))
         elif record is not None:
-            yield record
+            yield record, False
         position = end
         file.seek(position)
-        if isinstance(record, Footer):
-            if file.read(len(_MAGIC)) != _MAGIC:
-                on_loss(Loss(end, size - end, "it was cut off at its very end"))
+        if head[0] == Opcode.DATA_END:
+            if read_summary(file) is None:
+                on_loss(Loss(end, size - end, "its index is damaged or was cut off"))
             return
     on_loss(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
 
