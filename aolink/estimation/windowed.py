@@ -148,7 +148,7 @@ class Windowed(ABC, Generic[Light]):
     def _correct(self, model: ExposureModel, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
         about, rho = prior, np.full(len(prior.mean), _slowest(model.transition[None])[0])
         memory = _memory(rho)
-        for _ in range(_PASSES):
+        for to_come in reversed(range(_PASSES)):
             y, noise, fit = self.look(nodes, about, measured)
             if self.flux == "measured":
                 light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, self._lights].min(axis=1)
@@ -157,7 +157,8 @@ class Windowed(ABC, Generic[Light]):
             R = noise + memory[:, None, None] * fit.remainder
             done = corrected(prior, innovation, fit.slope, R)
             about = done.posterior
-            memory = _memory(np.sqrt(rho * _slowest(_closed_loop(model, prior, fit.slope, R))))
+            if to_come:
+                memory = _memory(np.sqrt(rho * _slowest(_closed_loop(model, prior, fit.slope, R))))
         # The spread to expect of this one innovation is without the memory.
         HP = stacked.matmul(fit.slope, prior.covariance)
         S = stacked.symmetric(stacked.matmul(HP, stacked.transpose(fit.slope)) + noise + fit.remainder)
@@ -369,7 +370,9 @@ def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
 
 def _slowest(transition: FloatArray) -> FloatArray:
     """Modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
-    return np.asarray(np.abs(np.linalg.eigvals(transition)).max(axis=1))
+    finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
+    # What is not finite is refused by the filter; here it must only not stop the others.
+    return np.asarray(np.abs(np.linalg.eigvals(np.where(finite, transition, 0.0))).max(axis=1))
 
 
 def _memory(rho: FloatArray) -> FloatArray:
