@@ -335,7 +335,8 @@ def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
 def _check_sensor(rig: Rig) -> list[Finding]:
     sensor = rig.sensor
     findings = []
-    sd = math.sqrt(sensor.kernel.variance)
+    # Where it is narrowest.
+    sd = math.sqrt(float(np.linalg.eigvalsh(sensor.kernel.covariance)[0]))
     if sd < sensor.pixel_width / 3:
         message = (
             f"the kernel's sd, {sd:.3g}, is under a third of a pixel ({sensor.pixel_width:.3g}):"
