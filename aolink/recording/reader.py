@@ -244,8 +244,10 @@ class Recording:
                     ids[record.id] = record.name
                     self.schemas[record.name] = record
             elif isinstance(record, Channel):
-                if sure or record.id not in self._channels:
-                    self._channels[record.id] = (record.topic, ids.get(record.schema_id, ""))
+                before = self._channels.get(record.id)
+                if sure or before is None:  # its schema may have been in a chunk that is lost
+                    kind = ids.get(record.schema_id, before[1] if before else "")
+                    self._channels[record.id] = (record.topic, kind)
             else:
                 self._note(record, rig_texts)
         for channel_id, count in names.items():
