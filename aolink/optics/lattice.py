@@ -20,6 +20,8 @@ IntArray = NDArray[np.int64]
 # A spot is a maximum that stands out so many times above the noise of the smoothed frame.
 _SIGNIFICANCE = 8.0
 _FEWEST_SPOTS = 9
+# A pixel so many times as bright as its neighbours is hot: a spot of sd 0.6 pixels or more makes none such.
+_HOT = 4.0
 # How far from its node a spot may be to belong to it, in pitches.
 _NEAR = 0.25
 # Background: medians of blocks of so many pixels.
@@ -143,10 +145,12 @@ def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, float]:
         np.array(blocks), (counts.shape[0] / rows, counts.shape[1] / columns), order=1, mode="nearest", grid_mode=True
     )  # fmt: skip
     flat = counts - smooth
+    ring = np.ones((3, 3), dtype=np.bool_)
+    ring[1, 1] = False
+    # A hot pixel, or one of a pair, is far brighter than its second brightest neighbour; light through a lens is not.
+    second = ndimage.rank_filter(flat, -2, footprint=ring)
+    alone = flat - _HOT * np.maximum(second, 0) > 6 * _spread(flat)
     around = ndimage.median_filter(flat, 3)
-    noise = _spread(flat)
-    # A hot pixel stands out of its neighbours where none of them is part of a spot.
-    alone = (flat - around > 6 * noise) & (ndimage.maximum_filter(around, 3) < 3 * noise)
     return np.where(alone, around, flat), float(np.median(smooth))
 
 
