@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import next_fast_len
 from scipy.special import sici
 
 from aolink.errors import FrameError
@@ -20,6 +22,8 @@ FloatArray = NDArray[np.float64]
 
 # Numbers at once: the masses of so many spots stay in the processor's cache.
 _AT_ONCE = 16
+# Rows of the table of diffraction's masses from the middle to the first zero: linearly between them, 1e-6 is left out.
+_POINTS = 512
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,26 +63,43 @@ def spot_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     if psi.shape == "image":
         return _image_windows(psi, side, path_px)
     light = np.empty((len(path_px), side, side))
-    edges = np.arange(side + 1) - 0.5
     for k in range(0, len(path_px), _AT_ONCE):
         some = slice(k, k + _AT_ONCE)
-        masses = _masses(psi, edges, path_px[some])
+        masses = _delta_masses(side, path_px[some]) if psi.shape == "delta" else _sinc2_masses(psi, side, path_px[some])
         # Both kernels are products of their two directions: the sum over the steps is a matrix product.
         np.matmul(masses[:, 1].swapaxes(1, 2), masses[:, 0], out=light[some])
     light /= path_px.shape[-1]
     return light
 
 
-def _masses(psi: Psi, edges: FloatArray, positions: FloatArray) -> FloatArray:
-    """Mass of one direction in each pixel, (..., n_steps, side)."""
-    away = edges - positions[..., None]
-    below = (away >= 0).astype(np.float64) if psi.shape == "delta" else _sinc2_below(away / psi.zero_px)
-    return np.asarray(np.diff(below, axis=-1))
+def _delta_masses(side: int, positions: FloatArray) -> FloatArray:
+    """One in the pixel where the spot is, (..., n_steps, side)."""
+    return np.asarray((np.floor(positions + 0.5)[..., None] == np.arange(side)), dtype=np.float64)
+
+
+def _sinc2_masses(psi: Psi, side: int, positions: FloatArray) -> FloatArray:
+    """Mass of one direction in each pixel, (..., n_steps, side): between the rows of a table, linearly."""
+    table = _sinc2_table(psi.zero_px, side)
+    place = np.clip((positions + side) * (_POINTS / psi.zero_px), 0, len(table) - 2)
+    row = place.astype(np.intp)
+    low, high = table.take(row, axis=0), table.take(row + 1, axis=0)
+    high -= low
+    high *= (place - row)[..., None]
+    low += high
+    return np.asarray(low)
+
+
+@lru_cache(maxsize=8)
+def _sinc2_table(zero_px: float, side: int) -> FloatArray:
+    """Masses of the pixels for spots from a window before the first one to a window behind the last, (rows, side)."""
+    positions = np.arange(math.ceil(3 * side / zero_px * _POINTS) + 2) * (zero_px / _POINTS) - side
+    edges = np.arange(side + 1) - 0.5
+    return np.asarray(np.diff(_sinc2_below((edges - positions[:, None]) / zero_px), axis=-1))
 
 
 def _sinc2_below(x: FloatArray) -> FloatArray:
     """Integral of sinc^2 from minus infinity to x: 1/2 + (Si(2 pi x) - sin^2(pi x)/(pi x)) / pi."""
-    a = math.pi * np.asarray(x, dtype=np.float64)
+    a = math.pi * x
     safe = np.where(np.abs(a) < 1e-9, 1.0, a)
     return np.asarray(0.5 + (sici(2 * a)[0] - np.where(np.abs(a) < 1e-9, a, np.sin(safe) ** 2 / safe)) / math.pi)
 
@@ -93,17 +114,19 @@ def _image_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     spots, _, steps = path_px.shape
     place = (path_px + 0.5) * fine - 0.5
     margin = max(psi.image.shape) // 2 + 1
-    size = n + 2 * margin
+    size = next_fast_len(n + 2 * margin, real=True)
     low = np.floor(place).astype(np.int64)
     part = place - low
-    trace = np.zeros((spots, size * size))
-    spot = np.broadcast_to(np.arange(spots)[:, None], (spots, steps))
+    first = np.broadcast_to(np.arange(spots)[:, None] * size**2, (spots, steps))
+    pixels, weights = [], []
     for dy in (0, 1):
         for dx in (0, 1):
             x, y = low[:, 0] + dx + margin, low[:, 1] + dy + margin
             weight = np.where(dx, part[:, 0], 1 - part[:, 0]) * np.where(dy, part[:, 1], 1 - part[:, 1]) / steps
             seen = (x >= 0) & (x < size) & (y >= 0) & (y < size)  # beyond, no light reaches the window
-            np.add.at(trace, (spot[seen], y[seen] * size + x[seen]), weight[seen])
+            pixels.append((first + y * size + x)[seen])
+            weights.append(weight[seen])
+    trace = np.bincount(np.concatenate(pixels), np.concatenate(weights), spots * size**2)
     kernel = np.zeros((size, size))
     rows, columns = psi.image.shape
     kernel[:rows, :columns] = psi.image / psi.image.sum()

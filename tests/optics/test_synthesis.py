@@ -28,7 +28,7 @@ def test_diffraction_is_the_integral_of_sinc_squared():
         [integrate.quad(lambda w, c=c: np.sinc((w - c) / 1.7) ** 2 / 1.7, k - 0.5, k + 0.5)[0] for k in range(12)]
         for c in (5.3, 4.1)
     ]
-    np.testing.assert_allclose(window, np.outer(along[1], along[0]), atol=1e-9)
+    np.testing.assert_allclose(window, np.outer(along[1], along[0]), atol=1e-6)
     wide = spot_windows(psi, 400, np.full((1, 2, 1), 199.5)).sum()
     assert wide == pytest.approx(1, abs=4 * 1.7 / np.pi**2 / 200)  # tails of 1 / (pi^2 x) to each side
 
