@@ -37,6 +37,8 @@ _QUEUE_BYTES = 256 << 20
 """What may wait for the disk."""
 _STALL_S = 5.0
 """A disk that takes longer over one write stops the session."""
+_LARGEST_BASIS = 32 << 20
+"""Bytes of an exposure basis that are kept whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +191,8 @@ class RecordingWriter:
         self._writer.start(profile="aolink", library="aolink")
         model = ExposureModel(rig.plant, rig.timing.exposure_steps)
         basis = io.BytesIO()
-        np.save(basis, model.basis)
+        # Of a large one only the columns of the start state: o1 to o3, which know such plants, have no others.
+        np.save(basis, model.basis if model.basis.nbytes <= _LARGEST_BASIS else model.state_rows)
         for name, kind, data in (
             (topics.RIG_ATTACHMENT, "application/toml", rig.toml.encode()),
             (topics.BASIS_ATTACHMENT, "application/octet-stream", basis.getvalue()),
