@@ -24,6 +24,8 @@ from aolink.session import Report
 if TYPE_CHECKING:
     from aolink.calibrating import Calibrated
     from aolink.demo import DemoResult
+    from aolink.estimation.exposure_scan import ExpectedError
+    from aolink.rig import Rig
     from aolink.slopes import FrameSlopes
 
 _LATENCY_STEPS = (
@@ -338,3 +340,16 @@ def slopes(result: FrameSlopes) -> Table:
     ):
         grid.add_row(name, value)
     return grid
+
+
+def exposure_scan(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
+    """What `aolink rig --exposure-scan` says; the rig's own exposure time is marked."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for title in ("exposure steps", "s", "RMSE path", "RMSE output at end", "centroid noise"):
+        table.add_column(title, justify="right")
+    for each in errors:
+        own = " *" if each.exposure_steps == rig.timing.exposure_steps else "  "
+        seconds = f"{each.exposure_steps * rig.timing.fast_step_s:.4g}"
+        values = (f"{x:.4f}" for x in (each.path_rms, each.end_rms, each.noise_rms))
+        table.add_row(f"{each.exposure_steps}{own}", seconds, *values)
+    return table
