@@ -175,11 +175,12 @@ def _steps(places: FloatArray) -> FloatArray:
     if len(difference) < _FEWEST_SPOTS:
         raise FrameError(f"no grid: the {len(places)} spots have no step in common along a row")
     length = np.linalg.norm(difference, axis=1)
-    alike = np.linalg.norm(difference[:, None] - difference, axis=-1) < 0.15 * length[:, None]
+    tree = cKDTree(difference)
+    votes = np.asarray(tree.query_ball_point(difference, 0.15 * length, return_length=True))
     # Of all steps that are common, the shortest: two lenslets' step is common as well.
-    votes = alike.sum(axis=1)
     common = np.flatnonzero(votes > 0.5 * votes.max())
-    along = difference[alike[common[length[common].argmin()]]].mean(axis=0)
+    chosen = common[length[common].argmin()]
+    along = difference[tree.query_ball_point(difference[chosen], 0.15 * length[chosen])].mean(axis=0)
     return np.stack([along, [-along[1], along[0]]])
 
 
