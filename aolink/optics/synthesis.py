@@ -24,6 +24,8 @@ FloatArray = NDArray[np.float64]
 _AT_ONCE = 16
 # Rows of the table of diffraction's masses from the middle to the first zero: linearly between them, 1e-6 is left out.
 _POINTS = 512
+# Numbers in a table at most; for wider windows it is not worth its memory.
+_LARGEST_TABLE = 4_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -79,6 +81,9 @@ def _delta_masses(side: int, positions: FloatArray) -> FloatArray:
 
 def _sinc2_masses(psi: Psi, side: int, positions: FloatArray) -> FloatArray:
     """Mass of one direction in each pixel, (..., n_steps, side): between the rows of a table, linearly."""
+    if _table_rows(psi.zero_px, side) * side > _LARGEST_TABLE:
+        away = np.arange(side + 1) - 0.5 - positions[..., None]
+        return np.asarray(np.diff(_sinc2_below(away / psi.zero_px), axis=-1))
     table = _sinc2_table(psi.zero_px, side)
     place = np.clip((positions + side) * (_POINTS / psi.zero_px), 0, len(table) - 2)
     row = place.astype(np.intp)
@@ -89,10 +94,14 @@ def _sinc2_masses(psi: Psi, side: int, positions: FloatArray) -> FloatArray:
     return np.asarray(low)
 
 
+def _table_rows(zero_px: float, side: int) -> int:
+    return math.ceil(3 * side / zero_px * _POINTS) + 2
+
+
 @lru_cache(maxsize=8)
 def _sinc2_table(zero_px: float, side: int) -> FloatArray:
     """Masses of the pixels for spots from a window before the first one to a window behind the last, (rows, side)."""
-    positions = np.arange(math.ceil(3 * side / zero_px * _POINTS) + 2) * (zero_px / _POINTS) - side
+    positions = np.arange(_table_rows(zero_px, side)) * (zero_px / _POINTS) - side
     edges = np.arange(side + 1) - 0.5
     return np.asarray(np.diff(_sinc2_below((edges - positions[:, None]) / zero_px), axis=-1))
 
