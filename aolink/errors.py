@@ -51,3 +51,9 @@ class CalibrationError(AolinkError):
     """Frames that are not what a calibration needs."""
 
     exit_code = 8
+
+
+class FrameError(AolinkError):
+    """A frame that does not show what it should: no spots, no grid of them, not a picture."""
+
+    exit_code = 9

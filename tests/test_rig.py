@@ -172,7 +172,7 @@ def test_a_file_goes_before_a_name_and_is_named_in_errors(tmp_path: Path) -> Non
     path.write_text(changed("seed = 1", "seed = -1"))
     with pytest.raises(RigError, match=rf"{re.escape(str(path))}: simulation.seed"):
         load_rig(path)
-    with pytest.raises(RigError, match=r"cannot read the rig file .*no.toml: No such file .* or one of: section-vi"):
+    with pytest.raises(RigError, match=r"cannot read the rig file .*no.toml: No such file .* or one of: .*section-vi"):
         load_rig(tmp_path / "no.toml")
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(RigError, match="is not a rig file: it is not text"):

@@ -48,6 +48,9 @@ class Light(StrEnum):
 def rig(
     rig: RigArgument,
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, say what was found, and end.")] = False,
+    exposure_scan: Annotated[
+        bool, typer.Option("--exposure-scan", help="Say what o1 would know with other exposure times, and end.")
+    ] = False,
     real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not with the commands.")] = False,
     seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
     listen: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, not terminals.")] = None,
@@ -64,6 +67,9 @@ def rig(
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
     if check:
         _print_findings(load_rig(rig), as_json)
+        return
+    if exposure_scan:
+        _print_scan(load_rig(rig), as_json)
         return
     loaded = load_checked(rig)
     if light is not None:
@@ -88,6 +94,19 @@ def rig(
         server.run(lambda: stop() or (tied and input_ended()))
         for stream in streams.values():
             stream.close()
+
+
+def _print_scan(loaded: Rig, as_json: bool) -> None:
+    from aolink import tables
+    from aolink.estimation.exposure_scan import best, exposure_scan
+
+    errors = exposure_scan(loaded)
+    if as_json:
+        print(json.dumps([vars(each) for each in errors]))
+        return
+    stdout.print(tables.exposure_scan(loaded, errors))
+    steps = best(errors).exposure_steps
+    stdout.print(f"least error of the path: timing.exposure_steps = {steps}, {steps * loaded.timing.fast_step_s:g} s")
 
 
 def _print_findings(loaded: Rig, as_json: bool) -> None:

@@ -32,6 +32,8 @@ _QUEUE_BYTES = 256 << 20
 """What may wait for the disk."""
 _STALL_S = 5.0
 """A disk that takes longer over one write stops the session."""
+_LARGEST_BASIS = 32 << 20
+"""Bytes of an exposure basis that are kept whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +49,9 @@ class _Item:
 def begin_recording(file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int) -> None:
     """Write what a recording begins with: the rig file, twice, the exposure basis, and facts about the session."""
     file.start()
-    basis = io.BytesIO()
-    np.save(basis, ExposureModel(rig.plant, rig.timing.exposure_steps).basis)
+    model, basis = ExposureModel(rig.plant, rig.timing.exposure_steps), io.BytesIO()
+    # Of a large one only the columns of the start state, which are all that o1 to o3 have.
+    np.save(basis, model.basis if model.basis.nbytes <= _LARGEST_BASIS else model.state_rows)
     file.add_attachment(topics.RIG_ATTACHMENT, "application/toml", rig.toml.encode(), start_ns)
     file.add_attachment(topics.BASIS_ATTACHMENT, "application/octet-stream", basis.getvalue(), start_ns)
     file.add_metadata(topics.SESSION_METADATA, metadata)
