@@ -51,3 +51,9 @@ class CalibrationError(AolinkError):
     """Frames that are not what a calibration needs."""
 
     exit_code = 8
+
+
+class RestorationError(AolinkError):
+    """A picture or a point spread function that cannot be restored with, or not by the method asked for."""
+
+    exit_code = 9
