@@ -153,14 +153,14 @@ def smooth(model: LineModel, result: Filtered) -> FloatArray:
     return out
 
 
-def scene_from_states(model: LineModel, states: FloatArray, pixels: range, lag: int = 0) -> FloatArray:
-    """Pixels of the scene out of states, each as state k + lag has it, (lines, len(pixels)).
+def scene_from_states(model: LineModel, states: FloatArray, pixels: range, lag: int = 0, first: int = 0) -> FloatArray:
+    """Pixels of the scene out of states, pixel k as state k + lag has it, (lines, len(pixels)).
 
-    What lies before the first state's own pixel, or after the last's, is taken from that state's memory.
+    What lies before state ``first``'s own pixel is taken from that state's memory.
     """
     columns, n_lines, _ = states.shape
     out = np.empty((n_lines, len(pixels)))
     for i, pixel in enumerate(pixels):
-        k = min(max(pixel + lag, 0), columns - 1)
+        k = min(max(pixel + lag, first), columns - 1)
         out[:, i] = states[k] @ model.output if pixel == k else states[k][:, k - pixel - 1]
     return out

@@ -114,7 +114,8 @@ def _estimated(
         seen = np.pad(np.ones((n_lines, columns), bool) if seen is None else seen, ((0, 0), (origin, 0)))
         if values.ndim == 2:
             values = np.concatenate([np.repeat(values[:1], origin, axis=0), values])
-    start = 0 if known is not None else -origin
+    # The first state that has seen a pixel, and the first pixel of the frame.
+    first, start = (origin, 0) if known is not None else (0, -origin)
     pixels = range(start, start + columns)
     variance = request.noise_variance
     if request.method == "smoother" and len(scanner.gamma) == 1:
@@ -135,7 +136,7 @@ def _estimated(
             states = smooth(here, result)
         else:
             states = result.predicted if request.method == "predictor" else result.filtered
-        out[some] = scene_from_states(model, states, pixels, lag=m if request.method == "lag" else 0)
+        out[some] = scene_from_states(model, states, pixels, lag=m if request.method == "lag" else 0, first=first)
     return np.asarray(out + mean)
 
 

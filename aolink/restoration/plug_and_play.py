@@ -36,7 +36,7 @@ def plug_and_play(
     start: NDArray[np.floating[Any]],
     denoise: Denoiser,
 ) -> FloatArray:
-    """Half-quadratic splitting: denoise, then the scene x that minimises |image - H x|^2 / s^2 + rho |x - denoised|^2.
+    """Half-quadratic splitting: the scene x of least |image - H x|^2 / s^2 + rho |x - z|^2, z from it, in turn.
 
     Parameters
     ----------
@@ -53,13 +53,14 @@ def plug_and_play(
     """
     noise_sd, span = math.sqrt(noise_variance), float(np.ptp(images))
     last = max(noise_sd, _LAST_SD * span)
-    x, seen = np.asarray(start, np.float64), None
-    for sd in np.geomspace(max(_FIRST_SD * span, last), last, _ROUNDS):
+    x = z = np.asarray(start, np.float64)
+    sds = np.geomspace(max(_FIRST_SD * span, last), last, _ROUNDS)
+    for sd in sds:
         kappa = _COUPLING * noise_variance / sd**2
         solver = make_solver(kappa)
-        seen = solver.project(images) if seen is None else seen
-        z = np.stack([denoise(each, float(sd)) for each in x])
-        x = np.asarray(solver.solve(seen + kappa * z, z, _TOLERANCE), np.float64)
+        x = np.asarray(solver.solve(solver.project(images) + kappa * z, z, _TOLERANCE), np.float64)
+        if sd != sds[-1]:
+            z = np.stack([denoise(each, float(sd)) for each in x])
     return x
 
 

@@ -192,12 +192,12 @@ def _check_fit(planes: FloatArray, psf: Psf) -> None:
         raise RestorationError(f"there are PSFs for {len(psf.values)} pixels of a line, the picture has {columns}")
 
 
-def _noise_variance(planes: FloatArray, psf: Psf, noise_sd: float | None) -> float:
+def _noise_variance(planes: FloatArray, found: spectrum.Spectrum, noise_sd: float | None) -> float:
     """As given, or found; above what rounding of the numbers makes."""
     if noise_sd is not None:
         return noise_sd**2
-    found = spectrum.noise_variance(spectrum.plane_spectrum(planes, _mean_psf(psf)))
-    return max(found, (1e-6 * max(float(np.ptp(planes)), 1e-6 * float(np.abs(planes).max()), 1e-100)) ** 2)
+    floor = 1e-6 * max(float(np.ptp(planes)), 1e-6 * float(np.abs(planes).max()), 1e-100)
+    return max(spectrum.noise_variance(found), floor**2)
 
 
 def _mean_psf(psf: Psf) -> FloatArray:
@@ -217,8 +217,9 @@ def _on_plane(
 ) -> Restored:
     shape = (planes.shape[1], planes.shape[2])
     whole = _filled(planes, good)
-    variance = _noise_variance(whole, psf, noise_sd)
-    weight = spectrum.difference_weight(spectrum.plane_spectrum(whole, _mean_psf(psf)), variance)
+    light = spectrum.plane_spectrum(whole, _mean_psf(psf))
+    variance = _noise_variance(whole, light, noise_sd)
+    weight = spectrum.difference_weight(light, variance)
     modes = psf.modes.mean(axis=1) if psf.varies else psf.modes
     unexplained = plane_variance(modes, weight)
     total = variance + unexplained
@@ -260,7 +261,7 @@ def _on_lines(
     variance = unexplained = math.nan
     if method != "inverse":
         whole = _filled(lines, seen)
-        variance = _noise_variance(whole, psf, noise_sd)
+        variance = _noise_variance(whole, spectrum.plane_spectrum(whole, _mean_psf(psf)), noise_sd)
         if scanner is None:
             correlation, power = spectrum.correlation_and_variance(
                 spectrum.line_spectrum(whole, _mean_psf(psf)), variance

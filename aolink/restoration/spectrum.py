@@ -67,7 +67,9 @@ def line_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
 def noise_variance(spectrum: Spectrum) -> float:
     """Variance of white noise, from the frequencies where least of the scene is left: never below it but by chance."""
     left = spectrum.transfer / np.maximum(spectrum.roughness, 1e-12)
-    dark = np.argsort(left)[: max(8, math.ceil(_DARK_SHARE * left.size))]
+    count = min(max(8, math.ceil(_DARK_SHARE * left.size)), left.size)
+    # All that are alike are in: a mirrored picture has the same noise.
+    dark = left <= np.partition(left, count - 1)[count - 1] * (1 + 1e-9)
     return float(spectrum.power[dark].mean())
 
 
