@@ -19,7 +19,6 @@ TOOLS = Path(__file__).parents[2] / "tools"
 @pytest.fixture
 def shahin(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(TOOLS))
-    import paper_report.shahin
 
     return sys.modules["paper_report.shahin"]
 

@@ -220,8 +220,8 @@ def build(runs: int, captions: dict[str, str]) -> list[Block]:
             f" {periods[1]:g} pixels, and it remembers the line above. Run as one per row it would not be his.",
             f"The printed beta K beta' is no covariance: its smallest eigenvalue is {np.linalg.eigvalsh(NOISE)[0]:.4f}"
             " (a rounded 0.02). We leave that eigenvalue out.",
-            f"gamma P gamma' is {printed.correlation(0)[0]:.2f} as printed and {scanner.correlation(0)[0]:.2f} repaired,"
-            " not 6.1.",
+            f"gamma P gamma' is {printed.correlation(0)[0]:.2f} as printed,"
+            f" {scanner.correlation(0)[0]:.2f} repaired, not 6.1.",
             "(12) lacks U(k) behind its (0, beta), and \"Y-bar\" is gamma. (13) is right once B K B' is read with the"
             " barred B and the picture in it is the noisy one; it gives a prediction one pixel ahead.",
             f"The uniform PSF's largest zero is {largest_zero(psf().values):.3f}, on the unit circle: his exact inverse"
