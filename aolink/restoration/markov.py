@@ -50,13 +50,12 @@ def difference_spectrum(n: int) -> NDArray[np.float64]:
 class LineSolver:
     """Blur along the rows, all pixels measured: exact. Cosines down the columns, one eigenbasis along the rows."""
 
-    kappa: float
     C: FloatArray
     """Blurs a line, (columns, columns + m)."""
     vectors: FloatArray
     """Of C'C + kappa Dx'Dx, (columns + m, columns + m)."""
-    values: NDArray[np.float64]
-    """Of the same, (columns + m,)."""
+    inverse: FloatArray
+    """One over their values plus kappa times those of Dy'Dy, (rows, columns + m)."""
     first: int
     """Element of a line at which the frame starts."""
 
@@ -68,15 +67,14 @@ class LineSolver:
         return np.asarray(images.astype(self.C.dtype, copy=False) @ self.C)
 
     def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
-        rough = self.kappa * difference_spectrum(right.shape[-2])[:, None]
         z = fft.dct(right, axis=-2, norm="ortho", workers=_THREADS) @ self.vectors
-        z /= (self.values + rough).astype(z.dtype)
+        z *= self.inverse
         return np.asarray(fft.idct(z @ self.vectors.T, axis=-2, norm="ortho", workers=_THREADS, overwrite_x=True))
 
 
-def line_solver(psf: Psf, columns: int, kappa: float, dtype: type = np.float64) -> LineSolver:
+def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, dtype: type = np.float64) -> LineSolver:
     """The exact solver of a PSF along the rows, which may differ from pixel to pixel."""
-    C = line_matrix(psf.values, columns)
+    C = line_matrix(psf.values, shape[1])
     normal = C.T @ C
     size = len(normal)
     i = np.arange(size)
@@ -86,7 +84,8 @@ def line_solver(psf: Psf, columns: int, kappa: float, dtype: type = np.float64) 
     normal[i[:-1], i[1:]] -= kappa
     values, vectors = linalg.eigh(normal, driver="evd", overwrite_a=True, check_finite=False)
     return LineSolver(
-        kappa=kappa, C=C.astype(dtype), vectors=vectors.astype(dtype), values=values,
+        C=C.astype(dtype), vectors=vectors.astype(dtype),
+        inverse=(1 / (values + kappa * difference_spectrum(shape[0])[:, None])).astype(dtype),
         first=psf.values.shape[-1] - 1 - psf.origin[0],
     )  # fmt: skip
 
@@ -187,7 +186,7 @@ def plane_solver(
 
 def masked_line_solver(psf: Psf, seen: BoolArray, kappa: float) -> IterativeSolver:
     """Blur along the rows with pixels missing: conjugate gradients from the exact solver of the whole frame."""
-    exact = line_solver(psf, seen.shape[-1], kappa)
+    exact = line_solver(psf, (seen.shape[0], seen.shape[1]), kappa)
     return IterativeSolver(
         kappa=kappa, blur=lambda x: np.asarray(x @ exact.C.T), blur_transposed=lambda y: np.asarray(y @ exact.C),
         nearly=exact.solve, seen=seen, frame=exact.frame,
@@ -201,5 +200,5 @@ def make_solver(
     if not psf.on_line:
         return plane_solver(psf, shape, kappa, seen)
     if seen is None:
-        return line_solver(psf, shape[1], kappa, dtype)
+        return line_solver(psf, shape, kappa, dtype)
     return masked_line_solver(psf, seen, kappa)

@@ -31,7 +31,7 @@ def dense(psf: Psf, images: FloatArray, kappa: float, seen: NDArray[np.bool_] | 
 def test_along_lines_it_is_dense_least_squares(values: FloatArray, kappa: float) -> None:
     psf = Psf(values=values, origin=(0,))
     images = np.random.default_rng(1).standard_normal((2, *SHAPE))
-    solver = line_solver(psf, SHAPE[1], kappa)
+    solver = line_solver(psf, SHAPE, kappa)
     assert abs(solver.solve(solver.project(images)) - dense(psf, images, kappa)).max() < 1e-10
 
 
@@ -127,7 +127,7 @@ def test_single_precision_is_enough_for_total_variation() -> None:
 def test_one_plane_solver_is_the_other() -> None:
     images = np.random.default_rng(7).standard_normal((1, *SHAPE))
     line, plane = Psf(values=LOPSIDED, origin=(1,)), Psf(values=LOPSIDED[None], origin=(0, 1))
-    exact, iterative = line_solver(line, SHAPE[1], 0.02), plane_solver(plane, SHAPE, 0.02)
+    exact, iterative = line_solver(line, SHAPE, 0.02), plane_solver(plane, SHAPE, 0.02)
     a, b = exact.solve(exact.project(images)), iterative.solve(iterative.project(images), None, 1e-12)
     assert abs(a - b).max() < 1e-8
     assert exact.frame[1] == iterative.frame[1]

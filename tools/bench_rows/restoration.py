@@ -75,7 +75,7 @@ def time_rows(row: Callable[..., Any], median_s: Callable[..., tuple[float, floa
     """With weights given; the Gauss-Markov solver of the PSF made before."""
     case = blurred("camera", psfs()["uniform 15"], 512)
     image, psf, variance, weight = case.image, case.psf, NOISE_SD**2, 80.0
-    solver = line_solver(psf, 512, weight * variance)
+    solver = line_solver(psf, (512, 512), weight * variance)
 
     def gauss_markov() -> None:
         solver.solve(solver.project(image[None]))
