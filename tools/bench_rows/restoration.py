@@ -1,4 +1,4 @@
-"""Restoration's rows: PSNR and time, beside scikit-image (and bm3d, which takes long) in the same run."""
+"""Restoration's rows: PSNR and time, beside scikit-image in the same run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,6 @@ _LIMITS_MS = {"smoother": 15.0, "gauss_markov": 25.0, "tv": 200.0}
 def quality_rows(row: Callable[..., Any]) -> list[Any]:
     """All methods on the seven pictures with noise and weights found by themselves; three fresh pictures."""
     rows = []
-    best = 0.0
     blur = quality([(c.image, c.scene) for c in cases(PICTURES)])
     others = {name: quality([(f(c), c.scene) for c in cases(PICTURES)]) for name, f in peers.PADDED.items()}
     for name, found in others.items():
@@ -106,17 +105,4 @@ def time_rows(row: Callable[..., Any], median_s: Callable[..., tuple[float, floa
         limit = _LIMITS_MS[method]
         rows.append(row(f"{method} at 512 x 512{', solver made before' if method == 'gauss_markov' else ''}",
             f"{mine:.1f} ms", f"{limit:g} ms; {beside}", limit / mine, 1))  # fmt: skip
-    return rows
-
-
-def bm3d_rows(row: Callable[..., Any]) -> list[Any]:
-    """On three pictures with two motions."""
-    chosen = [blurred(name, psf) for psf in list(psfs().values())[1::2] for name in ("camera", "coins", "text")]
-    ours = quality([(restore(c.image, c.psf).image, c.scene) for c in chosen])
-    rows = []
-    for name, work in (("padded", peers.bm3d_padded), ("border filled by gauss_markov", peers.bm3d_filled)):
-        found = quality([(work(c), c.scene) for c in chosen])
-        rows.append(
-            row(f"tv against BM3D, {name}, 3 pictures x 2 motions", str(ours), str(found), ours.whole / found.whole, 1)
-        )
     return rows
