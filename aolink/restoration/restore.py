@@ -28,6 +28,9 @@ BoolArray = NDArray[np.bool_]
 Method = Literal["inverse", "predictor", "filter", "lag", "smoother", "gauss_markov", "tv", "pnp"]
 METHODS: tuple[Method, ...] = get_args(Method)
 _COLOURS = (3, 4)
+# Noise below this share of the scene's differences (variances) is taken for as much where conjugate gradients solve:
+# their steps grow with one over its root, and the picture is no sharper for it.
+_SMALLEST_RATIO = 3e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,6 +130,8 @@ def restore(
     _check_fit(planes, psf)
     if noise_sd is not None and not (math.isfinite(noise_sd) and noise_sd > 0):
         raise RestorationError(f"noise_sd is {noise_sd}: expected above zero, or method='inverse' where there is none")
+    if direction not in (None, *get_args(Direction)):
+        raise RestorationError(f"direction is {direction!r}, expected one of {', '.join(get_args(Direction))}")
     if method in LINE_METHODS:
         done = _on_lines(planes, psf, method, noise_sd, boundary, good, scanner, direction)
     else:
@@ -223,21 +228,23 @@ def _on_plane(
     modes = psf.modes.mean(axis=1) if psf.varies else psf.modes
     unexplained = plane_variance(modes, weight)
     total = variance + unexplained
+    if not psf.on_line or good is not None:
+        total = max(total, _SMALLEST_RATIO / weight)
     if method == "gauss_markov":
         solver = make_solver(psf, shape, weight * total, good)
-        scene = solver.solve(solver.project(planes))
+        scene = solver.gauss_markov(whole)
     else:
         # Total variation does not need the last digits; half of them take half of the time.
-        level = planes.mean()
+        level = whole.mean()
         scene, solver = total_variation(
-            lambda kappa: make_solver(psf, shape, kappa, good, np.float32), planes - level, total, weight
+            lambda kappa: make_solver(psf, shape, kappa, good, np.float32), whole - level, total, weight
         )
         scene = scene.astype(np.float64) + level
     if method == "pnp":
         if psf.varies:
             raise RestorationError("pnp needs one PSF for the whole picture: use tv")
         scene = plug_and_play(
-            lambda kappa: plane_solver(psf, shape, kappa, good, white=True), planes, total, scene, denoise
+            lambda kappa: plane_solver(psf, shape, kappa, good, white=True), whole, total, scene, denoise
         )
     return Restored(
         image=scene[(slice(None), *solver.frame)], method=method, noise_sd=math.sqrt(variance),
@@ -251,11 +258,11 @@ def _on_lines(
 ) -> Restored:  # fmt: skip
     lines, seen, back = planes, good, None
     if not psf.on_line:
+        if method == "inverse":
+            raise RestorationError("the exact inverse needs a motion along the picture's rows or columns: use smoother")
         line = _straight(psf, method)
         psf = line.psf
         lines, seen, back = to_lines(planes, good, line.angle_rad)
-        if method == "inverse":
-            raise RestorationError("the exact inverse needs a motion along the picture's rows or columns: use smoother")
     if method == "inverse" and seen is not None:
         raise RestorationError("the exact inverse cannot do without a pixel: use the method smoother for masked ones")
     variance = unexplained = math.nan
