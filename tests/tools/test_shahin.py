@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import sys
+import importlib
 from pathlib import Path
 from types import ModuleType
 
@@ -19,8 +19,7 @@ TOOLS = Path(__file__).parents[2] / "tools"
 @pytest.fixture
 def shahin(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(TOOLS))
-
-    return sys.modules["paper_report.shahin"]
+    return importlib.import_module("paper_report.shahin")
 
 
 def test_the_page_and_its_figures(shahin: ModuleType, tmp_path: Path) -> None:
