@@ -40,8 +40,8 @@ _LATENCY_STEPS = (
 )
 
 _LOSSES = (
-    "frames_lost", "frames_incomplete", "packets_missing", "packets_bad_crc", "packets_bad_framing",
-    "packets_bad_payload", "chunks_refused", "steps_late", "steps_clipped", "steps_parked",
+    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
+    "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_clipped", "steps_parked",
 )  # fmt: skip
 """What a session counts of what went wrong."""
 

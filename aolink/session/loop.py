@@ -215,6 +215,8 @@ class SessionLoop:
         self._latencies.close(now)
         if exposures and self.report.ended == "complete":
             self.report.frames_lost = exposures - self.report.frames_received
+            if self._rig.scene:
+                self.report.scenes_lost = exposures - self.report.scenes_received
         self._record_links(now)
         self._log(Log.INFO, f"session {self.report.ended}: {self.report.exposures} exposures")
 
@@ -222,7 +224,8 @@ class SessionLoop:
         for event in events:
             if isinstance(event, Frame):
                 if event.first_step >= self._first_step:  # not one of a session before
-                    self._take_frame(event, receive_ns)
+                    take = self._take_scene if event.plane else self._take_frame
+                    take(event, receive_ns)
             elif isinstance(event, wire.Applied):
                 self._take_applied(event, receive_ns)
             elif isinstance(event, wire.Truth):
@@ -236,11 +239,7 @@ class SessionLoop:
                 self._log(level, f"{link.name}: {event.text}")
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
-        host_start_ns, sigma_ns = self._camera.clock.host_ns(frame.device_start_ns)
-        frame = replace(frame, host_start_ns=host_start_ns, clock_sigma_ns=sigma_ns)
-        info, image = convert.frame_messages(frame)
-        self._record(topics.EXPOSURE, info, receive_ns)
-        self._record(topics.IMAGE, image, receive_ns)
+        frame = self._record_picture(frame, topics.EXPOSURE, topics.IMAGE, receive_ns)
         report = self.report
         report.frames_received += 1
         report.frames_incomplete += frame.chunks_lost > 0
@@ -257,6 +256,21 @@ class SessionLoop:
                 )
             )
         self._estimate(self._assembler.add_frame(frame), receive_ns)
+
+    def _take_scene(self, frame: Frame, receive_ns: int) -> None:
+        self._record_picture(frame, topics.SCENE_EXPOSURE, topics.SCENE, receive_ns)
+        self.report.scenes_received += 1
+        self.report.scenes_incomplete += frame.chunks_lost > 0
+        self.report.scenes_lost += frame.frames_lost_before
+
+    def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
+        """Record a picture and what is known about it; gives it with the host's time of its start."""
+        host_start_ns, sigma_ns = self._camera.clock.host_ns(frame.device_start_ns)
+        frame = replace(frame, host_start_ns=host_start_ns, clock_sigma_ns=sigma_ns)
+        info, image = convert.frame_messages(frame)
+        self._record(exposure_topic, info, receive_ns)
+        self._record(topic, image, receive_ns)
+        return frame
 
     def _estimate(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
         for exposure in exposures:
