@@ -6,9 +6,10 @@ Neither the truth nor the true scene is read for it; the latter tells afterwards
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,32 +23,20 @@ from aolink.exposure import Exposure
 from aolink.optics.camera import is_saturated, to_density
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
-from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.reader import RawMessage, Recording, RestoredPictures
 from aolink.recording.reestimate import recorded_estimates, reestimated
 from aolink.restoration import Method, Psf, Restored, motion_psf, restore
 from aolink.rig import Rig
 from aolink.scene import SceneSensor, scene_motion
 from aolink.sensor import Kernel, SpotSensor
+from aolink.workers import processes
 
 FloatArray = NDArray[np.float64]
 
 _MOST_SPOTS = 64
 """More of them are not restored: each is a restoration of its own."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Deblurred:
-    """The pictures of one exposure without their blur."""
-
-    frame_id: int
-    scene: NDArray[np.float32] | None
-    """Intensity, cut at 0 and 1, (rows, columns)."""
-    spots: NDArray[np.float32] | None
-    """Share of a spot's light in each pixel, cut at 0 and 1, (rows, columns) of the camera's frame."""
-    scene_noise_sd: float = math.nan
-    path_noise_sd: float = math.nan
-    reason: str = ""
-    """Why a picture is missing."""
+_AHEAD = 4
+"""Exposures for each worker that are handed out before the first of them is written."""
 
 
 @dataclass(kw_only=True)
@@ -100,8 +89,8 @@ def _psf(estimate: Estimate, mix: FloatArray, kernel: Kernel, pixel_scale: float
     return motion_psf(path, covariance, kernel, pixel_scale)
 
 
-def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method = "tv") -> Deblurred:
-    """Restore what an exposure's sensors saw, with the path of its estimate."""
+def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method = "tv") -> RestoredPictures:
+    """Restore what an exposure's sensors saw, with the path of its estimate; intensities are cut at 0 and 1."""
     scene = spots = None
     noise, added, reasons = math.nan, math.nan, list[str]()
     if rig.scene is not None:
@@ -114,10 +103,11 @@ def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method = "t
         spots = _unit(_restored_spots(rig, exposure, estimate, method))
     except RestorationError as error:
         reasons.append(f"spot: {error}")
-    return Deblurred(
-        frame_id=exposure.frame_id, scene=scene, spots=spots, scene_noise_sd=noise, path_noise_sd=added,
-        reason="; ".join(reasons),
+    info = schemas_pb2.Restoration(
+        frame_id=exposure.frame_id, estimator=estimate.estimator, method=method, scene_noise_sd=noise,
+        path_noise_sd=added, reason="; ".join(reasons),
     )  # fmt: skip
+    return RestoredPictures(info, scene, spots)
 
 
 def _restored_scene(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method) -> Restored:
@@ -176,12 +166,12 @@ def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: NDArray[np.i
 
 def write_deblurred(
     recording: Recording, path: Path, *, estimator: str, method: Method = "tv", overwrite: bool = False,
-    progress: Callable[[int], None] = lambda exposures: None,
+    workers: int = 0, progress: Callable[[int], None] = lambda exposures: None,
 ) -> Summary:  # fmt: skip
     """Copy a recording with its pictures restored.
 
     Everything else stays, byte for byte; restored pictures that it has are replaced, and estimates of ``estimator``
-    are added if it has none.
+    are added if it has none. With ``workers`` so many processes do it, one thread each; without, this one.
 
     Raises
     ------
@@ -190,7 +180,7 @@ def write_deblurred(
     EstimatorError
         There is no such estimator, or it cannot work on this rig.
     """
-    made = _estimated(recording, estimator)
+    made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
     held = next(made, None)  # whether the estimator can work shows before the file is made
     true_scene = recording.true_scene
     notes = {
@@ -206,12 +196,11 @@ def write_deblurred(
         data = message.SerializeToString(deterministic=True)
         copy.add(RawMessage(topic, message.DESCRIPTOR.full_name, log_time_ns, 0, data))
 
-    def emit(exposure: Exposure, estimate: Estimate) -> None:
-        done = deblur(recording.rig, exposure, estimate, method)
+    def emit(exposure: Exposure, estimate: Estimate, done: RestoredPictures) -> None:
         log_time_ns = log_times.pop(exposure.frame_id, recording.end_ns)
         if estimator not in recording.estimators:
             add(topics.estimate_topic(estimator), convert.estimate_message(estimate), log_time_ns)
-        for topic, message in _messages(done, estimator, method, exposure.host_start_ns):
+        for topic, message in _messages(done, exposure.host_start_ns):
             add(topic, message, log_time_ns)
         _score(summary, recording.rig, true_scene, exposure, estimate, done)
         progress(summary.exposures)
@@ -244,7 +233,7 @@ def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Esti
     """Exposures with their recorded estimates, or with new ones where the recording has none of that name."""
     if name not in recording.estimators:
         for exposure, (estimate,) in reestimated(recording, [name]):
-            yield exposure, estimate
+            yield replace(exposure, truth=None), estimate
         return
     recorded = recorded_estimates(recording, name)
     ahead = next(recorded, None)
@@ -252,19 +241,29 @@ def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Esti
         while ahead is not None and ahead.frame_id < exposure.frame_id:
             ahead = next(recorded, None)
         if ahead is not None and ahead.frame_id == exposure.frame_id:
-            yield exposure, ahead
+            yield replace(exposure, truth=None), ahead
 
 
-def _messages(done: Deblurred, estimator: str, method: Method, time_ns: int) -> Iterator[tuple[str, Message]]:
-    info = schemas_pb2.Restoration(
-        frame_id=done.frame_id,
-        estimator=estimator,
-        method=method,
-        scene_noise_sd=done.scene_noise_sd,
-        path_noise_sd=done.path_noise_sd,
-        reason=done.reason,
-    )
-    yield topics.RESTORATION, info
+def _deblurred(
+    rig: Rig, series: Iterator[tuple[Exposure, Estimate]], method: Method, workers: int
+) -> Iterator[tuple[Exposure, Estimate, RestoredPictures]]:
+    if not workers:
+        for exposure, estimate in series:
+            yield exposure, estimate, deblur(rig, exposure, estimate, method)
+        return
+    with processes(workers) as pool:
+        waiting: deque[tuple[Exposure, Estimate, Future[RestoredPictures]]] = deque()
+        for exposure, estimate in series:
+            waiting.append((exposure, estimate, pool.submit(deblur, rig, exposure, estimate, method)))
+            if len(waiting) > _AHEAD * workers:
+                first, its, done = waiting.popleft()
+                yield first, its, done.result()
+        for exposure, estimate, done in waiting:
+            yield exposure, estimate, done.result()
+
+
+def _messages(done: RestoredPictures, time_ns: int) -> Iterator[tuple[str, Message]]:
+    yield topics.RESTORATION, done.info
     for topic, picture in ((topics.RESTORED_SCENE, done.scene), (topics.RESTORED_SPOTS, done.spots)):
         if picture is not None:
             yield topic, convert.float_image(picture, time_ns)
@@ -272,12 +271,12 @@ def _messages(done: Deblurred, estimator: str, method: Method, time_ns: int) -> 
 
 def _score(
     summary: Summary, rig: Rig, true_scene: NDArray[np.uint16] | None, exposure: Exposure, estimate: Estimate,
-    done: Deblurred,
+    done: RestoredPictures,
 ) -> None:  # fmt: skip
     summary.exposures += 1
     summary.scenes += done.scene is not None
-    if done.reason:
-        summary.reasons[done.reason] += 1
+    if done.info.reason:
+        summary.reasons[done.info.reason] += 1
     if true_scene is None or rig.scene is None or exposure.scene is None or done.scene is None:
         return
     scene = rig.scene.to_intensity(true_scene)

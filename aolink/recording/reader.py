@@ -50,7 +50,7 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class Restored(NamedTuple):
+class RestoredPictures(NamedTuple):
     """An exposure's pictures without their blur, as they are recorded."""
 
     info: schemas_pb2.Restoration
@@ -233,7 +233,7 @@ class Recording:
             raise RecordingError(f"{self.path}: the attachment {topics.TRUE_SCENE_ATTACHMENT} is not the rig's scene")
         return np.asarray(counts)
 
-    def restored(self) -> Iterator[Restored]:
+    def restored(self) -> Iterator[RestoredPictures]:
         """What `aolink deblur` wrote, exposure by exposure."""
         info: schemas_pb2.Restoration | None = None
         pictures: dict[str, NDArray[np.float32]] = {}
@@ -348,8 +348,8 @@ class Recording:
         self._losses.setdefault(loss.offset, loss)
 
 
-def _restored(info: schemas_pb2.Restoration, pictures: dict[str, NDArray[np.float32]]) -> Restored:
-    return Restored(info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS))
+def _restored(info: schemas_pb2.Restoration, pictures: dict[str, NDArray[np.float32]]) -> RestoredPictures:
+    return RestoredPictures(info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS))
 
 
 def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:

@@ -3,7 +3,7 @@
 from aolink.restoration.inverse import largest_zero, stable_direction
 from aolink.restoration.plug_and_play import non_local_means
 from aolink.restoration.psf import Psf, motion_psf
-from aolink.restoration.restore import METHODS, Method, Restored, restore
+from aolink.restoration.restore import METHODS, Method, Restored, checked_method, restore
 from aolink.restoration.scanner import Scanner, first_order, from_correlation, measured_correlation
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "Psf",
     "Restored",
     "Scanner",
+    "checked_method",
     "first_order",
     "from_correlation",
     "largest_zero",
