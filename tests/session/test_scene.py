@@ -127,7 +127,8 @@ def test_a_bad_link_costs_scenes_their_own_pixels_and_is_reproducible(tmp_path: 
 def test_a_camera_with_another_scene_is_refused(tmp_path: Path) -> None:
     other = replace(RIG, scene=replace(RIG.scene, shape=(128, 64)))  # type: ignore[type-var]
     with simulated_rig("moving-scene") as (camera, mirror):
-        for rig, found in (
+        scene_less = replace(RIG, scene=None)
+        for rig, found in ((other, r"\(128, 64\) in the file, \(128, 128\)"), (scene_less, r"\(0, 0\) in the")):
             (other, r"\(128, 64\) in the file, \(128, 128\)"),
             (replace(RIG, scene=None), r"\(0, 0\) in"),
         ):
