@@ -36,14 +36,14 @@ def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray
     assert told["noise_sd"] == pytest.approx(expected.noise_sd)
     assert (read_picture(tmp_path / "out.png") == expected.image).all()
     again = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png")
-    assert again.returncode == 9
+    assert again.returncode == 10
     assert again.stderr == "aolink: out.png exists: give --overwrite to replace it\n"
 
 
 def test_bad_files_are_one_line(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
     (tmp_path / "bad.csv").write_text("1, two, 3\n")
     done = aolink("deblur", "--image", "in.png", "--psf", "bad.csv", "-o", "out.png")
-    assert done.returncode == 9
+    assert done.returncode == 10
     assert done.stderr.count("\n") == 1
     assert "cannot be read as a PSF" in done.stderr
     assert not (tmp_path / "out.png").exists()
