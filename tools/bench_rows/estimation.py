@@ -132,7 +132,11 @@ def frame_from_last_byte() -> Row:
         if isinstance(out.message, pb.FrameChunk):
             chunks = lines.setdefault(out.message.frame_id, [])
             chunks.append(encode_message(out.message, len(chunks)))
-    assembler, driver, frames = Assembler(rig), Driver(rig, ["o3"]), FrameReassembly(rig.sensor.shape, rig.timing.fast_step_ns)
+    assembler, driver, frames = (
+        Assembler(rig),
+        Driver(rig, ["o3"]),
+        FrameReassembly(rig.sensor.shape, rig.timing.fast_step_ns),
+    )
     packets, messages, times = PacketDecoder(), MessageDecoder(), []
     for number in range(100):
         stream = b"".join(lines[1 + number % 3])
