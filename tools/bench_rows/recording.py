@@ -229,3 +229,25 @@ def memory_of_an_hour() -> Row:
     return Row(
         "memory over an hour's recording, o3", f"+{growth:.1f} MB", f"file {size:.0f} MB", size / max(growth, 0.1), 10
     )
+
+
+def batch_workers() -> Row:
+    """Eight recordings estimated again with moments on two processes, against one."""
+    from aolink import batch
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sources = [folder / f"{k}.mcap" for k in range(8)]
+        for source in sources:
+            record_long(source, 600)
+
+        def work(jobs: int) -> float:
+            target = folder / f"on-{jobs}-{time.monotonic_ns()}"
+            target.mkdir()
+            todo = batch.jobs(sources, batch.models(None, []), ["moments"], target)
+            start = time.perf_counter()
+            assert not any(each.error for each in batch.run(todo, jobs))
+            return time.perf_counter() - start
+
+        one, two = (statistics.median(work(jobs) for _ in range(3)) for jobs in (1, 2))
+    return Row("8 recordings estimated again on 2 processes", f"{two:.1f} s", f"on one {one:.1f} s", one / two, 1.8)
