@@ -21,7 +21,7 @@ from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
 from aolink.scene import framed, read_scene_picture
-from aolink.session.loop import Inputs, SessionLoop
+from aolink.session.loop import Inputs, SessionLoop, Watch
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.hub import Hub
@@ -96,6 +96,7 @@ def record(
     note: str = "",
     calibration: str = "",
     inputs: Inputs | None = None,
+    watch: Watch | None = None,
     overwrite: bool = False,
     options: WriteOptions | None = None,
     stop: Callable[[], bool] = lambda: False,
@@ -120,6 +121,8 @@ def record(
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
         What to command, instead of the rig's drive.
+    watch:
+        Told each exposure with its estimates, on the loop's own time.
     options:
         How the recording is cut into chunks and files.
     stop, progress:
@@ -156,7 +159,7 @@ def record(
             path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, attachments=attachments,
             options=options,
         )  # fmt: skip
-        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs)
+        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, watch)
         report = loop.report
         report.warnings += warnings
         try:

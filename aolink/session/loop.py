@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from aolink.assembly import Assembler, Frame
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
 from aolink.errors import DeviceError
-from aolink.estimation import Driver
-from aolink.exposure import Exposure
+from aolink.estimation import Driver, Estimate
+from aolink.exposure import Exposure, Picture
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
@@ -47,6 +47,9 @@ _NOT_YET = 1 << 63
 Inputs = Callable[[int, int], NDArray[np.float64]]
 """First fast step since the session's start and number of steps -> what to command, (n_steps, n_inputs)."""
 
+Watch = Callable[[Exposure, Sequence[Estimate]], None]
+"""Told each exposure with its estimates; must not take time."""
+
 
 class SessionLoop:
     """One session, from the first command to the last frame."""
@@ -60,10 +63,14 @@ class SessionLoop:
         writer: RecordingWriter,
         driver: Driver,
         inputs: Inputs | None = None,
+        watch: Watch | None = None,
     ) -> None:
         self.report = Report(virtual_time=hub.virtual)
         self._rig, self._hub, self._camera, self._mirror = rig, hub, camera, mirror
         self._writer, self._driver = writer, driver
+        self._watch = watch
+        self._unseen: tuple[Exposure, Sequence[Estimate]] | None = None
+        """The exposure that its watcher has not been given yet."""
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
@@ -212,6 +219,7 @@ class SessionLoop:
         self._receive(0.0)
         self._take(self._camera.link, list(self._camera.flush()), now)
         self._estimate(self._assembler.flush(), now)
+        self._show_unseen()
         self._latencies.close(now)
         if exposures and self.report.ended == "complete":
             self.report.frames_lost = exposures - self.report.frames_received
@@ -262,6 +270,29 @@ class SessionLoop:
         self.report.scenes_received += 1
         self.report.scenes_incomplete += frame.chunks_lost > 0
         self.report.scenes_lost += frame.frames_lost_before
+        self._show_unseen(frame)
+
+    def _show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
+        """Hand an exposure to who watches; with a picture sensor, when its scene is there or the next one comes."""
+        if self._watch is None:
+            return
+        if self._unseen is not None:
+            self._watch(*self._unseen)
+        self._unseen = (exposure, estimates)
+        if self._rig.scene is None:
+            self._show_unseen()
+
+    def _show_unseen(self, scene: Frame | None = None) -> None:
+        """Hand over the exposure that waits; with ``scene`` only if it is of the same exposure."""
+        if self._watch is None or self._unseen is None:
+            return
+        exposure, estimates = self._unseen
+        if scene is not None:
+            if scene.frame_id != exposure.frame_id:
+                return
+            exposure = replace(exposure, scene=Picture(pixels=scene.pixels, mask=scene.mask))
+        self._watch(exposure, estimates)
+        self._unseen = None
 
     def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
         """Record a picture and what is known about it; gives it with the host's time of its start."""
@@ -274,11 +305,13 @@ class SessionLoop:
 
     def _estimate(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
         for exposure in exposures:
-            for estimate in self._driver.step(exposure):
+            estimates = self._driver.step(exposure)
+            for estimate in estimates:
                 self._record(topics.estimate_topic(estimate.estimator), convert.estimate_message(estimate), log_time_ns)
             self.report.exposures += 1
             self._newest_frame = exposure.frame_id
             self._latencies.estimated(exposure.frame_id, self._hub.now_ns())
+            self._show(exposure, estimates)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._record(topics.APPLIED, applied, receive_ns)

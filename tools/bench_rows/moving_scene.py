@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 
 import aolink
@@ -12,13 +9,14 @@ from aolink.estimation import ESTIMATOR_NAMES
 from aolink.recording.deblur import blurred_psnr, psnr, scene_psf
 from aolink.restoration import Psf, motion_psf, restore
 from aolink.scene import framed, read_scene_picture
+from bench_rows.row import Row
 
 EXPOSURES = 100
 # What the estimated path is to give more than the blurred picture has.
 _GOALS = {"moments": 1.5, "profile": 1.5}
 
 
-def quality_rows(row: Callable[..., Any]) -> list[Any]:
+def moving_scene() -> list[Row]:
     """Mean PSNR over a session, by tv; the peer is the picture as it came, with its shift forgiven."""
     exposures = aolink.simulate("moving-scene", EXPOSURES)
     rig, sensor = exposures.rig, exposures.rig.scene
@@ -40,7 +38,7 @@ def quality_rows(row: Callable[..., Any]) -> list[Any]:
         if name not in ESTIMATOR_NAMES:
             continue
         each = found([scene_psf(rig, estimate) for estimate in aolink.estimate(exposures, name)])
-        rows.append(row(f"moving-scene, tv, path of {name}: mean (least) PSNR",
+        rows.append(Row(f"moving-scene, tv, path of {name}: mean (least) PSNR",
             f"{each.mean():.1f} ({each.min():.1f}) dB", f"blurred {blurred:.1f}; true path {true.mean():.1f}",
             each.mean() / blurred, _GOALS.get(name, 0)))  # fmt: skip
     return rows
