@@ -277,7 +277,8 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     timing = _timing(root.table("timing"))
     optics = read_optics(root.table("lenslets"), read_grid(root.table("sensor"))) if root.has("lenslets") else None
     plant = _plant(root, optics, timing)
-    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, optics.field if optics else None)
+    seen = (optics.field, optics.light) if optics else (None, None)
+    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, *seen)
     n_inputs = plant.axes * plant.n_inputs
     mirror = _mirror(root.table("mirror"), n_inputs, timing)
     drive = _drive(root.table("drive", optional=True), n_inputs, mirror)
@@ -302,7 +303,8 @@ def _plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
             raise RigError("plant.kind = 'membrane' needs [lenslets], to know the slopes that deflections make")
         model = read_membrane(table, optics, timing.fast_step_s)
     elif kind == "tip-tilt":
-        model = read_tip_tilt(table, math.prod(read_grid(root.table("sensor"))), timing.fast_step_s)
+        spots = int(optics.lit.sum()) if optics else math.prod(read_grid(root.table("sensor")))
+        model = read_tip_tilt(table, spots, timing.fast_step_s)
     else:
         return _plant_by_matrices(table)
     # A number is the variance of each noise.

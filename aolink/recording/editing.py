@@ -47,7 +47,7 @@ class _Copy:
         self._file = McapFile(target, WriteOptions(), overwrite=overwrite)
         begin_recording(self._file, source.rig, source.metadata | notes, source.start_ns)
         for name, data in source.attachments.items():
-            if name not in (topics.RIG_ATTACHMENT, topics.BASIS_ATTACHMENT):
+            if name not in topics.OF_EACH_FILE:
                 self._file.add_attachment(name, "application/octet-stream", data, source.start_ns)
 
     def add(self, message: RawMessage) -> None:

@@ -43,6 +43,9 @@ SCHEMAS: dict[str, type[Message]] = {
 
 RIG_ATTACHMENT = "rig.toml"
 BASIS_ATTACHMENT = "exposure_basis.npy"
+OUTPUTS_ATTACHMENT = "exposure_outputs.npy"
+OF_EACH_FILE = (RIG_ATTACHMENT, BASIS_ATTACHMENT, OUTPUTS_ATTACHMENT)
+"""Attachments that every recording is begun with."""
 SESSION_METADATA = "aolink"
 """Written at the start: versions, rig, devices, note."""
 RIG_METADATA = "aolink/rig"
