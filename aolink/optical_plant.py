@@ -16,8 +16,6 @@ from aolink.toml_table import Table
 
 FloatArray = NDArray[np.float64]
 
-_MICROMETRE = 1e-6
-"""Deflections are states, of a size that is good to calculate with."""
 _LEAST_LIGHT = 0.5
 
 
@@ -106,11 +104,11 @@ def read_tip_tilt(table: Table, n_spots: int, fast_step_s: float) -> MirrorPlant
     if abs(coupling) >= 1:
         raise RigError(f"{table.key('coupling')} = {coupling:g}: an axis must move its own slope more than the other's")
     gain = np.array([[1.0, coupling], [coupling, 1.0]]) @ gain
-    return mirror_plant(gain, np.tile(np.eye(2), (n_spots, 1)), *_dynamics(table, fast_step_s))
+    return mirror_plant(np.tile(gain, (n_spots, 1)), *_dynamics(table, fast_step_s))
 
 
 def read_membrane(table: Table, optics: Optics, fast_step_s: float) -> MirrorPlant:
-    """A plant of kind ``membrane``: inputs in Pa, states the deflections at the actuators in micrometres."""
+    """A plant of kind ``membrane``: inputs in Pa, states the pressures as the membrane follows them."""
     rows, columns = table.integers("actuators", 2, "rows and columns", low=1, high=32)
     try:
         membrane = Membrane(
@@ -134,9 +132,7 @@ def read_membrane(table: Table, optics: Optics, fast_step_s: float) -> MirrorPla
     # The light goes to the mirror and back: the path is twice the deflection.
     gradients = 2 * optics.seen(footprint).mean_slopes(membrane.influence_gradient)[optics.lit]
     per_pascal = optics.slopes(gradients, footprint).reshape(-1, rows * columns)
-    gain = membrane.coupling / _MICROMETRE
-    slopes = np.asarray(np.linalg.solve(gain.T, per_pascal.T).T, dtype=np.float64)
-    return mirror_plant(gain, slopes, *_dynamics(table, fast_step_s))
+    return mirror_plant(per_pascal, *_dynamics(table, fast_step_s))
 
 
 def _dynamics(table: Table, fast_step_s: float) -> tuple[tuple[FloatArray, FloatArray], float | None]:

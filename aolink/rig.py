@@ -17,8 +17,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
+from aolink.blocks import stationary_covariance
 from aolink.disturbance import Disturbance, read_disturbance
 from aolink.errors import RigError
 from aolink.optical_plant import Optics, read_membrane, read_optics, read_tip_tilt, read_voltage
@@ -312,10 +312,10 @@ def _plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
     if (W < 0).any():
         raise RigError("plant.process_noise has a variance below zero")
     table.finish()
-    initial = linalg.solve_discrete_lyapunov(model.A, model.B_w @ W @ model.B_w.T)
+    initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
-        initial_covariance=np.asarray(initial, dtype=np.float64), axes=1,
+        initial_covariance=initial, axes=1,
     )  # fmt: skip
 
 
@@ -340,7 +340,7 @@ def _plant_by_matrices(table: Table) -> Plant:
                 f"plant.initial_covariance is missing: plant.A has an eigenvalue of modulus {radius:.6g},"
                 " so there is no stationary covariance; give a matrix"
             )
-        covariance = np.asarray(linalg.solve_discrete_lyapunov(A, B_w @ W @ B_w.T), dtype=np.float64)
+        covariance = stationary_covariance(A, B_w @ W @ B_w.T)
     else:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)
