@@ -17,8 +17,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
+from aolink.blocks import stationary_covariance
 from aolink.disturbance import Disturbance, read_disturbance
 from aolink.errors import RigError
 from aolink.optical_plant import Optics, read_membrane, read_optics, read_tip_tilt, read_voltage
@@ -281,7 +281,8 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     timing = _timing(root.table("timing"))
     optics = read_optics(root.table("lenslets"), read_grid(root.table("sensor"))) if root.has("lenslets") else None
     plant = _plant(root, optics, timing)
-    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, optics.field if optics else None)
+    seen = (optics.field, optics.light) if optics else (None, None)
+    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, *seen)
     n_inputs = plant.axes * plant.n_inputs
     mirror = _mirror(root.table("mirror"), n_inputs, timing)
     drive = _drive(root.table("drive", optional=True), n_inputs, mirror)
@@ -307,7 +308,8 @@ def _plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
             raise RigError("plant.kind = 'membrane' needs [lenslets], to know the slopes that deflections make")
         model = read_membrane(table, optics, timing.fast_step_s)
     elif kind == "tip-tilt":
-        model = read_tip_tilt(table, math.prod(read_grid(root.table("sensor"))), timing.fast_step_s)
+        spots = int(optics.lit.sum()) if optics else math.prod(read_grid(root.table("sensor")))
+        model = read_tip_tilt(table, spots, timing.fast_step_s)
     else:
         return _plant_by_matrices(table)
     # A number is the variance of each noise.
@@ -315,10 +317,10 @@ def _plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
     if (W < 0).any():
         raise RigError("plant.process_noise has a variance below zero")
     table.finish()
-    initial = linalg.solve_discrete_lyapunov(model.A, model.B_w @ W @ model.B_w.T)
+    initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
-        initial_covariance=np.asarray(initial, dtype=np.float64), axes=1,
+        initial_covariance=initial, axes=1,
     )  # fmt: skip
 
 
@@ -343,7 +345,7 @@ def _plant_by_matrices(table: Table) -> Plant:
                 f"plant.initial_covariance is missing: plant.A has an eigenvalue of modulus {radius:.6g},"
                 " so there is no stationary covariance; give a matrix"
             )
-        covariance = np.asarray(linalg.solve_discrete_lyapunov(A, B_w @ W @ B_w.T), dtype=np.float64)
+        covariance = stationary_covariance(A, B_w @ W @ B_w.T)
     else:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)

@@ -97,6 +97,7 @@ def _is_exposure(info: pb.ExposureInfo) -> bool:
 def estimate_message(estimate: Estimate) -> pb.Estimate:
     """An estimate as it is recorded: the path as coefficients of the exposure basis."""
     axes, n_states = estimate.end_state.shape
+    spread = estimate.innovation_covariance.ravel()
     return pb.Estimate(
         estimator=estimate.estimator,
         frame_id=estimate.frame_id,
@@ -113,7 +114,8 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
         coefficients=estimate.coefficients.ravel(),
         coefficient_covariance=estimate.coefficient_covariance.ravel(),
         innovation=estimate.innovation.ravel(),
-        innovation_covariance=estimate.innovation_covariance.ravel(),
+        innovation_covariance=spread if estimate.innovation_covariance.ndim == 3 else None,
+        innovation_variance=spread if estimate.innovation_covariance.ndim == 2 else None,
         nis=estimate.nis,
     )
 
@@ -123,6 +125,10 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
     axes, n, c, m = message.axes, message.n_states, message.n_coefficients, message.n_measurements
     coefficients = _array(message.coefficients, axes, c)
     covariance = _array(message.coefficient_covariance, axes, c, c)
+    if message.innovation_variance:
+        spread = _array(message.innovation_variance, axes, m)
+    else:
+        spread = _array(message.innovation_covariance, axes, m, m)
     return Estimate(
         estimator=message.estimator,
         frame_id=message.frame_id,
@@ -139,7 +145,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         inputs=exposure.inputs,
         model=model,
         innovation=_array(message.innovation, axes, m),
-        innovation_covariance=_array(message.innovation_covariance, axes, m, m),
+        innovation_covariance=spread,
         nis=_array(message.nis, axes),
     )
 
@@ -150,7 +156,7 @@ def truth_from_message(message: wire.Truth) -> Truth:
     return Truth(
         start_state=_array(message.start_state, axes, -1),
         end_state=_array(message.end_state, axes, -1),
-        path=_array(message.path, outputs, -1),
+        path=_array(message.path or message.path_single, outputs, -1),
     )
 
 

@@ -51,6 +51,9 @@ SCHEMAS: dict[str, type[Message]] = {
 
 RIG_ATTACHMENT = "rig.toml"
 BASIS_ATTACHMENT = "exposure_basis.npy"
+OUTPUTS_ATTACHMENT = "exposure_outputs.npy"
+OF_EACH_FILE = (RIG_ATTACHMENT, BASIS_ATTACHMENT, OUTPUTS_ATTACHMENT)
+"""Attachments that every recording is begun with."""
 TRUE_SCENE_ATTACHMENT = "true_scene.npy"
 """Simulated rigs: what the picture sensor would read out of the scene at rest, without noise and blur."""
 SESSION_METADATA = "aolink"

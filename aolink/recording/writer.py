@@ -50,14 +50,19 @@ def begin_recording(
     Of ``attachments``, by name, those are added that are not of its own.
     """
     file.start()
-    model, basis = ExposureModel(rig.plant, rig.timing.exposure_steps), io.BytesIO()
+    model = ExposureModel(rig.plant, rig.timing.exposure_steps)
+    outputs, basis = model.factors
     # Of a large one only the columns of the start state, which are all that o1 to o3 have.
-    np.save(basis, model.basis if model.basis.nbytes <= _LARGEST_BASIS else model.state_rows)
+    basis = basis if basis.nbytes <= _LARGEST_BASIS else basis[..., : rig.plant.n_states]
     file.add_attachment(topics.RIG_ATTACHMENT, "application/toml", rig.toml.encode(), start_ns)
-    file.add_attachment(topics.BASIS_ATTACHMENT, "application/octet-stream", basis.getvalue(), start_ns)
-    for name, data in attachments.items():
-        if name not in (topics.RIG_ATTACHMENT, topics.BASIS_ATTACHMENT):
-            file.add_attachment(name, "application/octet-stream", data, start_ns)
+    arrays = {topics.BASIS_ATTACHMENT: basis} | ({} if outputs is None else {topics.OUTPUTS_ATTACHMENT: outputs})
+    for name, array in arrays.items():
+        data = io.BytesIO()
+        np.save(data, array)
+        file.add_attachment(name, "application/octet-stream", data.getvalue(), start_ns)
+    for name, value in attachments.items():
+        if name not in topics.OF_EACH_FILE:
+            file.add_attachment(name, "application/octet-stream", value, start_ns)
     file.add_metadata(topics.SESSION_METADATA, metadata)
     file.add_metadata(topics.RIG_METADATA, {"toml": rig.toml})  # nothing can be read without it
 

@@ -22,6 +22,7 @@ from aolink.wire.packet import MAX_CHUNK, PROTOCOL_VERSION, schema_hash
 
 Line = Literal["camera", "mirror"]
 FIRMWARE = "aolink simulated rig 1"
+_LARGEST_PATH = 65_536  # numbers in a truth's path, beyond which single precision must do
 _REMEMBERED_BLOCKS = 256
 
 
@@ -315,5 +316,5 @@ def truth_message(frame_id: int, truth: Truth) -> pb.Truth:
         n_outputs=truth.path.shape[0],
         start_state=truth.start_state.ravel(),
         end_state=truth.end_state.ravel(),
-        path=truth.path.ravel(),
+        **{"path" if truth.path.size <= _LARGEST_PATH else "path_single": truth.path.ravel()},
     )
