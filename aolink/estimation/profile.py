@@ -1,0 +1,212 @@
+"""The pixels themselves: the modes of the posterior by Levenberg and Marquardt's method, from several starts.
+
+The objective is -log p(t | pixels) with t whitened by its prior, s = L^-1 (t - m): |s|^2 / 2 minus the pixels'
+log-likelihood, Fisher's information in the place of the Hessian. At a mode its inverse is the covariance, and
+(Laplace) the log-evidence is log p(y | s) - |s|^2 / 2 - log |H| / 2.
+
+It starts where windowed moments have it, and from there along the directions in which they leave the path most
+uncertain: a path and its reversal in time give the same blur.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.estimation import stacked
+from aolink.estimation.exposure_model import ExposureModel
+from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, lower_inverse, single
+from aolink.estimation.hypothesis_filter import Innovation, Update
+from aolink.estimation.observation import Belief, corrected
+from aolink.estimation.pixels import PixelView, Reduction, reduction
+from aolink.sensor import BaseSensor
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_PASSES = 16
+_FIRST_DAMPING = 0.01
+_LARGEST_DAMPING = 1e8
+# The objective changes by less than this at a mode.
+_CONVERGED = 1e-4
+# Modes that are nearer to each other than so many standard deviations are one.
+_APART = 0.7
+_START_DIRECTIONS = 2
+_START_REACH = 1.3
+# Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
+_DIRECTIONS = 4
+_GATE_PROBABILITY = 1e-9
+# A second mode is one if the posterior gives it this much.
+LEAST_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Modes of the posterior, (axes, starts, ...)."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    log_evidence: FloatArray
+    """Laplace's, without the prior weight; minus infinity where a start led to a mode that was there already."""
+    objective: FloatArray
+    """Twice -log p(s, y), chi-square of the pixels for one mode."""
+
+
+def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES) -> Modes:
+    """Where each start leads.
+
+    Parameters
+    ----------
+    prior:
+        Of each axis.
+    starts:
+        In whitened coordinates, (axes, starts, n).
+    """
+    axes, count, n = starts.shape
+    if prior.mean.ndim == 2:
+        prior = Belief(np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1))
+    rows = view.part(np.repeat(np.arange(axes), count))
+    m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
+    s = starts.reshape(-1, n)
+    at = _at(rows, m, L, s)
+    damping = np.full(len(s), _FIRST_DAMPING)
+    active = np.arange(len(s))
+    for _ in range(passes):
+        if not len(active):
+            break
+        H, g, now = at.H[active], at.g[active], at.objective[active]
+        scale = np.einsum("rii->ri", H)
+        damped = H + (damping[active][:, None] * scale)[..., None] * np.eye(n)
+        step = np.linalg.solve(damped, g[..., None])[..., 0]
+        there = _at(rows.part(active), m[active], L[active], s[active] + step)
+        gain = now - there.objective
+        better = gain > 0
+        took = active[better]
+        s[took] += step[better]
+        for mine, theirs in ((at.H, there.H), (at.g, there.g), (at.objective, there.objective)):
+            mine[took] = theirs[better]
+        damping[active] = np.where(better, damping[active] / 8, np.maximum(damping[active], 1e-3) * 8)
+        settled = (better & (gain < _CONVERGED)) | (damping[active] > _LARGEST_DAMPING)
+        settled |= ~better & (stacked.dot(step, g) < _CONVERGED)
+        active = active[~settled]
+    covariance = stacked.congruence(L, stacked.symmetric(np.linalg.inv(at.H)))
+    _, log_H = np.linalg.slogdet(at.H)
+    evidence = -at.objective - 0.5 * log_H
+    mean = m[:, 0] + stacked.matvec(L, s)
+    shape = (axes, count)
+    return Modes(
+        mean.reshape(*shape, n), stacked.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
+        2 * at.objective.reshape(shape),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    H: FloatArray
+    g: FloatArray
+    objective: FloatArray
+
+
+def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
+    """Information, gradient and objective at whitened coordinates, one hypothesis a row."""
+    f, J = rows.linearised(m + stacked.matvec(L, s)[:, None])
+    score, information = rows.information(f)
+    J = stacked.matmul(J[:, 0], L)
+    H = stacked.matmul(stacked.transpose(J) * information, J) + np.eye(s.shape[1])
+    g = stacked.matvec(stacked.transpose(J), score[:, 0]) - s
+    return _Point(stacked.symmetric(H), g, 0.5 * stacked.dot(s, s) - rows.log_likelihood(f)[:, 0])
+
+
+def without_repeats(modes: Modes) -> Modes:
+    """The same, log-evidence minus infinity for modes that a better start, or an earlier one, led to as well."""
+    count = modes.mean.shape[1]
+    evidence = modes.log_evidence.copy()
+    for j in range(1, count):
+        away = modes.mean[:, :j] - modes.mean[:, j, None]
+        inverse = lower_inverse(cholesky(modes.covariance[:, j]))
+        white = stacked.matmul(away, stacked.transpose(inverse))
+        same = (np.add.reduce(white * white, axis=-1) < _APART**2) & np.isfinite(evidence[:, :j])
+        evidence[:, j] = np.where(same.any(axis=1), -np.inf, evidence[:, j])
+    return Modes(modes.mean, modes.covariance, evidence, modes.objective)
+
+
+def broad(view: PixelView, prior: Belief) -> Belief:
+    """What windowed moments make of the prior of t: wide where the blur has several readings."""
+    about = prior
+    for _ in range(3):
+        y, noise, fit = view.moments(about)
+        innovation = y - fit.expected - stacked.matvec(fit.slope, prior.mean - about.mean)
+        about = corrected(prior, innovation, fit.slope, noise + fit.remainder).posterior
+    return about
+
+
+def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float) -> FloatArray:
+    """The mean of a belief and points beside it along the path's most uncertain directions, (axes, 1 + 2d, n)."""
+    B = view.rows
+    L = cholesky(belief.covariance)
+    _, _, V = np.linalg.svd(stacked.matmul(np.broadcast_to(B, (len(L), *B.shape)), L), full_matrices=False)
+    along = stacked.matmul(V[:, :directions], stacked.transpose(L)) * reach
+    mean = belief.mean[:, None]
+    return np.concatenate([mean, mean + along, mean - along], axis=1)
+
+
+def whitened(prior: Belief, points: FloatArray) -> FloatArray:
+    """Points (axes, k, n) in coordinates in which the prior is N(0, I)."""
+    inverse = lower_inverse(cholesky(prior.covariance))
+    return stacked.matmul(points - prior.mean[:, None], stacked.transpose(inverse))
+
+
+def innovation(view: PixelView, prior: Belief, t: FloatArray) -> Innovation:
+    """Innovation of the pixels linearised at t, (axes, n), in units of their noise.
+
+    With A = R^(-1/2) J L = U S V', the pixels' innovation has variance 1 + S^2 along U's columns, and 1 elsewhere.
+    """
+    axes, n = t.shape
+    L = cholesky(prior.covariance)
+    s = whitened(prior, t[:, None])[:, 0]
+    f, J = view.linearised(t[:, None])
+    score, information = (each[:, 0] for each in view.information(f))
+    root = np.sqrt(information)
+    A = stacked.matmul(J[:, 0] * root[..., None], L)
+    e = score / np.where(root > 0, root, 1.0)
+    values, V = np.linalg.eigh(stacked.matmul(stacked.transpose(A), A))
+    outputs = view.outputs
+    k = min(_DIRECTIONS * outputs, n)
+    values, V = np.maximum(values[:, : n - k - 1 : -1], 0.0), V[:, :, : n - k - 1 : -1]
+    S = np.sqrt(values)
+    along = stacked.matvec(stacked.transpose(stacked.matmul(A, V)), e) / np.where(S > 0, S, 1.0)
+    u = along + S * stacked.matvec(stacked.transpose(V), s)
+    nis = np.add.reduce(u * u / (1 + values), axis=1)
+    rest = stacked.dot(e, e) + stacked.dot(s, s) - nis
+    degrees = np.maximum(np.add.reduce(view.mask, axis=1) - k, 1)
+    believed = (nis <= 2 * special.gammainccinv(k / 2, _GATE_PROBABILITY)) & (
+        rest <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
+    )
+    covariance = (1 + values)[..., None] * np.eye(k)
+    finite = np.isfinite(nis) & np.isfinite(rest)
+    return Innovation(u, covariance, nis, believed & finite)
+
+
+class ProfileUpdates:
+    """One Gaussian in, one Gaussian out: the modes that were found, weighted with their evidence."""
+
+    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
+        """The coefficients that it works with."""
+        return reduction(model, sensor)
+
+    def update(self, view: PixelView, prior: Hypotheses, number: int) -> Update:
+        """The posterior of axes with a prior of their start states."""
+        before = view.reduced.prior(prior.belief)
+        wide = broad(view, before)
+        starts = np.concatenate([spread_starts(view, wide, _START_DIRECTIONS, _START_REACH), before.mean[:, None]], axis=1)
+        modes = without_repeats(find_modes(view, before, whitened(before, starts)))
+        log_weight = modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None]
+        best = np.argmax(log_weight, axis=1)
+        after = Hypotheses(log_weight, modes.mean, modes.covariance).belief
+        new = innovation(view, before, modes.mean[np.arange(len(best)), best])
+        end = single(view.reduced.end(after))
+        several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
+        return Update(after, end, new, several)
