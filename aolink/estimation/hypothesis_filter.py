@@ -46,7 +46,7 @@ class Innovation:
     nis: FloatArray
     """(axes,)"""
     believed: BoolArray
-    """Whether both these and all other directions have a chi-square that can be, (axes,)."""
+    """Whether pixels and prior together have a chi-square that can be, (axes,)."""
 
 
 @dataclass(frozen=True, eq=False)

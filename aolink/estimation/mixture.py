@@ -61,7 +61,7 @@ class MixtureUpdates:
         """The posterior of axes with a prior of their start states."""
         reduced = view.reduced
         modes, proposal = explored(view, prior)
-        after, _ = importance_corrected(view, prior, proposal)
+        after, _ = importance_corrected(view, prior, proposal, points=_POINTS, rounds=_ROUNDS)
         best = np.argmax(modes.log_evidence, axis=1)
         new = innovation(view, reduced.prior(prior.belief), modes.mean[np.arange(len(best)), best])
         end = reduced.end(Belief(after.mean, after.covariance))

@@ -88,7 +88,7 @@ class Reduction:
 
 
 def reduction(
-    model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LEFT_OUT, all_steps: bool = False
+    model: ExposureModel, sensor: BaseSensor, *, left_out: float | None = None, all_steps: bool = False
 ) -> Reduction:
     """The reduction for a sensor, made once.
 
@@ -101,6 +101,7 @@ def reduction(
     """
     variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
     pixel = sensor.profile.pixel_width
+    left_out = _LEFT_OUT if left_out is None else left_out
     return _reduction(model, left_out**2 * variance, 0.0 if all_steps else variance + pixel**2 / 12)
 
 

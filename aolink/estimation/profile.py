@@ -180,14 +180,12 @@ def innovation(view: PixelView, prior: Belief, t: FloatArray) -> Innovation:
     along = stacked.matvec(stacked.transpose(stacked.matmul(A, V)), e) / np.where(S > 0, S, 1.0)
     u = along + S * stacked.matvec(stacked.transpose(V), s)
     nis = np.add.reduce(u * u / (1 + values), axis=1)
-    rest = stacked.dot(e, e) + stacked.dot(s, s) - nis
-    degrees = np.maximum(np.add.reduce(view.mask, axis=1) - k, 1)
-    believed = (nis <= 2 * special.gammainccinv(k / 2, _GATE_PROBABILITY)) & (
-        rest <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
-    )
+    # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
+    total = stacked.dot(e, e) + stacked.dot(s, s)
+    degrees = np.add.reduce(view.mask, axis=1) + n
+    believed = total <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
     covariance = (1 + values)[..., None] * np.eye(k)
-    finite = np.isfinite(nis) & np.isfinite(rest)
-    return Innovation(u, covariance, nis, believed & finite)
+    return Innovation(u, covariance, nis, believed & np.isfinite(nis))
 
 
 class ProfileUpdates:
