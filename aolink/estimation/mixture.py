@@ -31,6 +31,7 @@ from aolink.estimation.profile import (
     innovation,
     spread_starts,
     whitened,
+    with_reversals,
     without_repeats,
 )
 from aolink.sensor import BaseSensor
@@ -38,6 +39,9 @@ from aolink.sensor import BaseSensor
 FloatArray = NDArray[np.float64]
 
 _ROUNDS = 2
+# Points that count at least when the mixture for the next round is fitted, and steps of the search for the power.
+_LEAST_EFFECTIVE = 64.0
+_HALVINGS = 10
 _CARRIED = 6
 _POINTS = 256
 _START_DIRECTIONS = 1
@@ -62,8 +66,7 @@ class MixtureUpdates:
         reduced = view.reduced
         modes, proposal = explored(view, prior)
         after, _ = importance_corrected(view, prior, proposal, points=_POINTS, rounds=_ROUNDS)
-        best = np.argmax(modes.log_evidence, axis=1)
-        new = innovation(view, reduced.prior(prior.belief), modes.mean[np.arange(len(best)), best])
+        new = innovation(view, reduced.prior(prior.belief), modes)
         end = reduced.end(Belief(after.mean, after.covariance))
         carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(_CARRIED)
         share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
@@ -81,13 +84,13 @@ def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
     each = Belief(before.mean.reshape(-1, n), before.covariance.reshape(-1, n, n))
     wide = broad(rows, each)
     starts = spread_starts(rows, wide, _START_DIRECTIONS, _START_REACH)
-    found = find_modes(rows, each, whitened(each, starts))
-    shape = (axes, count * starts.shape[1])
-    evidence = found.log_evidence.reshape(shape) + np.repeat(prior.log_weight, starts.shape[1], axis=1)
+    found = with_reversals(rows, each, find_modes(rows, each, whitened(each, starts)))
+    shape = (axes, count * found.mean.shape[1])
+    evidence = found.log_evidence.reshape(shape) + np.repeat(prior.log_weight, found.mean.shape[1], axis=1)
     modes = without_repeats(
         Modes(
             found.mean.reshape(*shape, n), found.covariance.reshape(*shape, n, n), evidence,
-            found.objective.reshape(shape),
+            found.distance.reshape(shape), found.objective.reshape(shape),
         )
     )  # fmt: skip
     evidence = modes.log_evidence
@@ -114,8 +117,25 @@ def importance_corrected(
         target = np.concatenate([target, _log_prior(prior, new) + view.log_likelihood(view.predicted_of_many(new))], axis=1)
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
-        proposal = _refitted(proposal, t, log_weight)
+        last = k == rounds - 1
+        weight = log_weight if last else _tempered(log_weight, _LEAST_EFFECTIVE)
+        proposal = _refitted(proposal, t, weight)
     return proposal, np.exp(-log_sum(2 * log_weight, axis=1))
+
+
+def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
+    """Weights raised to the largest power up to one at which so many points, or half of all, count."""
+    least = min(least, log_weight.shape[1] / 2)
+    low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
+    power = high
+    for _ in range(_HALVINGS):
+        w = power[:, None] * log_weight
+        enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
+        low, high = np.where(enough, power, low), np.where(enough, high, power)
+        power = (low + high) / 2
+        power = np.where(low == 1, 1.0, power)
+    w = np.where(low == 1, 1.0, low)[:, None] * log_weight
+    return w - log_sum(w, axis=1)[:, None]
 
 
 def _drawn(proposal: Hypotheses, count: int, number: int) -> FloatArray:

@@ -179,6 +179,16 @@ class PixelView:
         return int(self._basis.shape[0])
 
     @property
+    def whole_nodes(self) -> int:
+        """Nodes inside the exposure's fast steps; those that correct for where it starts and ends come after them."""
+        return len(self._weights) - (2 if self._weights.min() < 0 else 0)
+
+    @property
+    def kernel_variance(self) -> float:
+        """Of the narrowest direction, slope units squared."""
+        return float(np.linalg.eigvalsh(self._kernel)[0])
+
+    @property
     def rows(self) -> FloatArray:
         """Path at the nodes of the coefficients, (n_outputs * nodes, n)."""
         return self._basis.reshape(-1, self._basis.shape[2])

@@ -10,7 +10,7 @@ uncertain: a path and its reversal in time give the same blur.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,8 @@ _CONVERGED = 1e-4
 _APART = 0.7
 _START_DIRECTIONS = 2
 _START_REACH = 1.3
+# A reversed path is met to so many standard deviations of the kernel, if the prior allows.
+_REVERSED_TO = 0.2
 # Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
 _DIRECTIONS = 4
 _GATE_PROBABILITY = 1e-9
@@ -51,8 +53,15 @@ class Modes:
     covariance: FloatArray
     log_evidence: FloatArray
     """Laplace's, without the prior weight; minus infinity where a start led to a mode that was there already."""
+    distance: FloatArray
+    """|s|^2, squared distance from the prior, (axes, starts)."""
     objective: FloatArray
-    """Twice -log p(s, y), chi-square of the pixels for one mode."""
+    """-log p(s, y) up to a constant, (axes, starts)."""
+
+    @property
+    def best(self) -> NDArray[np.intp]:
+        """The one of least objective, (axes,)."""
+        return np.argmin(self.objective, axis=1)
 
 
 def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES) -> Modes:
@@ -99,7 +108,7 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
     shape = (axes, count)
     return Modes(
         mean.reshape(*shape, n), stacked.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
-        2 * at.objective.reshape(shape),
+        stacked.dot(s, s).reshape(shape), at.objective.reshape(shape),
     )  # fmt: skip
 
 
@@ -130,7 +139,7 @@ def without_repeats(modes: Modes) -> Modes:
         white = stacked.matmul(away, stacked.transpose(inverse))
         same = (np.add.reduce(white * white, axis=-1) < _APART**2) & np.isfinite(evidence[:, :j])
         evidence[:, j] = np.where(same.any(axis=1), -np.inf, evidence[:, j])
-    return Modes(modes.mean, modes.covariance, evidence, modes.objective)
+    return replace(modes, log_evidence=evidence)
 
 
 def broad(view: PixelView, prior: Belief) -> Belief:
@@ -153,19 +162,42 @@ def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float
     return np.concatenate([mean, mean + along, mean - along], axis=1)
 
 
+def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> FloatArray:
+    """Whitened coordinates whose paths are nearest to those of points (axes, k, n), run backwards: the same blur."""
+    L, m = cholesky(prior.covariance), prior.mean
+    count = view.outputs * view.whole_nodes
+    rows = view.rows.reshape(view.outputs, -1, view.reduced.size)[:, : view.whole_nodes].reshape(count, -1)
+    precision = 1 / (_REVERSED_TO**2 * view.kernel_variance * view.whole_nodes)
+    B = stacked.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
+    back = view.paths(points)[..., view.whole_nodes - 1 :: -1].reshape(*points.shape[:2], count)
+    away = back - view.paths(m[:, None])[..., : view.whole_nodes].reshape(-1, 1, count)
+    H = precision * stacked.matmul(stacked.transpose(B), B) + np.eye(B.shape[-1])
+    right = precision * stacked.matmul(away, B)
+    return np.asarray(np.linalg.solve(H, stacked.transpose(right)).swapaxes(-1, -2))
+
+
+def with_reversals(view: PixelView, prior: Belief, modes: Modes) -> Modes:
+    """The same modes, and the one that the reversal of the best one leads to."""
+    back = reversed_starts(view, prior, modes.mean[np.arange(len(modes.mean)), modes.best][:, None])
+    more = find_modes(view, prior, back)
+    each = [(getattr(modes, f.name), getattr(more, f.name)) for f in fields(Modes)]
+    return Modes(*(np.concatenate(pair, axis=1) for pair in each))
+
+
 def whitened(prior: Belief, points: FloatArray) -> FloatArray:
     """Points (axes, k, n) in coordinates in which the prior is N(0, I)."""
     inverse = lower_inverse(cholesky(prior.covariance))
     return stacked.matmul(points - prior.mean[:, None], stacked.transpose(inverse))
 
 
-def innovation(view: PixelView, prior: Belief, t: FloatArray) -> Innovation:
-    """Innovation of the pixels linearised at t, (axes, n), in units of their noise.
+def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
+    """Innovation of the pixels linearised at the best mode, in units of their noise.
 
     With A = R^(-1/2) J L = U S V', the pixels' innovation has variance 1 + S^2 along U's columns, and 1 elsewhere.
     """
-    axes, n = t.shape
-    L = cholesky(prior.covariance)
+    rows = np.arange(len(modes.mean)), modes.best
+    t, distance = modes.mean[rows], modes.distance[rows]
+    n, L = t.shape[1], cholesky(prior.covariance)
     s = whitened(prior, t[:, None])[:, 0]
     f, J = view.linearised(t[:, None])
     score, information = (each[:, 0] for each in view.information(f))
@@ -175,13 +207,13 @@ def innovation(view: PixelView, prior: Belief, t: FloatArray) -> Innovation:
     values, V = np.linalg.eigh(stacked.matmul(stacked.transpose(A), A))
     outputs = view.outputs
     k = min(_DIRECTIONS * outputs, n)
-    values, V = np.maximum(values[:, : n - k - 1 : -1], 0.0), V[:, :, : n - k - 1 : -1]
+    values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
     S = np.sqrt(values)
     along = stacked.matvec(stacked.transpose(stacked.matmul(A, V)), e) / np.where(S > 0, S, 1.0)
     u = along + S * stacked.matvec(stacked.transpose(V), s)
     nis = np.add.reduce(u * u / (1 + values), axis=1)
     # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
-    total = stacked.dot(e, e) + stacked.dot(s, s)
+    total = stacked.dot(e, e) + distance
     degrees = np.add.reduce(view.mask, axis=1) + n
     believed = total <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
     covariance = (1 + values)[..., None] * np.eye(k)
@@ -200,11 +232,11 @@ class ProfileUpdates:
         before = view.reduced.prior(prior.belief)
         wide = broad(view, before)
         starts = np.concatenate([spread_starts(view, wide, _START_DIRECTIONS, _START_REACH), before.mean[:, None]], axis=1)
-        modes = without_repeats(find_modes(view, before, whitened(before, starts)))
+        found = find_modes(view, before, whitened(before, starts))
+        modes = without_repeats(with_reversals(view, before, found))
         log_weight = modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None]
-        best = np.argmax(log_weight, axis=1)
         after = Hypotheses(log_weight, modes.mean, modes.covariance).belief
-        new = innovation(view, before, modes.mean[np.arange(len(best)), best])
+        new = innovation(view, before, modes)
         end = single(view.reduced.end(after))
         several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
         return Update(after, end, new, several)

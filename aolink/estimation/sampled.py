@@ -60,8 +60,7 @@ class SampledUpdates:
         away = t - mean[:, None]
         after = Belief(mean, stacked.matmul(stacked.transpose(away), away) / (t.shape[1] - 1))
         modes, _ = explored(view, prior)
-        best = np.argmax(modes.log_evidence, axis=1)
-        new = innovation(view, before, modes.mean[np.arange(len(best)), best])
+        new = innovation(view, before, modes)
         fits = [fitted(points @ reduced.end_rows.T, self.seed) for points in t]
         end = Hypotheses(
             np.concatenate([fit.log_weight for fit in fits]),
