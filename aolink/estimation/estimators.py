@@ -111,7 +111,11 @@ class Estimator:
         reasons = self._bridge(exposure)
         response = response or model.response(exposure.inputs)
         measured, remark = measure(self.rig, exposure, self._observation, self.options)
-        posterior = self._filter.step(model, response, measured)
+        if isinstance(self._filter, HypothesisFilter):
+            assert not isinstance(measured, Measurement)
+            posterior = self._filter.step(model, response, measured)
+        else:
+            posterior = self._filter.step(model, response, measured)
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
         shape = (self.rig.n_outputs, exposure.n_steps)

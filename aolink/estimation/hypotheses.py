@@ -51,7 +51,7 @@ class Hypotheses:
         n = points.shape[-1]
         root = cholesky(self.covariance)
         away = points[:, None] - self.mean[:, :, None]
-        white = stacked.matmul(away, stacked.transpose(lower_inverse(root)))
+        white = stacked.long_matmul(away, stacked.transpose(lower_inverse(root)))
         log_root = np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1)
         constant = self.log_weight - log_root - 0.5 * n * math.log(2 * math.pi)
         return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1))

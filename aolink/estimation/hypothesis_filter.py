@@ -105,9 +105,7 @@ class HypothesisFilter:
             self.belief = _moved(self.belief, transition, noise, kick)
             self._unseen = predicted(self._unseen, transition, noise, kick)
 
-    def step(
-        self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None
-    ) -> Posterior:
+    def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
         """One exposure, with its pixels or without."""
         axes = self.plant.axes
         reduced = self._updates.reduction(model, self.sensor)

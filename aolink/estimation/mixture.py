@@ -43,7 +43,9 @@ _ROUNDS = 2
 _LEAST_EFFECTIVE = 64.0
 _HALVINGS = 10
 _CARRIED = 6
-_POINTS = 256
+# Points of a round for each coefficient; as many as the next power of two.
+_POINTS = 32
+_MOST_POINTS = 1024
 _START_DIRECTIONS = 1
 _START_REACH = 1.3
 # Share of the points that come from the wide Gaussians.
@@ -65,7 +67,7 @@ class MixtureUpdates:
         """The posterior of axes with a prior of their start states."""
         reduced = view.reduced
         modes, proposal = explored(view, prior)
-        after, _ = importance_corrected(view, prior, proposal, points=_POINTS, rounds=_ROUNDS)
+        after, _ = importance_corrected(view, prior, proposal)
         new = innovation(view, reduced.prior(prior.belief), modes)
         end = reduced.end(Belief(after.mean, after.covariance))
         carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(_CARRIED)
@@ -98,23 +100,28 @@ def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
         evidence - log_sum(evidence, axis=1)[:, None] + math.log(1 - _WIDE), modes.mean, modes.covariance * _INFLATION
     )
     flat = Hypotheses(
-        prior.log_weight + math.log(_WIDE), wide.mean.reshape(axes, count, n), wide.covariance.reshape(axes, count, n, n)
+        prior.log_weight + math.log(_WIDE),
+        wide.mean.reshape(axes, count, n),
+        wide.covariance.reshape(axes, count, n, n),
     )
     return modes, joined(narrow, flat)
 
 
 def importance_corrected(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, points: int = _POINTS, rounds: int = _ROUNDS
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, rounds: int = _ROUNDS
 ) -> tuple[Hypotheses, FloatArray]:
     """The posterior of t as the mixture that fits it, and the effective number of points, (axes,)."""
     proposals: list[Hypotheses] = []
     t = np.zeros((len(prior.mean), 0, view.reduced.size))
     target = np.zeros(t.shape[:2])
+    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(_POINTS * view.reduced.size)))
     for k in range(rounds):
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
         t = np.concatenate([t, new], axis=1)
-        target = np.concatenate([target, _log_prior(prior, new) + view.log_likelihood(view.predicted_of_many(new))], axis=1)
+        target = np.concatenate(
+            [target, _log_prior(prior, new) + view.log_likelihood(view.predicted_of_many(new))], axis=1
+        )
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         last = k == rounds - 1
@@ -139,26 +146,30 @@ def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
 
 
 def _drawn(proposal: Hypotheses, count: int, number: int) -> FloatArray:
+    """Points of a mixture, (axes, count, n); those of each round have a number."""
     axes, _, n = proposal.mean.shape
     u, e = _quasi_random(count, n, number)
     total = np.cumsum(np.exp(proposal.log_weight), axis=1)
     component = np.minimum((total[:, None] < u[:, None] * total[:, -1:, None]).sum(axis=2), total.shape[1] - 1)
     rows = np.arange(axes)[:, None]
     root = cholesky(proposal.covariance)[rows, component]
-    return proposal.mean[rows, component] + np.add.reduce(root * e[:, None], axis=-1)
+    return np.asarray(proposal.mean[rows, component] + np.add.reduce(root * e[:, None], axis=-1))
 
 
 @lru_cache(maxsize=32)
-def _quasi_random(count: int, n: int, number: int):
-    points = stats.qmc.Sobol(n + 1, rng=np.random.default_rng(number)).random(count)
-    return points[:, 0], special.ndtri(np.clip(points[:, 1:], 1e-12, 1 - 1e-12))
+def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArray]:
+    """Sobol's points, shifted: one uniform number and n normal ones for each, (count,) and (count, n)."""
+    points = stats.qmc.Sobol(n + 1, scramble=False).random(count)
+    points = (points + np.random.default_rng(number).random(n + 1)) % 1.0
+    return points[:, 0], np.asarray(special.ndtri(np.clip(points[:, 1:], 1e-12, 1 - 1e-12)))
 
 
 def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
+    """Of t = (start state, noise coefficients), (axes, points)."""
     states = prior.mean.shape[2]
     rest = t[..., states:]
-    n = rest.shape[-1]
-    return prior.log_density(t[..., :states]) - 0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * n * np.log(2 * np.pi)
+    noise = -0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi)
+    return np.asarray(prior.log_density(t[..., :states]) + noise)
 
 
 def _refitted(mixture: Hypotheses, points: FloatArray, log_weight: FloatArray) -> Hypotheses:
@@ -168,10 +179,10 @@ def _refitted(mixture: Hypotheses, points: FloatArray, log_weight: FloatArray) -
     mass = np.add.reduce(share, axis=2)
     effective = mass**2 / np.maximum(np.add.reduce(share * share, axis=2), 1e-300)
     safe = np.maximum(mass, 1e-300)[..., None]
-    mean = stacked.matmul(share, points) / safe
+    mean = stacked.long_matmul(share, points) / safe
     mean = np.where(mass[..., None] > 1e-9, mean, mixture.mean)
     away = points[:, None] - mean[:, :, None]
-    spread = stacked.matmul(stacked.transpose(away * share[..., None]), away) / safe[..., None]
+    spread = stacked.long_matmul(stacked.transpose(away * share[..., None]), away) / safe[..., None]
     trust = (effective / (effective + _PRIOR_POINTS))[..., None, None]
     covariance = stacked.symmetric(trust * spread + (1 - trust) * mixture.covariance)
     with np.errstate(divide="ignore"):

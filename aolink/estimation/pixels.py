@@ -132,7 +132,9 @@ def _node_count(model: ExposureModel, blurred: float) -> int:
     n, P = model.plant.n_states, model.plant.initial_covariance
     square = np.einsum("oki,ij,okj->ok", moves[..., :n], P, moves[..., :n]) + (moves[..., n:] ** 2).sum(axis=2)
     speed = math.sqrt(float(square.mean(axis=1).max())) if square.size else 0.0
-    return min(model.n_steps, max(_FEWEST_NODES, math.ceil(2 * speed * model.n_steps / (_SPACING * math.sqrt(blurred)))))
+    return min(
+        model.n_steps, max(_FEWEST_NODES, math.ceil(2 * speed * model.n_steps / (_SPACING * math.sqrt(blurred))))
+    )
 
 
 class PixelView:
@@ -202,7 +204,7 @@ class PixelView:
         """Outputs at the nodes, (axes, hypotheses, n_outputs, nodes)."""
         outputs, nodes, size = self._basis.shape
         rows = self._basis.reshape(-1, size)
-        flat = stacked.matmul(t, rows.T)
+        flat = stacked.long_matmul(t, rows.T)
         return np.asarray(flat.reshape(*t.shape[:2], outputs, nodes) + self._inputs[:, None])
 
     def predicted(self, t: FloatArray) -> FloatArray:
@@ -215,9 +217,7 @@ class PixelView:
         spots, terms = path.shape[2] // 2, self._terms()
         path = path.reshape(*path.shape[:2], spots, 2, -1)
         X, Y = (_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
-        light = sum(
-            c * stacked.matmul(stacked.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms)
-        )
+        light = sum(c * stacked.long_matmul(stacked.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms))
         return np.asarray(light).reshape(*t.shape[:2], -1) / self._optics.pixel_size
 
     def predicted_of_many(self, t: FloatArray) -> FloatArray:
@@ -241,7 +241,7 @@ class PixelView:
         for shift, weight in ((-1, 0.5 * (0.5 - away) ** 2), (0, 0.75 - away**2), (1, 0.5 * (0.5 + away) ** 2)):
             flat = (weight * self._weights).ravel()
             shares += np.bincount((start + shift).ravel(), weights=flat, minlength=len(shares))
-        return stacked.matmul(shares.reshape(*lead, count), masses) / self._optics.pixel_size
+        return stacked.long_matmul(shares.reshape(*lead, count), masses) / self._optics.pixel_size
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The same and their Jacobian, (axes, hypotheses, pixels, n)."""
@@ -251,7 +251,7 @@ class PixelView:
         if self._line:
             mass, slope = _masses(self._kernel[0, 0], edges, path[:, :, 0], 1)
             f = stacked.matmul(self._weights[None], mass)[..., 0, :] / D
-            J = stacked.matmul(stacked.transpose(slope * w), self._basis[0]) / D
+            J = stacked.long_matmul(stacked.transpose(slope * w), self._basis[0]) / D
             return f, J
         spots, terms = path.shape[2] // 2, self._terms()
         path = path.reshape(*lead, spots, 2, -1)
@@ -261,12 +261,12 @@ class PixelView:
         slopes: FloatArray = np.zeros(())
         for j, c in enumerate(terms):
             left = stacked.transpose(Y[j])
-            light = light + c * stacked.matmul(left, X[j] * w)
+            light = light + c * stacked.long_matmul(left, X[j] * w)
             # d/dt sum_k w Y_r X_c: the columns' derivative times the rows, and the other way round.
             columns = (X[j + 1] * w)[..., None] * along[:, :, None, :]
-            by_x = stacked.matmul(left, columns.reshape(*columns.shape[:-2], -1))
+            by_x = stacked.long_matmul(left, columns.reshape(*columns.shape[:-2], -1))
             rows = (Y[j + 1] * w)[..., None] * across[:, :, None, :]
-            by_y = stacked.matmul(stacked.transpose(X[j]), rows.reshape(*rows.shape[:-2], -1))
+            by_y = stacked.long_matmul(stacked.transpose(X[j]), rows.reshape(*rows.shape[:-2], -1))
             n_rows, n_columns = left.shape[-2], X[j].shape[-1]
             by_x = by_x.reshape(*lead, spots, n_rows, n_columns, size)
             by_y = by_y.reshape(*lead, spots, n_columns, n_rows, size).swapaxes(-3, -2)
@@ -280,7 +280,7 @@ class PixelView:
         terms = e * e / R
         if self.gain:
             terms = terms + np.log(R / self.read_noise)
-        return -0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1)
+        return np.asarray(-0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1))
 
     def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Score and Fisher information of each pixel by what is expected of it, (axes, hypotheses, pixels).

@@ -29,7 +29,9 @@ BoolArray = NDArray[np.bool_]
 
 _PASSES = 16
 _FIRST_DAMPING = 0.01
-_LARGEST_DAMPING = 1e8
+_LARGEST_DAMPING = 1e6
+_FREE_DAMPING = 0.1
+_NO_NOISE = 1e-14
 # The objective changes by less than this at a mode.
 _CONVERGED = 1e-4
 # Modes that are nearer to each other than so many standard deviations are one.
@@ -61,7 +63,7 @@ class Modes:
     @property
     def best(self) -> NDArray[np.intp]:
         """The one of least objective, (axes,)."""
-        return np.argmin(self.objective, axis=1)
+        return np.asarray(np.argmin(self.objective, axis=1))
 
 
 def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES) -> Modes:
@@ -76,7 +78,9 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
     """
     axes, count, n = starts.shape
     if prior.mean.ndim == 2:
-        prior = Belief(np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1))
+        prior = Belief(
+            np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
+        )
     rows = view.part(np.repeat(np.arange(axes), count))
     m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
     s = starts.reshape(-1, n)
@@ -97,11 +101,14 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
         s[took] += step[better]
         for mine, theirs in ((at.H, there.H), (at.g, there.g), (at.objective, there.objective)):
             mine[took] = theirs[better]
+        before = damping[active]
         damping[active] = np.where(better, damping[active] / 8, np.maximum(damping[active], 1e-3) * 8)
-        settled = (better & (gain < _CONVERGED)) | (damping[active] > _LARGEST_DAMPING)
-        settled |= ~better & (stacked.dot(step, g) < _CONVERGED)
+        # A short step says nothing where it is the damping that made it short.
+        free = before <= _FREE_DAMPING
+        settled = (free & better & (gain < _CONVERGED)) | (free & (stacked.dot(step, g) < _CONVERGED))
+        settled |= damping[active] > _LARGEST_DAMPING
         active = active[~settled]
-    covariance = stacked.congruence(L, stacked.symmetric(np.linalg.inv(at.H)))
+    covariance = stacked.congruence(L, stacked.symmetric(np.asarray(np.linalg.inv(at.H), dtype=np.float64)))
     _, log_H = np.linalg.slogdet(at.H)
     evidence = -at.objective - 0.5 * log_H
     mean = m[:, 0] + stacked.matvec(L, s)
@@ -123,8 +130,8 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
     """Information, gradient and objective at whitened coordinates, one hypothesis a row."""
     f, J = rows.linearised(m + stacked.matvec(L, s)[:, None])
     score, information = rows.information(f)
-    J = stacked.matmul(J[:, 0], L)
-    H = stacked.matmul(stacked.transpose(J) * information, J) + np.eye(s.shape[1])
+    J = stacked.long_matmul(J[:, 0], L)
+    H = stacked.long_matmul(stacked.transpose(J) * information, J) + np.eye(s.shape[1])
     g = stacked.matvec(stacked.transpose(J), score[:, 0]) - s
     return _Point(stacked.symmetric(H), g, 0.5 * stacked.dot(s, s) - rows.log_likelihood(f)[:, 0])
 
@@ -148,7 +155,9 @@ def broad(view: PixelView, prior: Belief) -> Belief:
     for _ in range(3):
         y, noise, fit = view.moments(about)
         innovation = y - fit.expected - stacked.matvec(fit.slope, prior.mean - about.mean)
-        about = corrected(prior, innovation, fit.slope, noise + fit.remainder).posterior
+        # A window without a pixel that can be used has neither moments nor noise.
+        spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
+        about = corrected(prior, innovation, fit.slope, spread).posterior
     return about
 
 
@@ -231,7 +240,9 @@ class ProfileUpdates:
         """The posterior of axes with a prior of their start states."""
         before = view.reduced.prior(prior.belief)
         wide = broad(view, before)
-        starts = np.concatenate([spread_starts(view, wide, _START_DIRECTIONS, _START_REACH), before.mean[:, None]], axis=1)
+        starts = np.concatenate(
+            [spread_starts(view, wide, _START_DIRECTIONS, _START_REACH), before.mean[:, None]], axis=1
+        )
         found = find_modes(view, before, whitened(before, starts))
         modes = without_repeats(with_reversals(view, before, found))
         log_weight = modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None]

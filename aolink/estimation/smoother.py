@@ -75,7 +75,7 @@ def _corrected(
     spread = stacked.symmetric(stacked.congruence(transition, P_end) + noise)
     innovation, change = later.start_state - predicted, later.start_covariance - spread
     # A state that is known for certain has no inverse, and needs none.
-    inverse = np.linalg.pinv(spread, hermitian=True)
+    inverse: FloatArray = np.linalg.pinv(spread, hermitian=True).astype(np.float64)
 
     def corrected(mean: FloatArray, covariance: FloatArray, with_next: FloatArray) -> tuple[FloatArray, FloatArray]:
         gain = stacked.matmul(with_next, inverse)

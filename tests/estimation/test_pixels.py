@@ -140,7 +140,7 @@ def test_what_the_reduction_leaves_out_is_small_and_accounted_for(kind):
 def test_fewer_nodes_and_coefficients_cost_less_than_the_noise():
     """Chi-square that the reduction adds where V is 0.001, mean over paths of the plant."""
     rig = dataclasses.replace(LINE, sensor=dataclasses.replace(LINE.sensor, noise_density=0.001))
-    coarse, model = view_of(rig)
+    coarse, _ = view_of(rig)
     fine, _ = view_of(rig, left_out=0.0, all_steps=True)
     rng = np.random.default_rng(4)
     full = 0.1 * rng.standard_normal((1, 50, fine.reduced.size))

@@ -1,6 +1,7 @@
 """The fixed-interval smoother against one dense least-squares solve, and against the truth."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def test_it_is_one_least_squares_solve_where_all_is_linear(period):
     np.testing.assert_allclose([e.start_state[0] for e in smoothed], mean, atol=1e-8)
     np.testing.assert_allclose([e.start_covariance[0] for e in smoothed], covariance, rtol=1e-6, atol=1e-12)
     if period == 200:
-        for before, after in zip(smoothed[:-1], smoothed[1:], strict=True):
+        for before, after in itertools.pairwise(smoothed):
             np.testing.assert_allclose(before.end_state, after.start_state, atol=1e-10)
 
 
