@@ -14,6 +14,7 @@ exp(-2 pi^2 / 1.5^2), 2e-4.
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -168,8 +169,7 @@ class PixelView:
 
     def part(self, axes: slice | NDArray[np.intp]) -> PixelView:
         """Of these axes alone."""
-        view = object.__new__(PixelView)
-        view.__dict__.update(self.__dict__)
+        view = copy(self)
         view.y, view.mask, view._inputs = self.y[axes], self.mask[axes], self._inputs[axes]
         view._measured = replace(self._measured, density=self._measured.density[axes], mask=self._measured.mask[axes])
         view.axes = self.axes[axes]
