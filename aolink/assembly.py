@@ -90,11 +90,10 @@ class FrameReassembly:
     def _close(self) -> Frame:
         parts, self._parts = self._parts, []
         first = parts[0]
-        data, arrived = bytearray(first.total), np.zeros(first.total, dtype=bool)
+        data, arrived = np.zeros(first.total, dtype=np.uint8), np.zeros(first.total, dtype=bool)
         for part in parts:
-            end = part.offset + len(part.data)
-            data[part.offset : end] = part.data
-            arrived[part.offset : end] = True
+            some = slice(part.offset, part.offset + len(part.data))
+            data[some], arrived[some] = np.frombuffer(part.data, np.uint8), True
         size = max(len(part.data) for part in parts)
         lost_before = 0 if self._last_id is None else first.frame_id - self._last_id - 1
         self._last_id = first.frame_id
@@ -102,9 +101,9 @@ class FrameReassembly:
             frame_id=first.frame_id,
             first_step=first.first_step,
             last_step=first.last_step,
-            pixels=np.frombuffer(bytes(data), dtype="<u2").astype(np.uint16).reshape(self._shape),
-            mask=arrived.reshape(-1, 2).all(axis=1).reshape(self._shape),
-            chunks_lost=-(-int((~arrived).sum()) // size),
+            pixels=data.view("<u2").astype(np.uint16, copy=False).reshape(self._shape),
+            mask=(arrived[::2] & arrived[1::2]).reshape(self._shape),
+            chunks_lost=-(-(first.total - int(np.count_nonzero(arrived))) // size),
             frames_lost_before=lost_before,
             device_start_ns=first.exposure_start_ns,
             device_end_ns=first.exposure_end_ns,
@@ -119,17 +118,21 @@ class TruthReassembly:
 
     def __init__(self) -> None:
         self._frame_id = 0
-        self._data = b""
+        self._data = bytearray()
 
     def add(self, chunk: pb.TruthChunk) -> pb.Truth | None:
         """Take a chunk; gives the truth that it completes."""
         if chunk.offset == 0:
-            self._frame_id, self._data = chunk.frame_id, b""
+            self._frame_id, self._data = chunk.frame_id, bytearray()
         if chunk.frame_id != self._frame_id or chunk.offset != len(self._data):
             self._frame_id = 0
             return None
         self._data += chunk.data
-        return pb.Truth.FromString(self._data) if len(self._data) == chunk.total else None
+        return pb.Truth.FromString(bytes(self._data)) if len(self._data) == chunk.total else None
+
+
+_Blocks = list[tuple[int, NDArray[np.float64]]]
+"""First steps and inputs of runs of steps, (k, n_inputs), in the order in which they came."""
 
 
 class _InputHistory:
@@ -137,8 +140,8 @@ class _InputHistory:
 
     def __init__(self, n_inputs: int, park: NDArray[np.float64]) -> None:
         self._n_inputs = n_inputs
-        self._applied: dict[int, NDArray[np.float64]] = {}
-        self._commanded: dict[int, NDArray[np.float64]] = {}
+        self._applied: _Blocks = []
+        self._commanded: _Blocks = []
         self._last = park
         self.reported_until = 0
         """First step that no report covers yet."""
@@ -150,24 +153,29 @@ class _InputHistory:
     def add_command(self, message: pb.CommandBlock) -> None:
         self._add(self._commanded, message)
 
-    def _add(self, steps: dict[int, NDArray[np.float64]], message: pb.Applied | pb.CommandBlock) -> None:
-        if len(message.u) == message.n_steps * self._n_inputs:
-            rows = np.array(message.u, dtype=np.float64).reshape(message.n_steps, self._n_inputs)
-            steps.update(zip(range(message.first_step, message.first_step + message.n_steps), rows, strict=True))
+    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock) -> None:
+        if message.n_steps and len(message.u) == message.n_steps * self._n_inputs:
+            u = np.array(message.u, dtype=np.float64).reshape(message.n_steps, self._n_inputs)
+            blocks.append((message.first_step, u))
 
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
-        """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``."""
-        rows, assumed = np.empty((max(0, end - first), self._n_inputs)), 0
-        for k in range(first, end):
-            row = self._applied.get(k)
-            if row is None:
-                assumed += 1
-                row = self._commanded.get(k, self._last)
-            rows[k - first] = self._last = row
-        for steps in (self._applied, self._commanded):
-            for k in [k for k in steps if k < end]:
-                del steps[k]
-        return rows, assumed
+        """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
+
+        The last word on a step counts; one that nothing is known of holds the input of the step before.
+        """
+        n = max(0, end - first)
+        rows, told, reported = np.empty((n, self._n_inputs)), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        for blocks, known in ((self._commanded, told), (self._applied, reported)):
+            for start, u in blocks:
+                some = slice(max(start - first, 0), max(start + len(u) - first, 0))
+                rows[some] = u[max(first - start, 0) :][: len(rows[some])]
+                known[some] = True
+            blocks[:] = [(max(start, end), u[max(end - start, 0) :]) for start, u in blocks if start + len(u) > end]
+        for k in np.flatnonzero(~(told | reported)):
+            rows[k] = rows[k - 1] if k else self._last
+        if n:
+            self._last = rows[-1].copy()
+        return rows, n - int(np.count_nonzero(reported))
 
 
 _MOST_LEAD_STEPS = 100_000

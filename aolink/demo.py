@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from aolink.errors import AolinkError, DeviceError, ViewerError
+from aolink.errors import AolinkError, DeviceError, EstimatorError, ViewerError
+from aolink.estimation import make_estimator
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import Rig
@@ -37,6 +38,16 @@ class DemoResult:
     """Where online and offline estimates differ, by estimator; empty if nowhere."""
     seconds: dict[str, float]
     """Wall time of each part."""
+
+
+def possible_estimators(rig: Rig) -> tuple[str, ...]:
+    """Those of `ESTIMATORS` that can work on a rig: not each of them knows plants that move many spots."""
+    possible = []
+    for name in ESTIMATORS:
+        with contextlib.suppress(EstimatorError):
+            make_estimator(rig, name)
+            possible.append(name)
+    return tuple(possible)
 
 
 @contextlib.contextmanager
@@ -103,6 +114,7 @@ def run_demo(
     rig_file.write_text(rig.toml)
     path, rrd, picture = folder / "session.mcap", folder / "session.rrd", folder / "session.png"
     seconds: dict[str, float] = {}
+    estimators = possible_estimators(rig)
 
     @contextlib.contextmanager
     def part(name: str) -> Iterator[Callable[[int], None]]:
@@ -115,7 +127,7 @@ def run_demo(
     options += ["--seed", str(seed)] if seed is not None else []
     with part("record") as tell, simulated_rig(rig_file, *options) as (camera, mirror):
         report = record(
-            rig, camera, mirror, path, estimators=ESTIMATORS, exposures=exposures, note="aolink demo", stop=stop,
+            rig, camera, mirror, path, estimators=estimators, exposures=exposures, note="aolink demo", stop=stop,
             progress=tell,
         )  # fmt: skip
     if stop():
@@ -125,7 +137,7 @@ def run_demo(
         )  # fmt: skip
     with part("estimate again") as tell:
         recording = Recording(path)
-        offline = reestimate(recording, ESTIMATORS, tell)
+        offline = reestimate(recording, estimators, tell)
         differences = {
             name: difference
             for name, again in offline.items()

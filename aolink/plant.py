@@ -173,7 +173,7 @@ def observability(plant: Plant, n_steps: int, fast_step_s: float) -> Observabili
     """Rank of what the camera sees, mode by mode (Popov-Belevitch-Hautus), for exposures of ``n_steps``."""
     rows = output_rows(plant, n_steps)
     transition, _ = lift(plant, n_steps)
-    eigenvalues = np.linalg.eigvals(plant.A)
+    eigenvalues = _distinct(np.linalg.eigvals(plant.A))
     blind = _unobservable(plant.A, plant.C, eigenvalues)
     scale = float(np.linalg.norm(rows)) / math.sqrt(n_steps)
     lifted = eigenvalues**n_steps
@@ -204,9 +204,20 @@ def observability(plant: Plant, n_steps: int, fast_step_s: float) -> Observabili
     )
 
 
+def _distinct(eigenvalues: NDArray[Any]) -> NDArray[Any]:
+    """Eigenvalues without repetition: a mirror's actuators are alike, and what holds for one holds for all."""
+    keep: list[complex] = []
+    for value in eigenvalues:
+        if all(abs(value - other) > 1e-7 for other in keep):
+            keep.append(value)
+    return np.array(keep)
+
+
 def _unobservable(A: FloatArray, C: FloatArray, eigenvalues: NDArray[Any], scale: float | None = None) -> FloatArray:
     """Basis of the states that (A, C) cannot tell from zero, (n_states, dimension), real and orthonormal."""
     C = C / (scale or np.linalg.norm(C))
+    if len(C) > len(A):
+        C = np.linalg.qr(C)[1]  # many outputs see no more than as many as there are states
     blind = []
     for value in eigenvalues:
         pencil = np.vstack([value * np.eye(len(A)) - A, C])
@@ -324,7 +335,9 @@ def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
     n_steps = int(min(_LARGEST_CHECK, max(timing.exposure_steps, settle) + turns))
     u = rig.drive.inputs(0, n_steps, timing.fast_step_s).reshape(n_steps, plant.axes, plant.n_inputs)
     response, _ = input_response(plant, u.transpose(1, 0, 2))
-    path = response + output_rows(plant, n_steps) @ plant.initial_mean
+    path = response
+    if plant.initial_mean.any():
+        path = path + output_rows(plant, n_steps) @ plant.initial_mean
     transition, noise = lift(plant, n_steps)
     late = plant.C @ (transition @ plant.initial_covariance @ transition.T + noise) @ plant.C.T
     early = plant.C @ plant.initial_covariance @ plant.C.T
@@ -335,7 +348,8 @@ def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
 def _check_sensor(rig: Rig) -> list[Finding]:
     sensor = rig.sensor
     findings = []
-    sd = math.sqrt(sensor.kernel.variance)
+    # Where it is narrowest.
+    sd = math.sqrt(float(np.linalg.eigvalsh(sensor.kernel.covariance)[0]))
     if sd < sensor.pixel_width / 3:
         message = (
             f"the kernel's sd, {sd:.3g}, is under a third of a pixel ({sensor.pixel_width:.3g}):"

@@ -19,8 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from aolink.disturbance import Disturbance, read_disturbance
 from aolink.errors import RigError
-from aolink.sensor import BaseSensor, read_calibration, read_sensor
+from aolink.optical_plant import Optics, read_membrane, read_optics, read_tip_tilt, read_voltage
+from aolink.optics.mirror import VoltageLaw
+from aolink.sensor import BaseSensor, read_calibration, read_grid, read_sensor
 from aolink.sensor import CalibrationTable as CalibrationTable
 from aolink.sensor import Kernel as Kernel
 from aolink.sensor import Sensor as Sensor
@@ -28,6 +31,9 @@ from aolink.sensor import SpotSensor as SpotSensor
 from aolink.toml_table import Table, shape_text
 
 FloatArray = NDArray[np.float64]
+
+# A row of them, and their limits, in one message of the protocol.
+_MOST_INPUTS = 10_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -109,11 +115,16 @@ class MirrorDriver:
     """Fast steps that the device can hold."""
     watchdog_s: float
     """The mirror parks itself when no valid packet has come for so long, s."""
+    voltage: VoltageLaw | None = None
+    """Where the driver makes voltages whose square pulls: they, not the inputs, are in equal steps."""
 
     def quantise(self, u: FloatArray) -> FloatArray:
         """The input that the converter puts out for ``u``, (..., axes * n_inputs)."""
         if not self.dac_bits:
             return u.copy()
+        if self.voltage is not None:
+            volt = self.voltage.max_v / ((1 << self.dac_bits) - 1)
+            return self.voltage.force(np.round(self.voltage.volts(u) / volt) * volt)
         step = (self.input_max - self.input_min) / ((1 << self.dac_bits) - 1)
         return self.input_min + np.round((u - self.input_min) / step) * step
 
@@ -192,6 +203,11 @@ class Rig:
     simulation: Simulation
     calibration: CalibrationTable | None
     """None where the sensor's values were not measured."""
+    optics: Optics | None
+    """The lenslets, where the file describes them."""
+    disturbance: Disturbance | None
+    folder: Path
+    """Of the file; where a file is named in it, its path is relative to this."""
     toml: str
     """The file's text, as read."""
 
@@ -240,7 +256,7 @@ def load_rig(path_or_name: str | Path) -> Rig:
         except UnicodeDecodeError:
             raise RigError(f"{path} is not a rig file: it is not text") from None
     try:
-        return parse_rig(text)
+        return parse_rig(text, path.parent)
     except RigError as error:
         raise RigError(f"{path_or_name}: {error}") from None
 
@@ -251,30 +267,57 @@ def builtin_rigs() -> list[str]:
     return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
 
 
-def parse_rig(text: str) -> Rig:
+def parse_rig(text: str, folder: Path | None = None) -> Rig:
     """Validate the text of a rig file. Raises `RigError`, naming the key."""
     try:
         root = Table(tomllib.loads(text), "")
     except tomllib.TOMLDecodeError as error:
         raise RigError(f"not valid TOML: {error}") from None
     name, summary = root.text("name"), root.text("summary", "")
-    plant = _plant(root.table("plant"))
     timing = _timing(root.table("timing"))
-    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs)
+    optics = read_optics(root.table("lenslets"), read_grid(root.table("sensor"))) if root.has("lenslets") else None
+    plant = _plant(root, optics, timing)
+    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, optics.field if optics else None)
     n_inputs = plant.axes * plant.n_inputs
     mirror = _mirror(root.table("mirror"), n_inputs, timing)
     drive = _drive(root.table("drive", optional=True), n_inputs, mirror)
+    disturbance = read_disturbance(root.table("disturbance")) if root.has("disturbance") else None
+    if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
+        raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
     simulation = _simulation(root.table("simulation", optional=True))
     calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
     root.finish()
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
-        mirror=mirror, drive=drive, simulation=simulation,
-        calibration=calibration, toml=text,
+        mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,
+        optics=optics, disturbance=disturbance, folder=folder or Path(), toml=text,
     )  # fmt: skip
 
 
-def _plant(table: Table) -> Plant:
+def _plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
+    table = root.table("plant")
+    kind = table.choice("kind", ("matrices", "membrane", "tip-tilt"), "matrices")
+    if kind == "membrane":
+        if optics is None:
+            raise RigError("plant.kind = 'membrane' needs [lenslets], to know the slopes that deflections make")
+        model = read_membrane(table, optics, timing.fast_step_s)
+    elif kind == "tip-tilt":
+        model = read_tip_tilt(table, math.prod(read_grid(root.table("sensor"))), timing.fast_step_s)
+    else:
+        return _plant_by_matrices(table)
+    # A number is the variance of each noise.
+    W = np.diag(table.vector("process_noise", model.B_w.shape[1], "noises"))
+    if (W < 0).any():
+        raise RigError("plant.process_noise has a variance below zero")
+    table.finish()
+    initial = linalg.solve_discrete_lyapunov(model.A, model.B_w @ W @ model.B_w.T)
+    return Plant(
+        A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
+        initial_covariance=np.asarray(initial, dtype=np.float64), axes=1,
+    )  # fmt: skip
+
+
+def _plant_by_matrices(table: Table) -> Plant:
     A = table.matrix("A", (None, None), "states x states")
     n = A.shape[0]
     if A.shape != (n, n):
@@ -336,20 +379,27 @@ def _timing(table: Table) -> Timing:
 
 
 def _mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
-    low = table.vector("input_min", n_inputs, "inputs")
-    high = table.vector("input_max", n_inputs, "inputs")
+    law = read_voltage(table.table("voltage")) if table.has("voltage") else None
+    if law and (table.has("input_min") or table.has("input_max")):
+        raise RigError("mirror.input_min and mirror.input_max follow from [mirror.voltage]: leave them out")
+    low = np.full(n_inputs, law.input_range[0]) if law else table.vector("input_min", n_inputs, "inputs")
+    high = np.full(n_inputs, law.input_range[1]) if law else table.vector("input_max", n_inputs, "inputs")
     if (low >= high).any():
         raise RigError("mirror.input_min must be below mirror.input_max for every input")
     park = table.vector("park", n_inputs, "inputs", 0.0)
     if (park < low).any() or (park > high).any():
         raise RigError("mirror.park is outside mirror.input_min .. mirror.input_max: the safe input must be allowed")
-    # A block is one packet: 4 KiB of 8-byte numbers.
-    most = max(1, 4096 // (8 * n_inputs))
+    if n_inputs > _MOST_INPUTS:
+        raise RigError(
+            f"the mirror has {n_inputs} inputs (plant.axes times the columns of plant.B): at most {_MOST_INPUTS}"
+        )
+    # A block is one packet, 4 KiB of 8-byte numbers; where not even one step fits, it goes in parts.
+    in_packet, in_parts = 4096 // (8 * n_inputs), 65_536 // (8 * n_inputs)
+    most = in_packet or max(1, in_parts)
     block = table.integer("block_steps", min(50, most), low=1)
     if block > most:
-        raise RigError(
-            f"mirror.block_steps = {block} does not fit into one packet: at most {most} for {n_inputs} inputs"
-        )
+        room = "one packet" if in_packet else "64 KiB"
+        raise RigError(f"mirror.block_steps = {block} does not fit into {room}: at most {most} for {n_inputs} inputs")
     queue = table.integer("queue_steps", 8 * block, low=1)
     if queue < 2 * block:
         raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")
@@ -361,6 +411,7 @@ def _mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
         block_steps=block,
         queue_steps=queue,
         watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
+        voltage=law,
     )
     table.finish()
     return driver

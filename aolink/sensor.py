@@ -223,29 +223,38 @@ class CalibrationTable:
     """Kind, name and SHA-256 of each recording that was used."""
 
 
-def read_sensor(table: Table, axes: int, n_outputs: int) -> BaseSensor:
-    """The table ``[sensor]``, for a plant of ``axes`` copies with ``n_outputs`` each. Raises `RigError`."""
+def read_sensor(table: Table, axes: int, n_outputs: int, field: tuple[float, float] | None = None) -> BaseSensor:
+    """The table ``[sensor]``, for a plant of ``axes`` copies with ``n_outputs`` each. Raises `RigError`.
+
+    ``field`` follows from the lenslets where the rig file describes them.
+    """
     kind = table.choice("kind", ("line", "spots"))
-    sensor = _line(table, axes * n_outputs) if kind == "line" else _spots(table, axes, n_outputs)
+    read_out = _read_out(table, field)
+    sensor = _line(table, axes * n_outputs, read_out) if kind == "line" else _spots(table, axes, n_outputs, read_out)
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
     table.finish()
     return sensor
 
 
-def _line(table: Table, outputs: int) -> Sensor:
+def read_grid(table: Table) -> tuple[int, ...]:
+    """``sensor.grid``, rows and columns of windows."""
+    return table.integers("grid", 2, "rows and columns of windows", low=1, high=256)
+
+
+def _line(table: Table, outputs: int, read_out: dict[str, Any]) -> Sensor:
     if outputs != 1:
         raise RigError(
             f"sensor.kind = 'line' sees one slope, but the plant has {outputs} (plant.axes times the rows of plant.C)"
         )
-    sensor = Sensor(kind="line", pixels=table.integer("pixels", low=2, high=65_536), **_read_out(table))
+    sensor = Sensor(kind="line", pixels=table.integer("pixels", low=2, high=65_536), **read_out)
     if sensor.kernel.matrix is not None:
         raise RigError("sensor.kernel.sigma is a matrix, but a line sensor sees one direction: give a number")
     return sensor
 
 
-def _spots(table: Table, axes: int, n_outputs: int) -> SpotSensor:
-    rows, columns = table.integers("grid", 2, "rows and columns of windows", low=1, high=256)
+def _spots(table: Table, axes: int, n_outputs: int, read_out: dict[str, Any]) -> SpotSensor:
+    rows, columns = read_grid(table)
     height, width = table.integers("window", 2, "rows and columns of pixels", low=2, high=256)
     if height != width:
         raise RigError(f"sensor.window = [{height}, {width}] is not square: a window needs as many rows as columns")
@@ -258,7 +267,7 @@ def _spots(table: Table, axes: int, n_outputs: int) -> SpotSensor:
         raise RigError(
             f"plant.C has {n_outputs} rows: for sensor.kind = 'spots' it needs one, or two for each spot that it moves"
         )
-    sensor = SpotSensor(kind="spots", grid=(rows, columns), window=(height, width), **_read_out(table))
+    sensor = SpotSensor(kind="spots", grid=(rows, columns), window=(height, width), **read_out)
     if sensor.kernel.matrix is not None and n_outputs == 1:
         raise RigError(
             "sensor.kernel.sigma is a matrix, but each copy of the plant moves a spot along one direction only: give a"
@@ -267,9 +276,11 @@ def _spots(table: Table, axes: int, n_outputs: int) -> SpotSensor:
     return sensor
 
 
-def _read_out(table: Table) -> dict[str, Any]:
+def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str, Any]:
     """The fields of `BaseSensor`."""
-    field = table.vector("field", 2, "lower and upper edge")
+    if known_field and table.has("field"):
+        raise RigError("sensor.field follows from [lenslets]: leave it out")
+    field = known_field or table.vector("field", 2, "lower and upper edge")
     if field[0] >= field[1]:
         raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
     kernel_table = table.table("kernel")

@@ -25,7 +25,10 @@ from aolink.session import Report
 if TYPE_CHECKING:
     from aolink.calibrating import Calibrated
     from aolink.demo import DemoResult
+    from aolink.estimation.exposure_scan import ExpectedError
     from aolink.recording.compare import TopicComparison
+    from aolink.rig import Rig
+    from aolink.slopes import FrameSlopes
 
 _LATENCY_STEPS = (
     ("exposure end to first byte", "exposure_end_ns", "first_byte_ns"),
@@ -388,3 +391,51 @@ def comparison_as_json(found: Mapping[str, TopicComparison], *, same_rig: bool) 
     """The same for scripts; a difference without a size is null."""
     same = same_rig and all(each.same for each in found.values())
     return dict(_without_nan({"same": same, "same_rig": same_rig, "topics": {k: asdict(v) for k, v in found.items()}}))
+
+
+def slopes_as_json(result: FrameSlopes) -> dict[str, Any]:
+    """What `aolink slopes` says of a frame."""
+    lattice, reference = result.lattice, result.reference
+    return {
+        "spots": len(lattice.spots),
+        "reference_spots": len(reference.spots),
+        "pitch_px": lattice.pitch,
+        "reference_pitch_px": reference.pitch,
+        "turn_deg": lattice.turn_deg,
+        "shift_px": result.shift_px.tolist(),
+        "displacement_rms_px": float(np.sqrt(np.nanmean(result.displacements_px**2))),
+        "wavefront_rms": result.rms,
+        "wavefront_peak_to_valley": result.peak_to_valley,
+        "wavefront_unit": "m" if result.in_metres else "px x pitch",
+    }
+
+
+def slopes(result: FrameSlopes) -> Table:
+    """`slopes_as_json` for people."""
+    said = slopes_as_json(result)
+    unit, factor = ("nm", 1e9) if result.in_metres else ("px x pitch", 1.0)
+    grid = Table.grid(padding=(0, 2))
+    x, y = said["shift_px"]
+    for name, value in (
+        ("spots", f"{said['spots']}, the reference has {said['reference_spots']}"),
+        ("pitch", f"{said['pitch_px']:.3f} px, the reference's {said['reference_pitch_px']:.3f} px"),
+        ("grid turned by", f"{said['turn_deg']:.2f} degrees"),
+        ("shift", f"{x:+.2f}, {y:+.2f} px along x and y, up to whole pitches"),
+        ("displacements", f"{said['displacement_rms_px']:.3f} px rms, without the shift"),
+        ("wavefront", f"{result.rms * factor:.4g} {unit} rms, {result.peak_to_valley * factor:.4g} peak to valley"),
+    ):
+        grid.add_row(name, value)
+    return grid
+
+
+def exposure_scan(rig: Rig, errors: Sequence[ExpectedError]) -> Table:
+    """What `aolink rig --exposure-scan` says; the rig's own exposure time is marked."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for title in ("exposure steps", "s", "RMSE path", "RMSE output at end", "centroid noise"):
+        table.add_column(title, justify="right")
+    for each in errors:
+        own = " *" if each.exposure_steps == rig.timing.exposure_steps else "  "
+        seconds = f"{each.exposure_steps * rig.timing.fast_step_s:.4g}"
+        values = (f"{x:.4f}" for x in (each.path_rms, each.end_rms, each.noise_rms))
+        table.add_row(f"{each.exposure_steps}{own}", seconds, *values)
+    return table

@@ -39,6 +39,19 @@ class Table:
     def table(self, name: str, *, optional: bool = False) -> Table:
         return Table(self.get(name, {} if optional else None), self.key(name))
 
+    def tables(self, name: str) -> list[Table]:
+        """A list of tables; empty where it is missing."""
+        values = self.get(name, [])
+        if not isinstance(values, list):
+            raise RigError(f"{self.key(name)}: expected a list of tables, found {shown(values)}")
+        return [Table(value, f"{self.key(name)}[{k}]") for k, value in enumerate(values)]
+
+    def flag(self, name: str, default: bool) -> bool:
+        value = self.get(name, default)
+        if not isinstance(value, bool):
+            raise RigError(f"{self.key(name)}: expected true or false, found {shown(value)}")
+        return value
+
     def text(self, name: str, default: str | None = None) -> str:
         value = self.get(name, default)
         if not isinstance(value, str):

@@ -63,3 +63,9 @@ def start_aolink(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
         )  # fmt: skip
 
     return start
+
+
+@pytest.fixture(scope="session")
+def mmirs() -> Path:
+    """Folder of a real telescope's frames, with their licence."""
+    return Path(__file__).parent / "data" / "mmirs"

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.assembly import Assembler, Frame, FrameReassembly, TruthReassembly
+from aolink.assembly import Assembler, Frame, FrameReassembly, TruthReassembly, _InputHistory
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as pb
 
@@ -197,3 +197,33 @@ def test_the_order_of_frames_and_reports_does_not_matter(data: st.DataObject) ->
     assert [e.frame_id for e in exposures] == [1, 2, 3]
     for e in exposures:
         assert np.array_equal(e.inputs[:, 0], 1e-3 * np.arange(e.first_step, e.first_step + 200))
+
+
+runs = st.tuples(st.booleans(), st.integers(0, 40), st.integers(0, 15))
+takes = st.tuples(st.integers(0, 12), st.integers(0, 12))
+
+
+@given(st.lists(st.one_of(runs, takes), max_size=25))
+def test_every_step_has_its_last_report_or_command_or_the_input_before(calls: list[tuple[int, ...]]) -> None:
+    history, applied, commanded = _InputHistory(2, np.zeros(2)), dict[int, float](), dict[int, float]()
+    value, last, end = 0.0, 0.0, 0
+    for call in calls:
+        if len(call) == 3:
+            reported, first, n_steps = call
+            u = [value := value + 1.0 for _ in range(n_steps)]
+            kind, add = (pb.Applied, history.add_applied) if reported else (pb.CommandBlock, history.add_command)
+            add(kind(first_step=first, n_steps=n_steps, u=np.repeat(u, 2)))
+            (applied if reported else commanded).update(zip(range(first, first + n_steps), u, strict=True))
+            continue
+        first = max(0, end + call[0] - 3)  # a few steps again, or a gap
+        end = first + call[1]
+        expected, assumed = [], 0
+        for step in range(first, end):
+            assumed += step not in applied
+            last = applied.get(step, commanded.get(step, last))
+            expected.append(last)
+        rows, found = history.take(first, end)
+        assert (rows.tolist(), found) == ([[each, each] for each in expected], assumed)
+        for known in (applied, commanded):
+            for step in [step for step in known if step < end]:
+                del known[step]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -31,6 +32,10 @@ from aolink.rig import Rig, load_rig, parse_light
 from aolink.terminal import StopRequest, ask, input_ended, progress_bar
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from aolink.estimation import Estimate
+    from aolink.exposure import Exposure
     from aolink.recording.reader import Recording
 
 MOST_EXPOSURES = 2**32 - 1
@@ -48,6 +53,9 @@ class Light(StrEnum):
 def rig(
     rig: RigArgument,
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, say what was found, and end.")] = False,
+    exposure_scan: Annotated[
+        bool, typer.Option("--exposure-scan", help="Say what o1 would know with other exposure times, and end.")
+    ] = False,
     real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not with the commands.")] = False,
     seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
     listen: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, not terminals.")] = None,
@@ -64,6 +72,9 @@ def rig(
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
     if check:
         _print_findings(load_rig(rig), as_json)
+        return
+    if exposure_scan:
+        _print_scan(load_rig(rig), as_json)
         return
     loaded = load_checked(rig)
     if light is not None:
@@ -88,6 +99,19 @@ def rig(
         server.run(lambda: stop() or (tied and input_ended()))
         for stream in streams.values():
             stream.close()
+
+
+def _print_scan(loaded: Rig, as_json: bool) -> None:
+    from aolink import tables
+    from aolink.estimation.exposure_scan import best, exposure_scan
+
+    errors = exposure_scan(loaded)
+    if as_json:
+        print(json.dumps([vars(each) for each in errors]))
+        return
+    stdout.print(tables.exposure_scan(loaded, errors))
+    steps = best(errors).exposure_steps
+    stdout.print(f"least error of the path: timing.exposure_steps = {steps}, {steps * loaded.timing.fast_step_s:g} s")
 
 
 def _print_findings(loaded: Rig, as_json: bool) -> None:
@@ -158,6 +182,9 @@ def record(
         Light | None,
         typer.Option(help="Frames of this for `aolink calibrate`: the mirror stays parked, whatever the rig's drive."),
     ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show it in Rerun as it goes on; the viewer skips what it has no time for.")
+    ] = False,
     split_mib: Annotated[
         float, typer.Option(min=0, metavar="MIB", help="Begin another file at this size; 0 for one file.")
     ] = 0.0,
@@ -192,7 +219,11 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
+    with (
+        _live_view(loaded, estimator or [], shown=view) as watch,
+        StopRequest().installed() as stop,
+        progress_bar(stderr, exposures) as tell,
+    ):
         report = session.record(
             loaded,
             camera,
@@ -202,6 +233,7 @@ def record(
             exposures=exposures or 0,
             note=note,
             calibration=calibration or "",
+            watch=watch,
             overwrite=overwrite,
             options=options,
             stop=stop,
@@ -220,6 +252,26 @@ def record(
         text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; look at it: {program()} view {written}"
         stdout.print(text, markup=False)
     stop.exit_if_asked()
+
+
+@contextmanager
+def _live_view(
+    rig: Rig, estimators: Sequence[str], *, shown: bool
+) -> Iterator[Callable[[Exposure, Sequence[Estimate]], None] | None]:
+    """What shows a session's exposures, or nothing; says how many it skipped."""
+    if not shown:
+        yield None
+        return
+    from aolink import viewing
+
+    with viewing.live_viewer(rig, estimators) as live:
+        view = viewing.Decimating(live)
+        try:
+            yield view.show
+        finally:
+            view.close()
+            if view.skipped:
+                stderr.print(f"aolink: the viewer had no time for {view.skipped} exposures; all are in the recording")
 
 
 @app.command(

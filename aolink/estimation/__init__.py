@@ -11,7 +11,6 @@ from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.smoother import smooth
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
-from aolink.estimation.windows import Window, measure_windows
 
 __all__ = [
     "ESTIMATOR_NAMES",
@@ -30,14 +29,12 @@ __all__ = [
     "Scorer",
     "SpotWindows",
     "Status",
-    "Window",
     "WindowedMoments",
     "WindowedSpots",
     "exposure_model",
     "make_estimator",
     "measure_moments",
     "measure_moments_2d",
-    "measure_windows",
     "path_from_coefficients",
     "run",
     "score",

@@ -1,6 +1,7 @@
 """Matrices of one or two rows, many at once, as their entries: arithmetic written out.
 
-An entry is an array with a value for each axis, or one number for all of them. Every operation is then one pass
+An entry is an array with a value for each axis, or one number for all of them; of a single axis all are numbers, which
+NumPy would take ten times as long for. Every operation is then one pass
 over arrays that lie in the processor's cache, and half of what is symmetric need not be computed; for
 larger matrices the calls would cost more than the arithmetic (`aolink.estimation.stacked`). What comes
 out for one axis does not depend on how many are beside it, bit for bit.
@@ -8,6 +9,7 @@ out for one axis does not depend on how many are beside it, bit for bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -26,14 +28,14 @@ def unpack(a: FloatArray) -> Matrix:
     if a.ndim == 2:
         return list(a.tolist())
     # One matrix seen through strides of zero is one, too.
-    if a.strides[0] == 0:
+    if a.strides[0] == 0 or len(a) == 1:
         return list(a[0].tolist())
     return [[a[:, i, j] for j in range(a.shape[2])] for i in range(a.shape[1])]
 
 
 def columns(x: FloatArray) -> list[Entry]:
     """Entries of vectors (axes, n)."""
-    return [x[:, i] for i in range(x.shape[1])]
+    return list(x[0].tolist()) if len(x) == 1 else [x[:, i] for i in range(x.shape[1])]
 
 
 def pack(matrix: Matrix, axes: int) -> FloatArray:
@@ -51,6 +53,11 @@ def pack_vector(x: Sequence[Entry], axes: int) -> FloatArray:
     for i, entry in enumerate(x):
         out[i] = entry
     return out.T
+
+
+def pack_one(x: Entry, axes: int) -> FloatArray:
+    """(axes,)"""
+    return x if isinstance(x, np.ndarray) else np.full(axes, x)
 
 
 def dot(x: Sequence[Entry], y: Sequence[Entry]) -> Entry:
@@ -97,16 +104,33 @@ def congruence(a: Matrix, p: Matrix, plus: Matrix) -> Matrix:
     return symmetric_times_transposed(times_transposed(a, p), a, plus)
 
 
+def congruence_by_numbers(a: Sequence[Sequence[float]], p: Matrix, plus: Matrix) -> Matrix:
+    """`congruence` with one matrix of numbers for all axes: the products of its entries are numbers, too."""
+    n = len(p)
+    upper = [p[k][m] for k in range(n) for m in range(k, n)]
+    out: Matrix = [[0.0] * len(a) for _ in a]
+    for i, row in enumerate(a):
+        for j, other in enumerate(a[: i + 1]):
+            share = [row[k] * other[m] + (row[m] * other[k] if m > k else 0.0) for k in range(n) for m in range(k, n)]
+            out[i][j] = out[j][i] = dot(share, upper) + plus[i][j]
+    return out
+
+
 def one_minus(a: Matrix) -> Matrix:
     """I - A"""
     return [[1.0 - x if i == j else -x for j, x in enumerate(row)] for i, row in enumerate(a)]
 
 
+def reciprocal(x: Entry) -> Entry:
+    """1 / x, infinite for zero, as it is for arrays."""
+    return 1.0 / x if not isinstance(x, float) or x else math.inf
+
+
 def inverse(a: Matrix) -> Matrix:
     """Inverse of symmetric positive definite matrices."""
     if len(a) == 1:
-        return [[1.0 / a[0][0]]]
+        return [[reciprocal(a[0][0])]]
     (p, q), (_, r) = a
-    determinant = p * r - q * q
-    off = -q / determinant
-    return [[r / determinant, off], [off, p / determinant]]
+    scale = reciprocal(p * r - q * q)
+    off = -q * scale
+    return [[r * scale, off], [off, p * scale]]

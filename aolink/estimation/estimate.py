@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from aolink.estimation.exposure_model import ExposureModel, path_from_coefficients
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +36,8 @@ class Estimate:
     """Start state, end state and path of one exposure, with their covariances.
 
     The three are jointly Gaussian. The path is kept as coefficients of the exposure basis
-    (`aolink.estimation.ExposureModel.basis`): path = basis @ coefficients + response to the inputs.
+    (`aolink.estimation.ExposureModel.basis`): path = basis @ coefficients + response to the inputs. It is unfolded
+    where somebody reads it: of 1800 axes it takes longer than all that was estimated.
     """
 
     estimator: str
@@ -55,10 +59,10 @@ class Estimate:
     """Of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
     coefficient_covariance: FloatArray
     """(axes, n_coefficients, n_coefficients)"""
-    path: FloatArray
-    """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
-    path_sd: FloatArray
-    """Standard deviation of the path, slope units, (n_outputs, n_steps)."""
+    inputs: FloatArray
+    """The exposure's, which are part of the path, (n_steps, n_inputs)."""
+    model: ExposureModel = field(compare=False, repr=False)
+    """What the coefficients are of."""
     innovation: FloatArray
     """Measurement minus its prediction, (axes, n_measurements)."""
     innovation_covariance: FloatArray
@@ -68,3 +72,21 @@ class Estimate:
 
     Chi-square with n_measurements degrees of freedom if all is well.
     """
+
+    @property
+    def path(self) -> FloatArray:
+        """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
+        return self._unfolded[0]
+
+    @property
+    def path_sd(self) -> FloatArray:
+        """Standard deviation of the path, slope units, (n_outputs, n_steps)."""
+        return self._unfolded[1]
+
+    @cached_property
+    def _unfolded(self) -> tuple[FloatArray, FloatArray]:
+        return path_from_coefficients(self.model, self.coefficients, self.coefficient_covariance, self.inputs)
+
+
+COMPARED = (*(each.name for each in fields(Estimate) if each.compare), "path", "path_sd")
+"""What of two estimates must agree if they are the same."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -34,7 +33,7 @@ from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
-from aolink.rig import Rig, SpotSensor
+from aolink.rig import Rig, Sensor, SpotSensor
 from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
@@ -52,6 +51,12 @@ ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments", *_OF
 _HIGHEST_ORDER = 8
 # Share of the pixels that `moments` can do with.
 _LEAST_USABLE = 0.5
+# Exposures together, and numbers in them.
+_AT_ONCE = 64
+_NUMBERS_AT_ONCE = 1_000_000
+
+Measured = tuple[Measurement | Profile | SpotWindows | None, str]
+"""What an observation takes of an exposure, or nothing; and what there is to say about it."""
 
 
 @dataclass(frozen=True)
@@ -102,23 +107,24 @@ class Estimator:
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
 
-    def step(self, exposure: Exposure, response: InputResponse | None = None) -> Estimate:
+    def step(
+        self, exposure: Exposure, response: InputResponse | None = None, measured: Measured | None = None
+    ) -> Estimate:
         """The estimate of an exposure, from it and from all that came before.
 
-        ``response``, to the exposure's inputs, saves computing it again.
+        ``response``, to the exposure's inputs, and ``measured``, of `measure_all`, save computing them again.
         """
         model = exposure_model(self.rig.plant, exposure.n_steps, exposure.start_offset)
         reasons = self._bridge(exposure)
         response = response or model.response(exposure.inputs)
-        measured, remark = measure(self.rig, exposure, self._observation, self.options)
+        taken, remark = measured or self.measure_all([exposure])[0]
         if isinstance(self._filter, HypothesisFilter):
-            assert not isinstance(measured, Measurement)
-            posterior = self._filter.step(model, response, measured)
+            assert not isinstance(taken, Measurement)
+            posterior = self._filter.step(model, response, taken)
         else:
-            posterior = self._filter.step(model, response, measured)
+            posterior = self._filter.step(model, response, taken)
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
-        shape = (self.rig.n_outputs, exposure.n_steps)
         return Estimate(
             estimator=self.name,
             frame_id=exposure.frame_id,
@@ -132,12 +138,16 @@ class Estimator:
             end_covariance=posterior.end.covariance,
             coefficients=coefficients,
             coefficient_covariance=covariance,
-            path=model.path(coefficients, response.path).reshape(shape),
-            path_sd=model.path_sd(covariance).reshape(shape),
+            inputs=exposure.inputs,
+            model=model,
             innovation=posterior.innovation,
             innovation_covariance=posterior.innovation_covariance,
             nis=posterior.nis,
         )
+
+    def measure_all(self, exposures: Sequence[Exposure]) -> list[Measured]:
+        """What it takes of each exposure; it does not matter what came before."""
+        return measure_all(self.rig, exposures, self._observation, self.options)
 
     def _bridge(self, exposure: Exposure) -> list[str]:
         """Predict to the start of an exposure; what there is to say about it."""
@@ -157,9 +167,26 @@ class Estimator:
         return reasons
 
 
-def measure(
-    rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options
-) -> tuple[Measurement | Profile | SpotWindows | None, str]:
+def measure_all(
+    rig: Rig, exposures: Sequence[Exposure], observation: Observation[Any] | None, options: Options
+) -> list[Measured]:
+    """`measure` of many exposures, each to the same bits: line-sensor frames without a flaw all at once."""
+    sensor, found = rig.sensor, dict[int, Measured]()
+    many = len(exposures) > 1 and sensor.shape[0] == 1
+    if many and isinstance(sensor, Sensor) and isinstance(observation, PathMoments):
+        whole = [k for k, each in enumerate(exposures) if each.pixels.shape == sensor.shape and each.complete]
+        pixels = np.concatenate([np.empty(sensor.shape, np.uint16)[:0], *(exposures[k].pixels for k in whole)])
+        lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
+        good = np.flatnonzero(lit & ~is_saturated(sensor, pixels).any(axis=1))
+        moments = measure_moments(sensor, pixels[good], observation.orders, options.flux) if len(good) else ""
+        if not isinstance(moments, str):
+            for i, k in enumerate(good):
+                own = Measurement(value=moments.value[i : i + 1], covariance=moments.covariance[i : i + 1])
+                found[whole[k]] = (own, "")
+    return [found.get(k) or measure(rig, each, observation, options) for k, each in enumerate(exposures)]
+
+
+def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options) -> Measured:
     """What an observation takes of an exposure, or nothing; and what there is to say about it."""
     if observation is None:
         return None, ""
@@ -184,7 +211,7 @@ def measure(
             return None, remark
         remark += ": left out"
     density = np.where(usable, to_density(sensor, pixels), 0.0)
-    significance = spot_significance(sensor, density)
+    significance = spot_significance(sensor, density)[0]
     if significance < least_significance(sensor):
         return None, f"no spot: the brightest stretch is {significance:.1f} standard deviations of noise"
     rows = (rig.plant.axes, -1)
@@ -250,15 +277,39 @@ class Driver:
         response = model.response(exposure.inputs)
         return [estimator.step(exposure, response) for estimator in self.estimators]
 
+    def steps(self, exposures: Iterable[Exposure]) -> Iterator[tuple[Exposure, list[Estimate]]]:
+        """The same for a series, to the same bits; what knows no recursion is done for many exposures at once."""
+        for some in _batches(exposures):
+            models = {(each.n_steps, each.start_offset) for each in some}
+            responses: Sequence[InputResponse | None] = [None] * len(some)
+            if len(models) == 1:
+                responses = exposure_model(self.rig.plant, *models.pop()).responses([each.inputs for each in some])
+            measured = [estimator.measure_all(some) for estimator in self.estimators]
+            for k, exposure in enumerate(some):
+                each = zip(self.estimators, measured, strict=True)
+                yield exposure, [estimator.step(exposure, responses[k], own[k]) for estimator, own in each]
+
 
 def run(rig: Rig, exposures: Iterable[Exposure], names: Sequence[str]) -> dict[str, list[Estimate]]:
     """Estimates of a series of exposures, by the estimators' names."""
     driver = Driver(rig, names)
     estimates: dict[str, list[Estimate]] = {name: [] for name in names}
-    for exposure in exposures:
-        for estimate in driver.step(exposure):
+    for _, each in driver.steps(exposures):
+        for estimate in each:
             estimates[estimate.estimator].append(estimate)
     return estimates
+
+
+def _batches(exposures: Iterable[Exposure]) -> Iterator[list[Exposure]]:
+    """Some exposures at a time, a few megabytes of them."""
+    batch: list[Exposure] = []
+    for exposure in exposures:
+        batch.append(exposure)
+        if len(batch) >= min(_AT_ONCE, _NUMBERS_AT_ONCE // (1 + exposure.inputs.size + exposure.pixels.size)):
+            yield batch
+            batch = []
+    if batch:
+        yield batch
 
 
 def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | None:
@@ -303,7 +354,8 @@ _BY_GRAVITY = (Status.PREDICTED, Status.OK, Status.REINITIALISED, Status.GATED, 
 
 
 def _worst(status: NDArray[np.int64]) -> Status:
-    return max((Status(int(s)) for s in np.unique(status)), key=_BY_GRAVITY.index)
+    counts = np.bincount(status)
+    return max((Status(int(s)) for s in np.flatnonzero(counts)), key=_BY_GRAVITY.index)
 
 
 def _told(posterior: Posterior) -> list[str]:
@@ -313,7 +365,7 @@ def _told(posterior: Posterior) -> list[str]:
         Status.DIVERGED: "too far from the prediction several times in a row: it starts again",
         Status.REINITIALISED: "started again from the plant's prior",
     }
-    counts = Counter(Status(int(s)) for s in posterior.status)
+    counts = np.bincount(posterior.status, minlength=len(Status))
     axes = len(posterior.status)
     told = []
     for status, text in words.items():

@@ -14,6 +14,7 @@ of whole steps.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -131,7 +132,11 @@ class ExposureModel:
 
     def response(self, inputs: FloatArray) -> InputResponse:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
-        path, end = input_response(self.plant, by_axis(self.plant, inputs))
+        return self.responses([inputs])[0]
+
+    def responses(self, inputs: Sequence[FloatArray]) -> list[InputResponse]:
+        """`response` of many exposures, each to the same bits, for a fraction of the calls."""
+        path, end = input_response(self.plant, np.concatenate([by_axis(self.plant, each) for each in inputs]))
         # Column by column, so that the products lie in memory as they are summed.
         columns = [stacked.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
         mean, slope, square = (
@@ -144,7 +149,12 @@ class ExposureModel:
             late = self.moved * self.last_response(end)
             mean, square = mean + late, square + late * late / self.moved
             slope = slope + late[..., None] * self.last_rows
-        return InputResponse(path=path, end=stacked.batch_last(end), mean=mean, slope=slope, square=square)
+        end = stacked.batch_last(end)
+        axes = self.plant.axes
+        return [
+            InputResponse(path=path[own], end=end[own], mean=mean[own], slope=slope[own], square=square[own])
+            for own in (slice(k * axes, (k + 1) * axes) for k in range(len(inputs)))
+        ]
 
     def last_response(self, end: FloatArray) -> FloatArray:
         """c_N, response of the outputs in the step after the last to that of the end state, (axes, n_outputs)."""

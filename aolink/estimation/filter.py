@@ -175,7 +175,7 @@ def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: F
     if max(transition.shape) > entries.MOST_ROWS:
         return Belief(mean, stacked.symmetric(stacked.congruence(transition, belief.covariance) + noise))
     P, Q = entries.unpack(belief.covariance), entries.unpack(noise)
-    covariance = entries.congruence(entries.unpack(transition), P, Q)
+    covariance = entries.congruence_by_numbers(transition.tolist(), P, Q)
     return Belief(mean, entries.pack(covariance, len(belief.covariance)))
 
 

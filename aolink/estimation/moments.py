@@ -22,6 +22,7 @@ from aolink.optics.kernel import kernel_moments
 from aolink.rig import Sensor
 
 FloatArray = NDArray[np.float64]
+Counts = NDArray[np.uint16] | FloatArray
 Flux = Literal["known", "measured"]
 
 # Where the flux is measured, its sd must be this many times smaller: a ratio's variance is not finite otherwise.
@@ -42,7 +43,7 @@ class Measurement:
     """False for axes of which nothing was measured, (axes,); None if there are none."""
 
 
-def raw_moments(sensor: Sensor, counts: NDArray[np.uint16], highest: int) -> FloatArray:
+def raw_moments(sensor: Sensor, counts: Counts, highest: int) -> FloatArray:
     """M_p = sum omega^p Y D for p = 0 .. highest, kernel included, (axes, pixels) -> (axes, highest + 1).
 
     Summed over whole numbers, counts times odd pixel coordinates, which floating point does without
@@ -50,7 +51,8 @@ def raw_moments(sensor: Sensor, counts: NDArray[np.uint16], highest: int) -> Flo
     """
     odd = 2.0 * np.arange(sensor.pixels) + 1 - sensor.pixels  # pixel centres from mid-field, in half pixels
     powers = odd[:, None] ** np.arange(highest + 1)
-    sums = counts.astype(np.float64) @ powers - sensor.black_level * powers.sum(axis=0)
+    # Contiguous in memory along the axes, so that what follows is fast for many of them.
+    sums = (powers.T @ counts.T.astype(np.float64, copy=False)).T - sensor.black_level * powers.sum(axis=0)
     half, centre = sensor.pixel_width / 2, sum(sensor.field) / 2
     about_centre: FloatArray = sums * (half ** np.arange(highest + 1) * sensor.pixel_width / sensor.counts_per_density)
     if centre == 0:
@@ -105,9 +107,7 @@ def without_kernel(kernel: FloatArray, highest: int) -> FloatArray:
     return np.asarray(np.linalg.inv(mixing))
 
 
-def measure_moments(
-    sensor: Sensor, counts: NDArray[np.uint16], orders: Sequence[int], flux: Flux = "known"
-) -> Measurement | str:
+def measure_moments(sensor: Sensor, counts: Counts, orders: Sequence[int], flux: Flux = "known") -> Measurement | str:
     """Moments of line-sensor frames without the kernel, y_p with E[y_p] = mean(theta^p).
 
     Parameters
@@ -131,7 +131,7 @@ def measure_moments(
 
 
 def with_shot_noise(
-    read: FloatArray, counts: NDArray[np.uint16], black_level: float, sums: Callable[[FloatArray], FloatArray]
+    read: FloatArray, counts: Counts, black_level: float, sums: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
     """Cov(M_p, M_q) by p + q with shot noise of the light as measured, (axes, 2 highest + 1).
 
@@ -170,8 +170,8 @@ def _is_covariance(noise: FloatArray) -> NDArray[np.bool_]:
 def _shot_sums(sensor: Sensor, light: FloatArray, highest: int) -> FloatArray:
     powers = sensor.centres[:, None] ** np.arange(highest + 1)
     scale = sensor.pixel_width / (sensor.counts_per_density * sensor.photoelectrons)
-    # Row by row: the bits of one product would depend on the number of rows.
-    return np.stack([row @ powers for row in light]) * scale
+    # A product for each row: the bits of one for all would depend on their number.
+    return np.asarray((np.ascontiguousarray(light)[:, None] @ powers)[:, 0] * scale)
 
 
 def moments_from_sums(
@@ -207,12 +207,20 @@ def moments_from_sums(
     )
 
 
-def spot_significance(sensor: Sensor, density: FloatArray) -> float:
-    """By how many standard deviations the light of the brightest stretch of a row stands out, over several lengths."""
-    light = np.concatenate([[0.0], np.cumsum(density)]) * sensor.pixel_width
-    lengths = [2**k for k in range(sensor.pixels.bit_length())]
-    sd = math.sqrt(effective_noise_density(sensor) * sensor.pixel_width)
-    return max(float((light[n:] - light[:-n]).max()) / (sd * math.sqrt(n)) for n in lengths if n <= sensor.pixels)
+def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
+    """By how many standard deviations the light of each row's brightest stretch stands out, over several lengths.
+
+    Densities (n, pixels) -> (n,).
+    """
+    light = np.zeros((sensor.pixels + 1, len(density)))
+    if len(density) < sensor.pixels:
+        np.cumsum(density.T, axis=0, out=light[1:])
+    else:  # the same sums; NumPy's own are slow across long rows
+        for k in range(sensor.pixels):
+            np.add(light[k], density[:, k], out=light[k + 1])
+    lengths = [2**k for k in range(sensor.pixels.bit_length()) if 2**k <= sensor.pixels]
+    gained = [(light[n:] - light[:-n]).max(axis=0) / math.sqrt(n) for n in lengths]
+    return np.asarray(np.max(gained, axis=0) * math.sqrt(sensor.pixel_width / effective_noise_density(sensor)))
 
 
 def least_significance(sensor: Sensor) -> float:
@@ -241,4 +249,4 @@ def shift_matrix(centre: float, highest: int) -> FloatArray:
 
 def recombine(moments: FloatArray, matrix: FloatArray) -> FloatArray:
     """matrix @ moments for each axis, in elementwise operations."""
-    return np.stack([sum(row[k] * moments[:, k] for k in range(len(row))) for row in matrix], axis=1)
+    return np.stack([sum(row[k] * moments[:, k] for k in range(len(row))) for row in matrix]).T

@@ -90,6 +90,8 @@ class PathMoments:
             innovation = measured.value - entries.pack_vector(h, axes)
             return corrected(prior, innovation, entries.pack(H, axes), measured.covariance, self.gain)
         innovations = [y - expected for y, expected in zip(entries.columns(measured.value), h, strict=True)]
+        if self.gain is None and len(H) == model.plant.n_states == 2:
+            return _corrected_two(prior, innovations, H, measured.covariance)
         return _corrected_small(prior, innovations, H, measured.covariance, self.gain)
 
 
@@ -126,12 +128,12 @@ def _moment_entries(
     for o in range(model.plant.n_outputs):
         if 1 in orders:
             mean_row = model.mean_row[o].tolist()
-            moments.append(entries.dot(mean_row, x) + response.mean[:, o])
+            moments.append(entries.dot(mean_row, x) + entries.columns(response.mean)[o])
             slopes.append(mean_row)
         if 2 in orders:
             slope = entries.columns(response.slope[:, o])
             half = entries.add(_times_state(model.quadratic[o], state), slope)
-            moments.append(entries.dot(x, entries.add(half, slope)) + response.square[:, o])
+            moments.append(entries.dot(x, entries.add(half, slope)) + entries.columns(response.square)[o])
             slopes.append([2 * each for each in half])
     for o, p in itertools.combinations(range(model.plant.n_outputs), 2) if crosses else ():
         # mean (a'x + c)(b'x + d) = x'M_ab x + (b_ad + b_bc)'x + s_cd
@@ -183,9 +185,51 @@ def _corrected_small(
     keep = entries.one_minus(entries.times_transposed(K, entries.transpose(H)))
     from_noise = entries.symmetric_times_transposed(entries.times_transposed(K, noise), K)
     covariance = entries.congruence(keep, P, from_noise)
-    nis = np.asarray(entries.dot(innovation, entries.times_vector(S_inverse, innovation)))
+    nis = entries.dot(innovation, entries.times_vector(S_inverse, innovation))
     after = Belief(entries.pack_vector(mean, axes), entries.pack(covariance, axes))
-    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), nis)
+    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), entries.pack_one(nis, axes))
+
+
+def _corrected_two(prior: Belief, innovation: list[Entry], H: entries.Matrix, R: FloatArray) -> Correction:
+    """`corrected` for two states and two measurements, with the optimal gain.
+
+    With G = H' R^-1 H, (P^-1 + G)^-1 = (P + |P| adj G) |R| / |S|, |S| = |R| (1 + tr PG + |P| |G|): three quarters of
+    the arithmetic of Joseph's form, and as sure to be positive semidefinite, for nothing is subtracted from P.
+    """
+    dot, axes = entries.dot, len(prior.mean)
+    (p, q), (_, r) = entries.unpack(prior.covariance)
+    (noise, shared), (_, rest) = entries.unpack(R)
+    (f, g), (d, e) = H, innovation
+    together = bool(np.any(shared))
+    share = shared / noise if together else 0.0
+    if together:
+        # The second measurement without what its noise shares with the first's: G is then the sum of two dyads.
+        g = [second - share * first for first, second in zip(f, g, strict=True)]
+        e, rest = e - share * d, rest - share * shared
+    Pf, Pg = ([dot([p, q], h), dot([q, r], h)] for h in (f, g))
+    s, t, both = dot(f, Pf), dot(g, Pg) + rest, dot(f, Pg)
+    # Rounding may make it a little less than zero.
+    determinant: Entry = abs(p * r - q * q)  # type: ignore[assignment] # of either it is its own kind
+    root = f[0] * g[1] - f[1] * g[0]
+    inverse = entries.reciprocal(noise * t + s * rest + determinant * root * root)  # 1 / |S|
+    s = s + noise
+
+    rest_f, noise_g = [rest * each for each in f], [noise * each for each in g]
+    adjoint = [f[1] * rest_f[1] + g[1] * noise_g[1], -f[0] * rest_f[1] - g[0] * noise_g[1]]
+    adjoint.append(f[0] * rest_f[0] + g[0] * noise_g[0])
+    size, determinant = noise * rest * inverse, determinant * inverse
+    p, q, r = (size * old + determinant * each for old, each in zip((p, q, r), adjoint, strict=True))
+
+    # S^-1 and the gain P H' S^-1
+    s_inverse, t_inverse, off = t * inverse, s * inverse, both * inverse
+    gain = [[a * s_inverse - b * off, b * t_inverse - a * off] for a, b in zip(Pf, Pg, strict=True)]
+    mean = [x + dot(row, [d, e]) for x, row in zip(entries.columns(prior.mean), gain, strict=True)]
+    nis = d * (s_inverse * d - 2.0 * (off * e)) + e * (t_inverse * e)
+    if together:
+        both, t = both + share * s, t + share * (2.0 * both + share * s)
+    S = [[s, both], [both, t]]
+    after = Belief(entries.pack_vector(mean, axes), entries.pack([[p, q], [q, r]], axes))
+    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), entries.pack_one(nis, axes))
 
 
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:

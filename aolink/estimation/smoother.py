@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from aolink.errors import EstimatorError
 from aolink.estimation import stacked
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.exposure_model import by_axis, exposure_model, path_from_coefficients
+from aolink.estimation.exposure_model import by_axis
 from aolink.exposure import Exposure
 from aolink.plant import input_response, lift
 from aolink.rig import Plant
@@ -66,7 +66,7 @@ def _corrected(
     plant: Plant, exposure: Exposure, estimate: Estimate, next_exposure: Exposure, later: Estimate
 ) -> Estimate:
     """An estimate of the filter with what is known of the next exposure's start from all that came later."""
-    model = exposure_model(plant, exposure.n_steps, exposure.start_offset)
+    model = estimate.model
     z, P = estimate.coefficients, estimate.coefficient_covariance
     end, P_end = estimate.end_state, estimate.end_covariance
     E = model.transition if z.shape[1] == plant.n_states else model.end_rows
@@ -85,11 +85,10 @@ def _corrected(
     to_next = stacked.transpose(transition @ E)
     z, P = corrected(z, P, stacked.matmul(P, np.broadcast_to(to_next, (len(P), *to_next.shape))))
     end, P_end = corrected(end, P_end, stacked.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)))
-    path, path_sd = path_from_coefficients(model, z, P, exposure.inputs)
     n = plant.n_states
     return replace(
         estimate, start_state=z[:, :n], start_covariance=P[:, :n, :n], end_state=end, end_covariance=P_end,
-        coefficients=z, coefficient_covariance=P, path=path, path_sd=path_sd,
+        coefficients=z, coefficient_covariance=P,
     )  # fmt: skip
 
 

@@ -10,9 +10,12 @@ error functions, of a wider kernel. So the linear regression of y on the coeffic
 window drawn tighter each time.
 
 Omega depends on the state, which hardly changes from frame to frame on a plant that remembers: its errors
-do not average out as independent ones would. It is therefore weighted with (1 + rho)/(1 - rho), rho the
-largest eigenvalue of A^N, as the variance of a mean of errors that are correlated by rho. Without that, a
-filter that follows a resonance believes in one of several phases that the blur cannot tell apart.
+do not average out as independent ones would. It is therefore weighted with (1 + rho)/(1 - rho), as the
+variance of a mean of errors that are correlated by rho. Without that, a filter that follows a resonance
+believes in one of several phases that the blur cannot tell apart. What correlates them is the plant, the
+largest eigenvalue of A^N, where the frames say little; where they say much an error goes on by A^N (I - K H) only,
+as far as that is linear. rho is the geometric mean of both: the first alone wastes what frames say, the
+second is too sure where the blur has several readings.
 """
 
 from __future__ import annotations
@@ -132,9 +135,9 @@ class Windowed(ABC, Generic[Light]):
 
     def correct(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes, memory = _nodes(model, response, self.most_nodes), _memory(model)
+        nodes = _nodes(model, response, self.most_nodes)
         parts = [
-            self._correct(memory, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
+            self._correct(model, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
         ]
         if len(parts) == 1:
@@ -142,16 +145,20 @@ class Windowed(ABC, Generic[Light]):
         joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
         return Correction(Belief(joined[0], joined[1]), *joined[2:])
 
-    def _correct(self, memory: float, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
-        about = prior
-        for _ in range(_PASSES):
+    def _correct(self, model: ExposureModel, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
+        about, rho = prior, np.full(len(prior.mean), _slowest(model.transition[None])[0])
+        memory = _memory(rho)
+        for to_come in reversed(range(_PASSES)):
             y, noise, fit = self.look(nodes, about, measured)
             if self.flux == "measured":
                 light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, self._lights].min(axis=1)
                 y, noise, fit = self._ratios(y, noise, fit)
             innovation = y - fit.expected - stacked.matvec(fit.slope, prior.mean - about.mean)
-            done = corrected(prior, innovation, fit.slope, noise + memory * fit.remainder)
+            R = noise + memory[:, None, None] * fit.remainder
+            done = corrected(prior, innovation, fit.slope, R)
             about = done.posterior
+            if to_come:
+                memory = _memory(np.sqrt(rho * _slowest(_closed_loop(model, prior, fit.slope, R))))
         # The spread to expect of this one innovation is without the memory.
         HP = stacked.matmul(fit.slope, prior.covariance)
         S = stacked.symmetric(stacked.matmul(HP, stacked.transpose(fit.slope)) + noise + fit.remainder)
@@ -361,6 +368,22 @@ def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
     return (after.mean, after.covariance, *rest)
 
 
-def _memory(model: ExposureModel) -> float:
-    rho = float(np.abs(np.linalg.eigvals(model.transition)).max())
-    return min(_MOST_MEMORY, (1 + rho) / max(1 - rho, 1e-9))
+def _slowest(transition: FloatArray) -> FloatArray:
+    """Modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
+    finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
+    # What is not finite is refused by the filter; here it must only not stop the others.
+    return np.asarray(np.abs(np.linalg.eigvals(np.where(finite, transition, 0.0))).max(axis=1))
+
+
+def _memory(rho: FloatArray) -> FloatArray:
+    """Variance of a mean of errors with this correlation from frame to frame, over that of independent ones."""
+    return np.asarray(np.minimum(_MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
+
+
+def _closed_loop(model: ExposureModel, prior: Belief, H: FloatArray, R: FloatArray) -> FloatArray:
+    """How an error of the start state goes on to the next exposure's, A (I - K H), (axes, n_states, n_states)."""
+    n = len(model.transition)
+    PH = stacked.matmul(prior.covariance, stacked.transpose(H))
+    K = stacked.matmul(PH, stacked.inverse(stacked.symmetric(stacked.matmul(H, PH)) + R))
+    kept = np.eye(prior.mean.shape[1])[:, :n] - stacked.matmul(K, H[:, :, :n])
+    return stacked.matmul(np.broadcast_to(model.end_rows, (len(kept), *model.end_rows.shape)), kept)

@@ -53,20 +53,6 @@ class SpotWindows:
         return SpotWindows(density=self.density[axes], mask=self.mask[axes])
 
 
-@dataclass(frozen=True, eq=False)
-class _Expectations:
-    """E[f] and its derivatives by where the spot is, for each sum of each spot at each node."""
-
-    value: FloatArray
-    """(axes, spots, nodes, m)"""
-    first: FloatArray
-    """By x and y, (axes, spots, nodes, 2, m)."""
-    second: FloatArray
-    """(axes, spots, nodes, 2, 2, m)"""
-    third: FloatArray
-    """(axes, spots, nodes, 2, 2, 2, m)"""
-
-
 class WindowedSpots(Windowed[SpotWindows]):
     """Windowed moments of all spots that one copy of the plant moves.
 
@@ -137,8 +123,10 @@ class WindowedSpots(Windowed[SpotWindows]):
             out.append(np.stack(functions, axis=1).reshape(*mean.shape[:2], len(self.orders), -1))
         return out[0], out[1]
 
-    def expectations(self, along: FloatArray, across: FloatArray, mean: FloatArray, own: FloatArray) -> _Expectations:
-        """E[f] and its derivatives under the prior.
+    def expectations(
+        self, along: FloatArray, across: FloatArray, mean: FloatArray, own: FloatArray
+    ) -> list[FloatArray]:
+        """Expectations of the sums and of their derivatives by where the spot is, under the prior.
 
         Parameters
         ----------
@@ -146,6 +134,11 @@ class WindowedSpots(Windowed[SpotWindows]):
             (axes, spots, m, pixels)
         mean, own:
             Mean and covariance of a spot at a node, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, 2).
+
+        Returns
+        -------
+        Of order n, n from 0 to 3, the derivatives by x (n - i) times and by y i times, i from 0 to n:
+        (axes, spots, nodes, n + 1, m).
         """
         kernel, edges = self.sensor.kernel.covariance, self.sensor.profile.edges
         variance = np.maximum(np.einsum("askdd->askd", own), 0.0)
@@ -160,14 +153,7 @@ class WindowedSpots(Windowed[SpotWindows]):
             terms = min(_TERMS, _HIGHEST + 1 - max(x, y))
             return np.asarray(sum(powers[j] * (A[j + x] * B[j + y]) for j in range(terms)))
 
-        def tensor(order: int) -> FloatArray:
-            kinds = [derivative(order - k, k) for k in range(order + 1)]
-            shape = (2,) * order
-            every = [kinds[sum(index)] for index in np.ndindex(shape)]
-            stack = np.stack(every, axis=3)
-            return stack.reshape(*stack.shape[:3], *shape, stack.shape[-1])
-
-        return _Expectations(derivative(0, 0), tensor(1), tensor(2), tensor(3))
+        return [np.stack([derivative(n - i, i) for i in range(n + 1)], axis=3) for n in range(4)]
 
     def regression(
         self, along: FloatArray, across: FloatArray, mean: FloatArray, spread: FloatArray, rows: FloatArray,
@@ -186,34 +172,28 @@ class WindowedSpots(Windowed[SpotWindows]):
         weights:
             Of the nodes, (nodes,).
         """
-        axes, spots, count, _ = mean.shape
-        f = self.expectations(along, across, mean, np.einsum("askdske->askde", spread))
-        size = f.value.shape[-1]
-
-        def weighted(tensor: FloatArray) -> FloatArray:
-            shape = (count, *(1,) * (tensor.ndim - 3))
-            return (tensor * weights.reshape(shape)).reshape(axes, spots, -1, size)
-
-        first, second, third = (stacked.transpose(weighted(t)) for t in (f.first, f.second, f.third))
+        axes, spots = mean.shape[:2]
+        value, *derivatives = (
+            each * weights[:, None, None]
+            for each in self.expectations(along, across, mean, np.einsum("askdske->askde", spread))
+        )
+        size = value.shape[-1]
+        first, second, third = (stacked.transpose(d.reshape(axes, spots, -1, size)) for d in derivatives)
         of_spot = rows.reshape(spots, -1, rows.shape[-1])
         slope = stacked.matmul(first, np.broadcast_to(of_spot, (axes, *of_spot.shape)))
         remainder = np.empty((axes, spots, size, spots, size))
-        # Mehler again, between two spots at two nodes: the j-th derivatives meet over the j-th power of C, over j!.
         for s in range(spots):
             for t in range(s, spots):
                 C = spread[:, s, :, :, t]
-                square = np.einsum("akdle,akflg->akdfleg", C, C)
-                cube = np.einsum("akdfleg,akhlm->akdfhlegm", square, C).reshape(axes, count * 8, count * 8)
-                square = square.reshape(axes, count * 4, count * 4)
                 block = sum(
-                    stacked.matmul(stacked.matmul(each[:, s], power), stacked.transpose(each[:, t])) / factor
-                    for each, power, factor in ((second, square, 2), (third, cube, 6))
+                    stacked.matmul(stacked.matmul(each[:, s], _meetings(C, n)), stacked.transpose(each[:, t]))
+                    for n, each in ((2, second), (3, third))
                 )
                 remainder[:, s, :, t] = block
                 remainder[:, t, :, s] = stacked.transpose(np.asarray(block))
-        joined = remainder.reshape(axes, spots * size, spots * size)
-        expected = (f.value * weights[:, None]).sum(axis=2).reshape(axes, -1)
-        return Regression(expected, slope.reshape(axes, spots * size, -1), stacked.symmetric(joined))
+        joined = stacked.symmetric(remainder.reshape(axes, spots * size, spots * size))
+        expected = value.sum(axis=2).reshape(axes, -1)
+        return Regression(expected, slope.reshape(axes, spots * size, -1), joined)
 
     def measured(self, along: FloatArray, across: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The weighted sums, (axes, spots * m), and their noise, which spots do not share, (axes, ., .)."""
@@ -224,3 +204,38 @@ class WindowedSpots(Windowed[SpotWindows]):
         for k in range(spots):
             joint[:, k, :, k] = noise[:, k]
         return y.reshape(axes, -1), joint.reshape(axes, spots * size, spots * size)
+
+
+def _meetings(C: FloatArray, order: int) -> FloatArray:
+    """Mehler between two spots at each two nodes: how the n-th derivatives of the one meet those of the other.
+
+    Cov(f, f') has, for each n, the sum over all ways to pair n derivatives by x or y of f with n of f', of the
+    product of the pairs' covariances, over n!.
+
+    Parameters
+    ----------
+    C:
+        Covariance of the two spots' positions, (axes, nodes, 2, nodes, 2).
+
+    Returns
+    -------
+    (axes, nodes * (n + 1), nodes * (n + 1)), derivatives in the order of `WindowedSpots.expectations`.
+    """
+    axes, nodes, _, others, _ = C.shape
+    # By the pair's two directions, to the powers from 0.
+    powers: list[list[FloatArray | float]] = []
+    for a, b in ((1, 1), (1, 0), (0, 1), (0, 0)):
+        each: list[FloatArray | float] = [1.0, np.ascontiguousarray(C[:, :, a, :, b])]
+        for _ in range(1, order):
+            each.append(each[-1] * each[1])
+        powers.append(each)
+    out = np.empty((axes, nodes, order + 1, others, order + 1))
+    for i in range(order + 1):
+        for j in range(order + 1):
+            total: FloatArray | float = 0.0
+            for both in range(max(0, i + j - order), min(i, j) + 1):
+                pairs = (both, i - both, j - both, order - i - j + both)
+                yy, yx, xy, xx = (each[k] for each, k in zip(powers, pairs, strict=True))
+                total += (yy * xx) * (yx * xy) / math.prod(math.factorial(k) for k in pairs)
+            out[:, :, i, :, j] = total
+    return out.reshape(axes, nodes * (order + 1), others * (order + 1))

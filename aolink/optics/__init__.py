@@ -1,1 +1,1 @@
-"""Optics: image kernels on pixels, and the camera's counts."""
+"""Optics: image kernels on pixels and the camera's counts; lenslets, mirror, turbulence; spots, slopes, wavefront."""

@@ -21,7 +21,7 @@ def to_counts(sensor: BaseSensor, density: FloatArray) -> NDArray[np.uint16]:
     return np.clip(counts, 0, sensor.full_scale).astype(np.uint16)
 
 
-def to_density(sensor: BaseSensor, counts: NDArray[np.uint16]) -> FloatArray:
+def to_density(sensor: BaseSensor, counts: NDArray[np.uint16] | FloatArray) -> FloatArray:
     """The density that counts stand for; noise makes it negative where nothing shines."""
     return (counts.astype(np.float64) - sensor.black_level) / sensor.counts_per_density
 

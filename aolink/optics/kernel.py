@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.rig import Kernel
+from aolink.sensor import Kernel
 
 FloatArray = NDArray[np.float64]
 

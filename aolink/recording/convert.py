@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.errors import RecordingError
-from aolink.estimation import ExposureModel, path_from_coefficients
+from aolink.estimation import ExposureModel
 from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure, Truth
 from aolink.recording import schemas_pb2 as pb
@@ -102,11 +102,10 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
 
 
 def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: Exposure) -> Estimate:
-    """Inverse of `estimate_message`; the path is expanded with the inputs of its exposure."""
+    """Inverse of `estimate_message`; the path is that of the inputs of its exposure."""
     axes, n, c, m = message.axes, message.n_states, message.n_coefficients, message.n_measurements
     coefficients = _array(message.coefficients, axes, c)
     covariance = _array(message.coefficient_covariance, axes, c, c)
-    path, path_sd = path_from_coefficients(model, coefficients, covariance, exposure.inputs)
     return Estimate(
         estimator=message.estimator,
         frame_id=message.frame_id,
@@ -120,8 +119,8 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         end_covariance=_array(message.end_covariance, axes, n, n),
         coefficients=coefficients,
         coefficient_covariance=covariance,
-        path=path,
-        path_sd=path_sd,
+        inputs=exposure.inputs,
+        model=model,
         innovation=_array(message.innovation, axes, m),
         innovation_covariance=_array(message.innovation_covariance, axes, m, m),
         nis=_array(message.nis, axes),

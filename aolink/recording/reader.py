@@ -234,16 +234,20 @@ class Recording:
                 return rig_texts.get(topics.RIG_ATTACHMENT, rig_texts.get(topics.RIG_METADATA))
         ids: dict[int, str] = {}
         names: dict[int, int] = {}
-        for record in self._scanned():
+        for record, sure in self._scanned():
             if isinstance(record, McapMessage):
                 names[record.channel_id] = names.get(record.channel_id, 0) + 1
                 self.start_ns = min(self.start_ns or record.log_time, record.log_time)
                 self.end_ns = max(self.end_ns, record.log_time)
             elif isinstance(record, Schema):
-                ids[record.id] = record.name
-                self.schemas[record.name] = record
+                if sure or record.id not in ids:
+                    ids[record.id] = record.name
+                    self.schemas[record.name] = record
             elif isinstance(record, Channel):
-                self._channels[record.id] = (record.topic, ids.get(record.schema_id, ""))
+                before = self._channels.get(record.id)
+                if sure or before is None:  # its schema may have been in a chunk that is lost
+                    kind = ids.get(record.schema_id, before[1] if before else "")
+                    self._channels[record.id] = (record.topic, kind)
             else:
                 self._note(record, rig_texts)
         for channel_id, count in names.items():
@@ -269,7 +273,8 @@ class Recording:
     def _records(self, channels: Container[int], low: int, high: int) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""
         if self._index is None:
-            yield from self._scanned()
+            for record, _ in self._scanned():
+                yield record
             return
         with open_recording(self.path) as file:
             for index in self._index:
@@ -280,7 +285,7 @@ class Recording:
                     continue
                 yield from chunk_at(file, index, self._lose)
 
-    def _scanned(self) -> Iterator[McapRecord]:
+    def _scanned(self) -> Iterator[tuple[McapRecord, bool]]:
         with open_recording(self.path) as file:
             yield from scan(file, self._lose)
 

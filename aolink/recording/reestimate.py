@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import fields
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
+from aolink.estimation.estimate import COMPARED
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.reader import Recording
@@ -36,8 +36,8 @@ def reestimated(
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
     """The same exposure by exposure, estimates in the order of ``names``; nothing of it stays in memory."""
     driver = Driver(recording.rig, names, engine)
-    for number, exposure in enumerate(recording.exposures(), 1):
-        yield exposure, driver.step(exposure)
+    for number, done in enumerate(driver.steps(recording.exposures()), 1):
+        yield done
         progress(number)
 
 
@@ -133,12 +133,12 @@ def first_difference(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> st
     if len(ours) != len(theirs):
         return f"{len(ours)} estimates against {len(theirs)}"
     for mine, other in zip(ours, theirs, strict=True):
-        for field in fields(Estimate):
-            a, b = getattr(mine, field.name), getattr(other, field.name)
+        for name in COMPARED:
+            a, b = getattr(mine, name), getattr(other, name)
             if isinstance(a, np.ndarray):
                 same = a.shape == b.shape and a.tobytes() == b.tobytes()
             else:
                 same = a == b
             if not same:
-                return f"frame {mine.frame_id}: {field.name} differs"
+                return f"frame {mine.frame_id}: {name} differs"
     return None

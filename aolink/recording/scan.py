@@ -51,8 +51,8 @@ _CHUNK_HEAD = struct.Struct("<QQQII")
 _FOOTER_BYTES = _HEAD.size + 20 + len(_MAGIC)
 _SEARCH_BYTES = 1 << 20
 _COMPRESSIONS = (b"lz4", b"zstd", b"")
-_CANDIDATE = re.compile(rb"[\x06\x0f].{4}\x00{4}", re.DOTALL)
-"""A chunk (6) or the end of the data (15), with a length below 4 GiB."""
+_CANDIDATE = re.compile(rb"[\x06\x0f].{4}\x00{4}|\x0c.{4}\x00{4}.\x00{3}aolink", re.DOTALL)
+"""A chunk (6), the end of the data (15) or metadata of ours (12), with a length below 4 GiB."""
 
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
@@ -182,8 +182,11 @@ def _parse_summary(data: bytes) -> Summary | None:
     return summary
 
 
-def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[McapRecord]:
-    """Every whole record of a file from its start to its footer, those in chunks too; losses go to ``on_loss``."""
+def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[McapRecord, bool]]:
+    """Every whole record of a file from its start to its index, those in chunks too; losses go to ``on_loss``.
+
+    With each record, whether a checksum says that it is what was written.
+    """
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     if file.read(len(_MAGIC)) != _MAGIC:
@@ -195,7 +198,7 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[McapRecor
         length = _HEAD.unpack(head)[1] if len(head) == _HEAD.size else 0
         end = position + _HEAD.size + length
         if len(head) < _HEAD.size or end > size or not _is_plausible(head[0], length, file):
-            found = _next_chunk(file, position + 1, size)
+            found = end if _begins_a_record(file, end, size) else _next_chunk(file, position + 1, size)
             if found is None:
                 on_loss(
                     Loss(
@@ -212,14 +215,14 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[McapRecor
             end = _next_chunk(file, position + 1, size, before=end) or end
             on_loss(replace(lost[0], length=end - position))
         elif isinstance(record, Chunk):
-            yield from broken_up(record, position, on_loss)
+            yield from ((each, True) for each in broken_up(record, position, on_loss))
         elif record is not None:
-            yield record
+            yield record, False
         position = end
         file.seek(position)
-        if isinstance(record, Footer):
-            if file.read(len(_MAGIC)) != _MAGIC:
-                on_loss(Loss(end, size - end, "it was cut off at its very end"))
+        if head[0] == Opcode.DATA_END:
+            if read_summary(file) is None:
+                on_loss(Loss(end, size - end, "its index is damaged or was cut off"))
             return
     on_loss(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
 
@@ -289,8 +292,15 @@ def _is_plausible(opcode: int, length: int, file: IO[bytes]) -> bool:
     return opcode in _KNOWN and length <= MAX_RECORD and _LENGTHS.get(opcode, length) == length
 
 
+def _begins_a_record(file: IO[bytes], position: int, size: int) -> bool:
+    """Whether what stands at a position can be the next record: only its kind is damaged then, not its length."""
+    file.seek(min(position, size))
+    head = file.read(_HEAD.size)
+    return len(head) == _HEAD.size and _is_plausible(head[0], _HEAD.unpack(head)[1], file)
+
+
 def _next_chunk(file: IO[bytes], position: int, size: int, before: int | None = None) -> int | None:
-    """Where the next whole chunk, or the end of the data, begins; None if that is not ``before`` a byte."""
+    """Where the next whole chunk, metadata or the end of the data begins; None if that is not ``before`` a byte."""
     before = size if before is None else before
     while position < before:
         file.seek(position)
@@ -300,8 +310,8 @@ def _next_chunk(file: IO[bytes], position: int, size: int, before: int | None = 
             if at >= min(_SEARCH_BYTES, before - position):
                 break
             opcode, length = _HEAD.unpack_from(block, at)
-            if opcode == Opcode.DATA_END:
-                if length == 4:
+            if opcode != Opcode.CHUNK:
+                if length == 4 or opcode == Opcode.METADATA:
                     return position + at
             elif length <= MAX_RECORD and position + at + length <= size and _is_chunk_head(block[at:], length):
                 return position + at

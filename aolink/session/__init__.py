@@ -19,7 +19,7 @@ from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
-from aolink.session.loop import Inputs, SessionLoop
+from aolink.session.loop import Inputs, SessionLoop, Watch
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.hub import Hub
@@ -85,6 +85,7 @@ def record(
     note: str = "",
     calibration: str = "",
     inputs: Inputs | None = None,
+    watch: Watch | None = None,
     overwrite: bool = False,
     options: WriteOptions | None = None,
     stop: Callable[[], bool] = lambda: False,
@@ -109,6 +110,8 @@ def record(
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
         What to command, instead of the rig's drive.
+    watch:
+        Told each exposure with its estimates, on the loop's own time.
     options:
         How the recording is cut into chunks and files.
     stop, progress:
@@ -143,7 +146,7 @@ def record(
         writer = RecordingWriter(
             path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, options=options
         )
-        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs)
+        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, watch)
         report = loop.report
         report.warnings += warnings
         try:

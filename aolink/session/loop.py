@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from aolink.assembly import Assembler, Frame
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
 from aolink.errors import DeviceError
-from aolink.estimation import Driver
+from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
@@ -47,6 +47,9 @@ _NOT_YET = 1 << 63
 Inputs = Callable[[int, int], NDArray[np.float64]]
 """First fast step since the session's start and number of steps -> what to command, (n_steps, n_inputs)."""
 
+Watch = Callable[[Exposure, Sequence[Estimate]], None]
+"""Told each exposure with its estimates; must not take time."""
+
 
 class SessionLoop:
     """One session, from the first command to the last frame."""
@@ -60,10 +63,12 @@ class SessionLoop:
         writer: RecordingWriter,
         driver: Driver,
         inputs: Inputs | None = None,
+        watch: Watch | None = None,
     ) -> None:
         self.report = Report(virtual_time=hub.virtual)
         self._rig, self._hub, self._camera, self._mirror = rig, hub, camera, mirror
         self._writer, self._driver = writer, driver
+        self._watch = watch
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
@@ -260,11 +265,14 @@ class SessionLoop:
 
     def _estimate(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
         for exposure in exposures:
-            for estimate in self._driver.step(exposure):
+            estimates = self._driver.step(exposure)
+            for estimate in estimates:
                 self._record(topics.estimate_topic(estimate.estimator), convert.estimate_message(estimate), log_time_ns)
             self.report.exposures += 1
             self._newest_frame = exposure.frame_id
             self._latencies.estimated(exposure.frame_id, self._hub.now_ns())
+            if self._watch is not None:
+                self._watch(exposure, estimates)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._record(topics.APPLIED, applied, receive_ns)

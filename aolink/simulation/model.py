@@ -13,6 +13,7 @@ from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.frame import frame_density
 from aolink.plant import psd_root
 from aolink.rig import Rig, load_rig
+from aolink.simulation.disturbance import DisturbancePlayer
 
 FloatArray = NDArray[np.float64]
 
@@ -35,8 +36,8 @@ class RigModel:
     """Plant, mirror and camera of a rig, advanced in fast steps.
 
     What comes out depends on the rig, the seed, the inputs and when the camera was started, and not on
-    how the steps are cut into calls of `advance`: initial state, process noise, read-out noise and
-    photo-electrons have random streams of their own, drawn in the order of time.
+    how the steps are cut into calls of `advance`: initial state, process noise, read-out noise,
+    photo-electrons and disturbance have random streams of their own, drawn in the order of time.
     """
 
     def __init__(self, rig: Rig, seed: int | None = None) -> None:
@@ -44,11 +45,15 @@ class RigModel:
         self.rig = rig
         self.step = 0
         """The next fast step."""
-        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(4)
-        initial, self._process_noise, self._pixel_noise, self._electrons = (np.random.default_rng(s) for s in seeds)
+        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(5)
+        initial, self._process_noise, self._pixel_noise, self._electrons, disturbed = map(np.random.default_rng, seeds)
         scatter = initial.standard_normal((plant.axes, plant.n_states, 1))
         self._state = plant.initial_mean + (psd_root(plant.initial_covariance) @ scatter)[..., 0]
         self._noise_input = plant.B_w @ psd_root(plant.process_noise)
+        self._disturbance = DisturbancePlayer(rig, disturbed) if rig.disturbance else None
+        if rig.disturbance and not rig.disturbance.plant_noise:
+            self._noise_input = np.zeros_like(self._noise_input)
+            self._state = np.tile(plant.initial_mean, (plant.axes, 1))
         self._frames = 0
         self._exposure: int | None = None  # first step of the exposure that runs, or of the next one
         self._exposures_left = 0
@@ -73,6 +78,8 @@ class RigModel:
         """Apply the mirror values ``u``, (k, axes * n_inputs), for k fast steps; the frames that end within them."""
         first, states = self.step, self._run(u)
         outputs = (self.rig.plant.C @ states[:-1, ..., None]).reshape(len(u), self.rig.n_outputs)
+        if self._disturbance is not None and len(u):
+            outputs = outputs + self._disturbance.slopes(first, len(u))
         self.step += len(u)
         frames: list[CameraFrame] = []
         while self._exposure is not None and self._exposure < self.step:
@@ -110,7 +117,7 @@ class RigModel:
         path, density = self._illuminate(path, end_state)
         if sensor.photoelectrons:
             density_of_one = shot_gain(sensor)
-            density = np.asarray(self._electrons.poisson(density / density_of_one) * density_of_one)
+            density = np.asarray(self._electrons.poisson(np.maximum(density, 0) / density_of_one) * density_of_one)
         noise = self._pixel_noise.standard_normal(sensor.shape)
         density = density + pixel_noise_sd(sensor) * noise
         return CameraFrame(

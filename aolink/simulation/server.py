@@ -26,7 +26,15 @@ from aolink.errors import PortError
 from aolink.rig import Faults, Rig
 from aolink.simulation.devices import Line, Outgoing, SimulatedDevices
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import DELIMITER, MESSAGE_OF_TYPE, PROTOCOL_VERSION, Packet, PacketDecoder, encode_message
+from aolink.wire.packet import (
+    DELIMITER,
+    PROTOCOL_VERSION,
+    MessageDecoder,
+    Packet,
+    PacketDecoder,
+    PacketType,
+    encode_packets,
+)
 
 VIRTUAL_EPOCH_NS = 1_767_225_600_000_000_000
 """Host time at which a virtual session begins: 2026-01-01 00:00 UTC, always the same."""
@@ -171,21 +179,20 @@ class LineEnd:
         self.unsent = bytearray()
         self._faults = faults
         self._decoder = PacketDecoder()
+        self._messages = MessageDecoder()
         self._sequence = 0
 
     def receive(self) -> list[tuple[Message | None, int]]:
-        """(message, sequence) of every packet that came; the message is None for a lost or damaged one."""
+        """(message, sequence) of every packet that came; the message is None for a lost, damaged or partial one."""
         received: list[tuple[Message | None, int]] = []
         # Piece by piece, so that every packet, damaged or not, is counted in its place.
         for piece in _pieces(self.stream.read()):
             before = self._decoder.seen
             packets = self._decoder.feed(piece)
             for packet in packets:
-                message = _parse(packet)
                 # Who is there is asked in real time, so again on a slow machine: faults begin after it.
-                if not isinstance(message, pb.Identify) and self._faults.loses_command():
-                    message = None
-                received.append((message, packet.sequence))
+                lost = packet.type != PacketType.IDENTIFY and self._faults.loses_command()
+                received.append((None if lost else self._parse(packet), packet.sequence))
             received.extend([(None, 0)] * (self._decoder.seen - before - len(packets)))
         return received
 
@@ -196,13 +203,22 @@ class LineEnd:
 
     def put(self, message: Message) -> None:
         """Queue a message for sending; `VirtualTime` is a side channel and is never damaged."""
-        packet = encode_message(message, self._sequence)
-        self._sequence = (self._sequence + 1) & 0xFFFF
-        if isinstance(message, pb.VirtualTime):
-            packet = DELIMITER + packet  # ends whatever damage is before it
-        elif not isinstance(message, pb.Identity):
-            packet = self._faults.damage(packet)
-        self.unsent += packet
+        for packet in encode_packets(message, self._sequence):
+            self._sequence = (self._sequence + 1) & 0xFFFF
+            if isinstance(message, pb.VirtualTime):
+                self.unsent += DELIMITER + packet  # ends whatever damage is before it
+            elif isinstance(message, pb.Identity):
+                self.unsent += packet
+            else:
+                self.unsent += self._faults.damage(packet)
+
+    def _parse(self, packet: Packet) -> Message | None:
+        if packet.version != PROTOCOL_VERSION:
+            return None
+        try:
+            return self._messages.take(packet)
+        except DecodeError:
+            return None
 
     def flush(self) -> None:
         """Send what the port takes now."""
@@ -371,13 +387,3 @@ def _pieces(data: bytes) -> list[bytes]:
     """Cut after every delimiter."""
     *whole, rest = data.split(DELIMITER)
     return [piece + DELIMITER for piece in whole] + ([rest] if rest else [])
-
-
-def _parse(packet: Packet) -> Message | None:
-    kind = MESSAGE_OF_TYPE.get(packet.type)
-    if kind is None or packet.version != PROTOCOL_VERSION:
-        return None
-    try:
-        return kind.FromString(packet.payload)
-    except DecodeError:
-        return None

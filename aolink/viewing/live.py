@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -68,6 +69,52 @@ class LiveView:
             log=False,
         )
         self._stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
+
+
+class Decimating:
+    """Shows on a thread of its own what it has time for; whoever hands over never waits.
+
+    Of what comes while it is busy it shows the newest, and counts the rest.
+    """
+
+    def __init__(self, view: LiveView) -> None:
+        self.skipped = 0
+        """Exposures that were not shown."""
+        self._view = view
+        self._next: tuple[Exposure, Sequence[Estimate]] | None = None
+        self._changed = threading.Condition()
+        self._closed = False
+        self._failed: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="aolink-viewer", daemon=True)
+        self._thread.start()
+
+    def show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
+        """Hand over the next exposure."""
+        with self._changed:
+            self.skipped += self._next is not None
+            self._next = (exposure, estimates)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Show what is waiting, and end. Raises what went wrong while showing."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+        if self._failed is not None:
+            raise ViewerError(f"the live view ended: {self._failed}") from self._failed
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._next is not None or self._closed)
+                waiting, self._next = self._next, None
+            if waiting is None:
+                return
+            try:
+                self._view.show(*waiting)
+            except Exception as error:  # a session must not end for its picture
+                self._failed = self._failed or error
 
 
 @contextmanager

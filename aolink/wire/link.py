@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from google.protobuf.message import DecodeError, Message
 
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import MESSAGE_OF_TYPE, PROTOCOL_VERSION, PacketDecoder, encode_message
+from aolink.wire.packet import PROTOCOL_VERSION, MessageDecoder, PacketDecoder, encode_packets
 from aolink.wire.port import Transport
 
 _REMEMBERED = 64
@@ -61,6 +61,7 @@ class Link:
         """Called before anything is sent; the hub keeps the lines in step with it on virtual time."""
         self._now_ns = now_ns
         self._decoder = PacketDecoder()
+        self._messages = MessageDecoder()
         self._next_sequence = 0
         self._last_sequence: int | None = None
         self._recent: deque[int] = deque(maxlen=_REMEMBERED)
@@ -71,18 +72,17 @@ class Link:
         self._decoder.bad_crc = self._decoder.bad_framing = 0
 
     def send(self, message: Message) -> int:
-        """Send a message; gives the sequence number of its packet. Raises PortError."""
+        """Send a message; gives the sequence number of its packet, or of its last part's. Raises PortError."""
         self.before_send()
         if isinstance(message, pb.Identify):
             self._next_sequence, self.sent_packets = 0, 0
-        sequence = self._next_sequence
-        data = encode_message(message, sequence)
-        self.transport.write(data)
-        self._next_sequence = (sequence + 1) & 0xFFFF
-        self.sent_packets += 1
-        self.counts.packets_sent += 1
-        self.counts.bytes_sent += len(data)
-        return sequence
+        for data in encode_packets(message, self._next_sequence):
+            self.transport.write(data)
+            self._next_sequence = (self._next_sequence + 1) & 0xFFFF
+            self.sent_packets += 1
+            self.counts.packets_sent += 1
+            self.counts.bytes_sent += len(data)
+        return (self._next_sequence - 1) & 0xFFFF
 
     def receive(self) -> list[Received]:
         """The messages that have come, without waiting, in order. Raises PortError."""
@@ -100,15 +100,14 @@ class Link:
             if self._is_duplicate(packet.sequence):
                 self.counts.duplicates += 1
                 continue
-            kind = MESSAGE_OF_TYPE.get(packet.type)
             try:
-                message = kind.FromString(packet.payload) if kind else None
+                message = self._messages.take(packet)
             except DecodeError:
-                message = None
-            if message is None:
                 self.counts.bad_payload += 1
                 continue
             self.counts.packets_received += 1
+            if message is None:  # more of it is to come
+                continue
             if isinstance(message, pb.VirtualTime):
                 self.handed = message
                 continue

@@ -244,6 +244,18 @@ class Event(_message.Message):
     text: str
     def __init__(self, level: _Optional[_Union[Event.Level, str]] = ..., device_ns: _Optional[int] = ..., text: _Optional[str] = ...) -> None: ...
 
+class Part(_message.Message):
+    __slots__ = ("type", "offset", "total", "data")
+    TYPE_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    TOTAL_FIELD_NUMBER: _ClassVar[int]
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    type: int
+    offset: int
+    total: int
+    data: bytes
+    def __init__(self, type: _Optional[int] = ..., offset: _Optional[int] = ..., total: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
+
 class TruthChunk(_message.Message):
     __slots__ = ("frame_id", "offset", "total", "data")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]

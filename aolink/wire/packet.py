@@ -2,7 +2,7 @@
 
 A packet is COBS([version u8 | type u8 | sequence u16 | payload | CRC-32 u32]) 0x00, little-endian, the
 CRC zlib's over everything before it. CRC-32 finds every burst of up to 32 bits and all but 2^-32 of
-other damage.
+other damage. A message that does not fit goes in parts, each in a packet of its own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import cache
 from importlib import resources
 
 from cobs import cobs
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 
 from aolink.wire import messages_pb2 as pb
 
@@ -25,7 +25,9 @@ PROTOCOL_VERSION = 1
 MAX_PAYLOAD = 4608
 """Bytes; 4 KiB of data and the fields around it."""
 MAX_CHUNK = 4096
-"""Bytes of data in one chunk of a frame."""
+"""Bytes of data in one chunk of a frame, and in one part of a message."""
+MAX_MESSAGE = 262_144
+"""Bytes of a message that comes in parts: a row of inputs and the limits of 10 000 of them."""
 _HEADER = struct.Struct("<BBH")
 _CRC = struct.Struct("<I")
 _MIN_DECODED = _HEADER.size + _CRC.size
@@ -49,6 +51,7 @@ class PacketType(IntEnum):
     CLOCK_QUERY = 10
     CLOCK_REPLY = 11
     EVENT = 12
+    PART = 13
     TRUTH_CHUNK = 120
     VIRTUAL_TIME = 121
 
@@ -66,6 +69,7 @@ MESSAGE_OF_TYPE: dict[int, type[Message]] = {
     PacketType.CLOCK_QUERY: pb.ClockQuery,
     PacketType.CLOCK_REPLY: pb.ClockReply,
     PacketType.EVENT: pb.Event,
+    PacketType.PART: pb.Part,
     PacketType.TRUTH_CHUNK: pb.TruthChunk,
     PacketType.VIRTUAL_TIME: pb.VirtualTime,
 }
@@ -91,10 +95,73 @@ def encode_packet(packet: Packet) -> bytes:
     return encoded + DELIMITER
 
 
+def encode_packets(message: Message, sequence: int) -> list[bytes]:
+    """The packets of this protocol version that carry ``message``, one or its parts, numbered from ``sequence`` on.
+
+    Raises ValueError if it is longer than `MAX_MESSAGE`.
+    """
+    type_, payload = TYPE_OF_MESSAGE[type(message)], message.SerializeToString()
+    if len(payload) <= MAX_PAYLOAD:
+        return [encode_packet(Packet(PROTOCOL_VERSION, type_, sequence, payload))]
+    total = len(payload)
+    if total > MAX_MESSAGE:
+        raise ValueError(f"a {type(message).__name__} of {total} bytes is too long, at most {MAX_MESSAGE}")
+    parts = [
+        pb.Part(type=type_, offset=offset, total=total, data=payload[offset : offset + MAX_CHUNK])
+        for offset in range(0, total, MAX_CHUNK)
+    ]
+    return [
+        encode_packet(Packet(PROTOCOL_VERSION, PacketType.PART, (sequence + k) & 0xFFFF, part.SerializeToString()))
+        for k, part in enumerate(parts)
+    ]
+
+
 def encode_message(message: Message, sequence: int) -> bytes:
-    """The bytes of a packet of this protocol version that carries ``message``."""
-    payload = message.SerializeToString()
-    return encode_packet(Packet(PROTOCOL_VERSION, TYPE_OF_MESSAGE[type(message)], sequence, payload))
+    """All bytes of `encode_packets`."""
+    return b"".join(encode_packets(message, sequence))
+
+
+class MessageDecoder:
+    """Packets, one after the other, become messages; it holds one message in parts at most."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._type = self._total = self._next_sequence = 0
+
+    def take(self, packet: Packet) -> Message | None:
+        """The message that a packet completes; None where more of it is to come.
+
+        Raises DecodeError for a payload that is no message, and for a part without those before it.
+        """
+        type_, payload = packet.type, packet.payload
+        if type_ == PacketType.PART:
+            part = pb.Part.FromString(payload)
+            if not self._append(part, packet.sequence):
+                self._data = bytearray()
+                raise DecodeError("a part that does not follow the one before, or of a message that cannot be")
+            if len(self._data) < part.total:
+                return None
+            type_, payload = part.type, bytes(self._data)
+        self._data = bytearray()
+        kind = MESSAGE_OF_TYPE.get(type_)
+        if kind is None:
+            raise DecodeError(f"there is no message of type {type_}")
+        return kind.FromString(payload)
+
+    def _append(self, part: pb.Part, sequence: int) -> bool:
+        """Whether a part goes on where the message is, or begins one."""
+        if part.offset == 0:
+            self._data, self._type, self._total = bytearray(), part.type, part.total
+        elif (part.type, part.total, sequence) != (self._type, self._total, self._next_sequence):
+            return False
+        end = part.offset + len(part.data)
+        if part.offset != len(self._data) or not part.data or part.type == PacketType.PART:
+            return False
+        if end > part.total or part.total > MAX_MESSAGE:
+            return False
+        self._data += part.data
+        self._next_sequence = (sequence + 1) & 0xFFFF
+        return True
 
 
 class PacketDecoder:

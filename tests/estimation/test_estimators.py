@@ -16,9 +16,11 @@ from aolink.estimation import (
     run,
     score,
 )
+from aolink.estimation.estimate import COMPARED
 from aolink.estimation.estimators import Options, measure
 from aolink.estimation.observation import PathMoments
 from aolink.plant import lift
+from aolink.recording.reestimate import first_difference
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
@@ -38,7 +40,9 @@ def estimates(rig, exposures):
 
 
 def arrays(estimate):
-    return {f.name: v for f in dataclasses.fields(estimate) if isinstance(v := getattr(estimate, f.name), np.ndarray)}
+    """All but the inputs, which are the exposure's."""
+    values = {name: getattr(estimate, name) for name in COMPARED if name != "inputs"}
+    return {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
 
 
 def assert_sound(estimate):
@@ -328,3 +332,29 @@ def test_a_frame_of_the_rig_has_its_moments(rig, exposures):
 def test_drivers_keep_the_order_of_their_names(rig, exposures):
     driver = Driver(rig, ["o3", "open-loop"])
     assert [e.estimator for e in driver.step(exposures[0])] == ["o3", "open-loop"]
+
+
+@pytest.mark.parametrize("flux", ["known", "measured"])
+@pytest.mark.parametrize("name", ["section-vi-lively", "sh-4x4"])
+def test_it_does_not_matter_how_many_exposures_are_handed_over_at_once(name, flux):
+    """1, 7 or all of them, damaged, blank and shorter ones among them: bit for bit."""
+    rig = load_rig(name)
+    count = 66 if name == "section-vi-lively" else 15
+    some = list(simulate(rig, count, seed=2))
+    dark = np.full(rig.sensor.shape, round(rig.sensor.black_level), np.uint16)
+    mask = np.ones(rig.sensor.shape, bool)
+    mask[0, 3] = False
+    some[3] = dataclasses.replace(some[3], pixels=dark)
+    some[5] = dataclasses.replace(some[5], mask=mask)
+    some[6] = dataclasses.replace(some[6], pixels=np.full(rig.sensor.shape, rig.sensor.full_scale, np.uint16))
+    some[12] = dataclasses.replace(some[12], n_steps=150, inputs=some[12].inputs[:150])
+    names = ("o1", "o3", "moments")
+    one_by_one, seven, at_once = Driver(rig, names), Driver(rig, names), Driver(rig, names)
+    for driver in (one_by_one, seven, at_once):
+        driver.estimators = [make_estimator(rig, each, flux=flux) for each in names]
+    sevens = (pair for k in range(0, count, 7) for pair in seven.steps(some[k : k + 7]))
+    for exposure, theirs, (same, ours) in zip(some, sevens, at_once.steps(iter(some)), strict=True):
+        assert same is exposure
+        expected = one_by_one.step(exposure)
+        assert first_difference(expected, ours) is None
+        assert first_difference(expected, theirs[1]) is None

@@ -347,3 +347,28 @@ def test_written_out_it_is_the_correction_in_matrices(gain):
     np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, rtol=1e-7, atol=1e-11)
     np.testing.assert_allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-9)
     np.testing.assert_allclose(ours.nis, theirs.nis, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("rank", "first", "correlation"),
+    [*((rank, 2.0, correlation) for rank in (0, 1, 2) for correlation in (0.0, 0.9)), (1, 0.0, 0.0), (2, 0.0, 0.0)],
+)
+@pytest.mark.parametrize("one_noise", [True, False])
+def test_the_short_correction_is_josephs(rank, first, correlation, one_noise):
+    """Two states, two measurements: singular priors, correlated noise or none, one for all axes or one for each."""
+    rng, axes = np.random.default_rng(3), 500
+    model = exposure_model(dataclasses.replace(PLANT, axes=axes), N)
+    response = model.response(rng.normal(0, 0.01, (N, axes)))
+    root = rng.standard_normal((axes, 2, rank))
+    prior = Belief(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2))
+    noise = 1e-3 * np.array([[first, correlation], [correlation, 1.0]])
+    noises = np.broadcast_to(noise, (axes, 2, 2)) if one_noise else noise * rng.uniform(0.5, 2, (axes, 1, 1))
+    moments = rng.standard_normal((axes, 2))
+    ours = PathMoments(1, (1, 2)).correct(model, response, prior, Measurement(value=moments, covariance=noises))
+    h, H = predicted_moments(model, response, prior.mean, (1, 2))
+    josephs = corrected(prior, moments - h, H, noises)
+    np.testing.assert_allclose(ours.posterior.mean, josephs.posterior.mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(ours.posterior.covariance, josephs.posterior.covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(ours.innovation_covariance, josephs.innovation_covariance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ours.nis, josephs.nis, rtol=1e-7)
+    assert np.linalg.eigvalsh(ours.posterior.covariance).min() > -1e-12

@@ -10,11 +10,13 @@ import pytest
 from aolink.estimation import run
 from aolink.estimation.estimate import Status
 from aolink.estimation.moments import measure_moments, spot_significance
+from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.score import score
-from aolink.estimation.spots import brightest_stretch, centroid_noise, measure_spots, profiles
+from aolink.estimation.spots import centroid_noise, measure_spots, profiles, windows
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, to_counts, to_density
 from aolink.optics.frame import frame_density
+from aolink.optics.plane import kernel_covariance
 from aolink.rig import Plant, Rig, SpotSensor, load_rig
 from aolink.simulation.model import simulate
 
@@ -65,6 +67,48 @@ def test_a_profiles_noise_is_that_of_its_line_sensor(sensor):
         noise = to_density(line, found[:, direction]) - truth
         assert noise.var() == pytest.approx(effective_noise_density(line) / line.pixel_width, rel=0.03)
         assert abs(noise.mean()) < 5 * noise.std() / np.sqrt(noise.size)
+
+
+@pytest.mark.parametrize(("grid", "window"), [((2, 3), 5), ((1, 2), 256), ((30, 30), 16)])
+def test_profiles_are_the_sums_in_whole_numbers(grid, window):
+    """Up to the brightest window that a rig file takes, whose sums single precision just holds."""
+    sensor, rng = replace(SENSOR, grid=grid, window=(window, window)), np.random.default_rng(1)
+    pixels = rng.integers(60_000, 65_536, sensor.shape).astype(np.uint16)
+    pixels[:, :window] = 65_535
+    usable = np.ones(sensor.shape, dtype=bool)
+    usable[1, 2] = False
+    each, good = windows(sensor, pixels.astype(np.int64)), windows(sensor, usable)
+    sums = np.stack([each.sum(axis=1), each.sum(axis=2)], axis=1).reshape(-1, window)
+    mask = np.stack([good.all(axis=1), good.all(axis=2)], axis=1).reshape(-1, window)
+    found = profiles(sensor, pixels, usable)
+    assert np.array_equal(found.counts, np.where(mask, sums, 0))
+    assert np.array_equal(found.mask, mask)
+    assert np.array_equal(profiles(sensor, pixels, np.ones_like(usable)).counts, sums)
+
+
+@pytest.mark.parametrize("flux", ["known", "measured"])
+def test_moments_of_spots_are_those_of_the_plane_without_its_cross_terms(exposures, flux):
+    measured, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels, (1, 2), flux)
+    edges, orders = SENSOR.profile.edges, [(1, 0), (2, 0), (0, 1), (0, 2)]
+    density = windows(SENSOR, to_density(SENSOR, exposures[0].pixels))
+    kernel, noise = kernel_covariance(SENSOR.kernel.sigma * np.eye(2)), effective_noise_density(SENSOR)
+    theirs = measure_moments_2d(density, edges, edges, kernel, noise, orders, flux)
+    np.testing.assert_allclose(measured.value.reshape(16, 4), theirs.value, atol=1e-12)
+    for direction, block in enumerate((slice(0, 2), slice(2, 4))):
+        expected = theirs.covariance[:, block, block]
+        np.testing.assert_allclose(measured.covariance[direction::2], expected, rtol=1e-9, atol=1e-18)
+
+
+@pytest.mark.parametrize("photoelectrons", [0.0, 300.0])
+@pytest.mark.parametrize("flux", ["known", "measured"])
+def test_a_spots_moments_do_not_depend_on_those_beside_it(exposures, flux, photoelectrons):
+    few = replace(SENSOR, grid=(1, 4), photoelectrons=photoelectrons)
+    many = replace(SENSOR, photoelectrons=photoelectrons)
+    pixels = exposures[3].pixels
+    whole, _ = measured_of(many, RIG.plant, pixels, flux=flux)
+    part, _ = measured_of(few, replace(RIG.plant, axes=8), pixels[:24], flux=flux)
+    assert np.array_equal(part.value, whole.value[:8])
+    assert np.array_equal(part.covariance, whole.covariance[:8])
 
 
 @pytest.mark.parametrize("flux", ["known", "measured"])
@@ -121,8 +165,14 @@ def test_a_coupled_plant_is_estimated_better_than_by_prediction():
 def test_the_significance_of_many_profiles_is_that_of_each():
     line, rng = SENSOR.profile, np.random.default_rng(5)
     density = rng.standard_normal((20, line.pixels))
-    each = [spot_significance(line, row) for row in density]
-    np.testing.assert_allclose(brightest_stretch(line, density), each)
+    each = []
+    for row in density:
+        stretches = [(row[k : k + n], n) for n in (1, 2, 4, 8, 16) for k in range(line.pixels - n + 1)]
+        sd = np.sqrt(effective_noise_density(line) * line.pixel_width)
+        each.append(max(light.sum() * line.pixel_width / (sd * np.sqrt(n)) for light, n in stretches))
+    np.testing.assert_allclose(spot_significance(line, density), each)
+    one_by_one = [spot_significance(line, row[None])[0] for row in np.tile(density, (4, 1))]
+    assert np.array_equal(spot_significance(line, np.tile(density, (4, 1))), one_by_one)
 
 
 @pytest.fixture(scope="module")

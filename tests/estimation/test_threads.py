@@ -10,6 +10,7 @@ import dataclasses
 import numpy as np
 from aolink.estimation import ESTIMATOR_NAMES, exposure_model, run
 from aolink.estimation.filter import BlurFilter
+from aolink.estimation.spots import measure_spots
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
@@ -26,6 +27,13 @@ profile = Profile(density=rng.standard_normal((64, 40)), mask=np.ones((64, 40), 
 model = exposure_model(plant, 200)
 step = BlurFilter(plant, WindowedMoments(rig.sensor)).step(model, model.response(rng.random((200, 64))), profile)
 digest.update(step.coefficients.covariance.tobytes())
+small = load_rig("sh-4x4")
+sensor = dataclasses.replace(small.sensor, grid=(30, 30))
+plant = dataclasses.replace(small.plant, axes=1800)
+pixels = rng.integers(400, 700, sensor.shape).astype(np.uint16)
+chosen = dict(orders=(1, 2), flux="measured", least_usable=0.5, least_significance=-99.0)
+measured, _ = measure_spots(sensor, plant, pixels, np.ones(sensor.shape, bool), **chosen)
+digest.update(measured.value.tobytes() + measured.covariance.tobytes())
 print(digest.hexdigest())
 """
 

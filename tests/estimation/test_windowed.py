@@ -174,7 +174,7 @@ def test_a_blur_that_has_several_readings_is_not_believed_in_one(resonance_hz):
     exposures = simulate(rig, 210, seed=2, inputs=np.zeros((42_000, 1)))
     estimates = run(rig, exposures, ["o1", "moments"])
     o1, ours = (errors(exposures, estimates[name]) for name in ("o1", "moments"))
-    assert upper_bound_of_ratio(ours, o1) <= (1.02 if resonance_hz == 5 else 0.8)
+    assert upper_bound_of_ratio(ours, o1) <= (1.02 if resonance_hz == 5 else 0.7)
     assert score(exposures, estimates["moments"], 10).end_nees.mean < 2.6
 
 
@@ -322,3 +322,18 @@ def test_lost_frames_and_dead_time_are_bridged():
     ours, o1 = (score(series, estimates[name], 10) for name in ("moments", "o1"))
     assert ours.path_rmse < 0.5 * o1.path_rmse
     assert ours.end_nees.mean == pytest.approx(2.0, abs=0.5)
+
+
+def test_numbers_beyond_all_bounds_are_gated_and_stop_nothing():
+    """Light of next to nothing to divide by, and densities near the largest number."""
+    plant = dataclasses.replace(RIG.plant, axes=2)
+    model = exposure_model(plant, 200)
+    for flux, density in (("measured", 1e-320), ("known", 1e200), ("measured", -1e200)):
+        filter_ = BlurFilter(plant, WindowedMoments(SENSOR, flux=flux))
+        profile = Profile(density=np.full((2, 40), density), mask=np.ones((2, 40), bool))
+        profile.density[1] = exposure_density(SENSOR.kernel, SENSOR.edges, np.zeros(200))
+        with np.errstate(all="ignore"):
+            done = filter_.step(model, model.response(np.zeros((200, 2))), profile)
+        assert list(done.status) == [Status.GATED, Status.OK]
+        assert np.isfinite(done.coefficients.mean).all()
+        assert np.isfinite(done.nis).all()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation import Status, exposure_model, make_estimator, run, score, windowed
 from aolink.estimation.estimators import measure
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import _nodes
@@ -204,7 +204,7 @@ def test_coupled_plants_are_seen_better_than_by_o1_and_with_the_certainty_that_i
     assert {e.status for e in estimates["moments"]} == {Status.OK}
 
 
-def test_copies_that_do_not_hang_together_are_as_one_plant_that_holds_them_all():
+def test_copies_that_do_not_hang_together_are_as_one_plant_that_holds_them_all(monkeypatch):
     """Two spots by two copies, or by one plant with both blocks in it."""
     rig = tip_tilt(kernel=TILTED)
     plant, one = rig.plant, dataclasses.replace(rig.sensor, grid=(1, 2))
@@ -219,6 +219,8 @@ def test_copies_that_do_not_hang_together_are_as_one_plant_that_holds_them_all()
         process_noise=double(plant.process_noise), initial_mean=np.zeros(8),
         initial_covariance=double(plant.initial_covariance), axes=1,
     )  # fmt: skip
+    # How long errors last is one number for a whole copy, two copies have one each.
+    monkeypatch.setattr(windowed, "_MOST_MEMORY", 1.0)
     apart = run(two, exposures, ["moments"])["moments"]
     together = run(dataclasses.replace(two, plant=joint), exposures, ["moments"])["moments"]
     for a, b in zip(apart, together, strict=True):

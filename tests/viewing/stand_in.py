@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from scipy.signal import lfilter
 
 from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.exposure_model import exposure_model
 from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.recording import schemas_pb2 as schemas
@@ -30,6 +31,18 @@ class Recorded:
     log_time_ns: int
     sequence: int
     message: Any
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn(Estimate):
+    """An estimate whose path is given."""
+
+    drawn: np.ndarray
+    drawn_sd: np.ndarray
+
+    @property
+    def _unfolded(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.drawn, self.drawn_sd
 
 
 @dataclass
@@ -92,13 +105,14 @@ class StandIn:
             true = self.spot[e.first_step : e.first_step + e.n_steps]
             path = true + sd * rng.normal() * np.linspace(1, 0.5, e.n_steps)
             made.append(
-                Estimate(
+                Drawn(
                     estimator=name, frame_id=e.frame_id, first_step=e.first_step, n_steps=e.n_steps,
                     status=Status.OK if m else Status.PREDICTED, reason="",
                     start_state=np.array([[path[0], 0.0]]), start_covariance=np.diag([sd**2, 0.01])[None],
                     end_state=np.array([[path[-1], 0.1]]), end_covariance=np.diag([sd**2, 0.04])[None],
                     coefficients=np.zeros((1, 2)), coefficient_covariance=np.zeros((1, 2, 2)),
-                    path=path[None], path_sd=np.full((1, e.n_steps), sd) * np.linspace(1, 1.5, e.n_steps),
+                    inputs=e.inputs, model=exposure_model(self.rig.plant, e.n_steps), drawn=path[None],
+                    drawn_sd=np.full((1, e.n_steps), sd) * np.linspace(1, 1.5, e.n_steps),
                     innovation=np.zeros((1, m)), innovation_covariance=np.zeros((1, m, m)),
                     nis=rng.chisquare(max(m, 1), size=1),
                 )

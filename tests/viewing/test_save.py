@@ -264,7 +264,7 @@ def test_many_axes_become_percentiles(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     estimates = [
         replace(
-            e, path=rng.normal(size=(axes, N)), path_sd=np.ones((axes, N)), nis=rng.chisquare(2, size=axes),
+            e, drawn=rng.normal(size=(axes, N)), drawn_sd=np.ones((axes, N)), nis=rng.chisquare(2, size=axes),
             start_state=rng.normal(size=(axes, 2)), start_covariance=np.tile(np.eye(2), (axes, 1, 1)),
             end_state=rng.normal(size=(axes, 2)), end_covariance=np.tile(np.eye(2), (axes, 1, 1)),
         )
@@ -339,3 +339,32 @@ def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session
             )
             assert ours == theirs, (entity, column)
             assert ours
+
+
+def test_a_slow_viewer_skips_and_nobody_waits_for_it(recorded: Session) -> None:
+    import threading
+
+    from aolink.viewing import Decimating
+
+    class Slow:
+        """Shows one exposure until it is let go on."""
+
+        def __init__(self) -> None:
+            self.shown: list[int] = []
+            self.began, self.go_on = threading.Event(), threading.Event()
+
+        def show(self, exposure, estimates) -> None:
+            self.began.set()
+            self.go_on.wait(10)
+            self.shown.append(exposure.frame_id)
+
+    exposures, slow = list(Recording(recorded.path).exposures()), Slow()
+    view = Decimating(slow)
+    view.show(exposures[0], [])
+    assert slow.began.wait(10)
+    for exposure in exposures[1:]:
+        view.show(exposure, [])  # the viewer is still at the first
+    slow.go_on.set()
+    view.close()
+    assert slow.shown == [exposures[0].frame_id, exposures[-1].frame_id]
+    assert view.skipped == len(exposures) - 2

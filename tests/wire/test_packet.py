@@ -8,10 +8,23 @@ from importlib import resources
 
 import pytest
 from cobs import cobs
+from google.protobuf.message import DecodeError, Message
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.wire.packet import MAX_PAYLOAD, Packet, PacketDecoder, encode_packet
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import (
+    MAX_MESSAGE,
+    MAX_PAYLOAD,
+    TYPE_OF_MESSAGE,
+    MessageDecoder,
+    Packet,
+    PacketDecoder,
+    PacketType,
+    encode_message,
+    encode_packet,
+    encode_packets,
+)
 
 packets = st.builds(
     Packet,
@@ -113,3 +126,53 @@ def test_published_vectors() -> None:
         decoder = PacketDecoder()
         assert decoder.feed(bytes.fromhex(vector["wire"])) == [], vector["what"]
         assert (decoder.bad_crc, decoder.bad_framing) == (vector["bad_crc"], vector["bad_framing"]), vector["what"]
+    for vector in vectors["parts"]:
+        messages, refused = joined(decode(bytes.fromhex(vector["wire"])))
+        found = [[TYPE_OF_MESSAGE[type(m)], m.SerializeToString().hex()] for m in messages]
+        assert (found, refused) == (vector["messages"], vector["refused"]), vector["what"]
+
+
+def joined(sent: list[Packet]) -> tuple[list[Message], int]:
+    """The messages that packets make, and how many of these make no sense."""
+    decoder, messages, refused = MessageDecoder(), [], 0
+    for packet in sent:
+        try:
+            message = decoder.take(packet)
+        except DecodeError:
+            refused += 1
+        else:
+            messages += [message] if message else []
+        assert len(decoder._data) <= MAX_MESSAGE
+    return messages, refused
+
+
+@given(st.integers(0, 65535), st.integers(1, 20_000), st.data())
+def test_a_long_message_comes_whole_or_not_at_all(sequence: int, length: int, data: st.DataObject) -> None:
+    """Whichever of its packets are lost; what follows it is not touched."""
+    message = pb.Applied(block_id=1, n_steps=1, u=[float(k) for k in range(length)])
+    cut = decode(b"".join(encode_packets(message, sequence)))
+    assert [p.sequence for p in cut] == [(sequence + k) & 0xFFFF for k in range(len(cut))]
+    kept = data.draw(st.lists(st.booleans(), min_size=len(cut), max_size=len(cut)))
+    following = decode(encode_message(message, sequence + len(cut) & 0xFFFF))
+    messages, _ = joined([packet for packet, keep in zip(cut, kept, strict=True) if keep] + following)
+    assert messages == [message] * (1 + all(kept))
+
+
+part_packets = st.builds(
+    lambda sequence, **fields: Packet(1, PacketType.PART, sequence, pb.Part(**fields).SerializeToString()),
+    sequence=st.integers(0, 3),
+    type=st.integers(0, 14),
+    offset=st.integers(0, 4) | st.integers(0, 2**32 - 1),
+    total=st.integers(0, 6) | st.integers(0, 2**32 - 1),
+    data=st.binary(max_size=4),
+)
+
+
+@given(st.lists(part_packets | packets, max_size=30))
+def test_whatever_parts_come_memory_is_bounded(sent: list[Packet]) -> None:
+    joined(sent)
+
+
+def test_a_message_too_long_is_refused() -> None:
+    with pytest.raises(ValueError, match="a CommandBlock of 320004 bytes is too long, at most 262144"):
+        encode_packets(pb.CommandBlock(block_id=0, u=[1.0] * 40_000), 0)

@@ -98,8 +98,7 @@ def shake_section(rows: Sequence[ShakeRow], effort: Effort) -> list[Block]:
             f" V = {worst.noise_density:g})."
         ),
         Text(
-            "NEES is that of the end state, 2 where a covariance is right; moments is over-cautious rather than"
-            " overconfident where the blur has several readings. A resonance remembers its amplitude for many"
+            "NEES is that of the end state, 2 where a covariance is right. A resonance remembers its amplitude for many"
             " exposures, so that a run is worth few independent ones: open loop, whose covariance is right by"
             " construction, shows by how much 2 is missed by chance. In an ensemble of thirty runs that is a quarter,"
             " and the ratio to o1 at 20 Hz is off by two per cent."

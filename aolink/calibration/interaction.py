@@ -1,0 +1,112 @@
+"""The interaction matrix of a rig, measured: every input is pushed and pulled, and the camera tells where spots go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import CalibrationError
+from aolink.exposure import Exposure
+from aolink.optics.camera import to_density
+from aolink.optics.centroid import centre_of_gravity
+from aolink.rig import Rig
+from aolink.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+# A pixel counts if its density exceeds so many sd of noise: what is far from the spot only adds noise.
+_THRESHOLD_SD = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Interaction:
+    """Slopes for inputs at rest, and how well they are known."""
+
+    matrix: FloatArray
+    """Slope units per input unit, (n_outputs, n_inputs)."""
+    offset: FloatArray
+    """Slopes without input, (n_outputs,)."""
+    singular_values: FloatArray
+    """Of the matrix, from large to small."""
+    residual_rms: float
+    """Of the slopes that the matrix does not explain, slope units."""
+    exposures: int
+    """How many were used."""
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest singular value: how much weaker the weakest mode of the inputs is."""
+        return float(self.singular_values[0] / max(self.singular_values[-1], 1e-300))
+
+    def control_matrix(self, weakest: float = 0.0) -> FloatArray:
+        """Inputs that make given slopes, (n_inputs, n_outputs), without modes below ``weakest`` times the strongest."""
+        return np.asarray(np.linalg.pinv(self.matrix, rcond=weakest))
+
+
+def poke_inputs(rig: Rig, amplitude: FloatArray | float, rest_exposures: int = 1) -> FloatArray:
+    """Inputs at each fast step that push each input up and down in turn.
+
+    Each value is held for ``rest_exposures`` frame periods, in which the mirror settles, and one more to be seen.
+
+    Raises
+    ------
+    CalibrationError
+        The pokes would go beyond the mirror's limits.
+    """
+    size = np.broadcast_to(np.asarray(amplitude, dtype=np.float64), rig.n_inputs)
+    pokes = np.concatenate([sign * np.diag(size) for sign in (1.0, -1.0)]) + rig.mirror.park
+    pokes = pokes.reshape(2, rig.n_inputs, -1).swapaxes(0, 1).reshape(-1, rig.n_inputs)
+    if (pokes < rig.mirror.input_min).any() or (pokes > rig.mirror.input_max).any():
+        raise CalibrationError("the pokes go beyond the mirror's limits: take a smaller amplitude")
+    return np.repeat(pokes, (rest_exposures + 1) * rig.timing.frame_period_steps, axis=0)
+
+
+def measure_interaction(rig: Rig, exposures: Iterable[Exposure]) -> Interaction:
+    """Least squares of slopes on inputs, over the exposures whose input had rested since the exposure before began.
+
+    Raises
+    ------
+    CalibrationError
+        The sensor has no grid of spots, spots are missing, or inputs did not move apart from each other.
+    """
+    if not isinstance(rig.sensor, SpotSensor):
+        raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
+    inputs, slopes, before = [], [], None
+    for exposure in exposures:
+        u = np.concatenate([exposure.lead_inputs, exposure.inputs])
+        still = before is not None and (u == before[0]).all() and (before == before[0]).all()
+        if still and exposure.complete:
+            inputs.append(u[0])
+            slopes.append(spot_slopes(rig.sensor, exposure.pixels))
+        before = exposure.inputs
+    if not inputs:
+        raise CalibrationError("in no exposure had the input rested since the one before: hold each poke longer")
+    u, y = np.array(inputs), np.array(slopes)
+    if np.isnan(y).any():
+        raise CalibrationError(f"{int(np.isnan(y).any(axis=0).sum() // 2)} spots are missing in some exposure")
+    design = np.column_stack([u, np.ones(len(u))])
+    if np.linalg.matrix_rank(design) < design.shape[1]:
+        raise CalibrationError(
+            f"{len(u)} exposures at rest do not tell {rig.n_inputs} inputs apart: poke each of them alone"
+        )
+    solution, *_ = np.linalg.lstsq(design, y, rcond=None)
+    matrix = solution[:-1].T
+    return Interaction(
+        matrix=matrix,
+        offset=solution[-1],
+        singular_values=np.linalg.svd(matrix, compute_uv=False),
+        residual_rms=float(np.sqrt(np.mean((y - design @ solution) ** 2))),
+        exposures=len(u),
+    )
+
+
+def spot_slopes(sensor: SpotSensor, pixels: NDArray[np.uint16]) -> FloatArray:
+    """Thresholded centroid of each spot in the rig's order, slope units, (2 spots,); NaN where there is no spot."""
+    (rows, columns), side = sensor.grid, sensor.window[0]
+    density = to_density(sensor, pixels).reshape(rows, side, columns, side).swapaxes(1, 2).reshape(-1, side, side)
+    noise = np.sqrt(sensor.noise_density / sensor.pixel_size)
+    place = centre_of_gravity(density, _THRESHOLD_SD * noise)
+    return np.asarray(sensor.field[0] + (place + 0.5) * sensor.pixel_width).ravel()

@@ -1,0 +1,150 @@
+"""Which exposure time tells most: the error that o1 will have, by its covariances, without a single frame.
+
+Everything is linear: what o1 does with a centroid is a constant gain, and the plant's noise moves the centroid, the
+path and the end state together. So the true covariance of o1's error follows from a recursion of its own, which
+counts what o1 itself leaves out: the process noise within the exposure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from aolink.errors import EstimatorError
+from aolink.estimation.exposure_model import exposure_model
+from aolink.estimation.filter import added_noise
+from aolink.estimation.moments import known_flux_covariance, noise_integrals
+from aolink.estimation.observation import steady_gain
+from aolink.estimation.spots import centroid_noise
+from aolink.optics.camera import effective_noise_density
+from aolink.plant import lift, psd_root
+from aolink.rig import Rig
+from aolink.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+_MOST_OUTPUTS = 256
+_LONGEST = 20_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExpectedError:
+    """What is to be expected of an exposure time, in the long run; root mean squares over outputs and steps."""
+
+    exposure_steps: int
+    path_rms: float
+    """Error of o1's path within an exposure, slope units."""
+    end_rms: float
+    """Error of the output one step after the exposure, slope units: what a controller acts on."""
+    noise_rms: float
+    """Of the centroid by read-out and shot noise, slope units."""
+
+
+def candidates(rig: Rig) -> list[int]:
+    """Exposure times from a sixteenth of the rig's own to four times it, fast steps."""
+    own = rig.timing.exposure_steps
+    steps = {max(1, round(own * 2 ** (k / 2))) for k in range(-8, 5)}
+    return sorted(n for n in steps if n <= _LONGEST)
+
+
+def with_exposure(rig: Rig, exposure_steps: int) -> Rig:
+    """The rig with another exposure time: as much dead time, and light in proportion.
+
+    A pixel's read-out noise stays in counts, so over a density of unit mass V goes with the light's square.
+    """
+    timing, sensor = rig.timing, rig.sensor
+    light = exposure_steps / timing.exposure_steps
+    dead = timing.frame_period_steps - timing.exposure_steps
+    return replace(
+        rig,
+        timing=replace(timing, exposure_steps=exposure_steps, frame_period_steps=exposure_steps + dead),
+        sensor=replace(
+            sensor, noise_density=sensor.noise_density / light**2, photoelectrons=sensor.photoelectrons * light,
+            counts_per_density=sensor.counts_per_density * light,
+        ),
+    )  # fmt: skip
+
+
+def exposure_scan(rig: Rig, steps: Iterable[int] | None = None) -> list[ExpectedError]:
+    """Expected errors of o1 over exposure times in fast steps, `candidates` where None.
+
+    Raises
+    ------
+    EstimatorError
+        The plant has too many outputs, or a mode that neither dies out nor is seen.
+    """
+    if rig.plant.n_outputs > _MOST_OUTPUTS:
+        raise EstimatorError(f"an exposure scan takes {_MOST_OUTPUTS} outputs at most, {rig.name} has more")
+    return [_expected(with_exposure(rig, n)) for n in (candidates(rig) if steps is None else steps)]
+
+
+def best(errors: Iterable[ExpectedError]) -> ExpectedError:
+    """The one whose path is known best."""
+    return min(errors, key=lambda e: e.path_rms)
+
+
+def centroid_covariance(rig: Rig) -> FloatArray:
+    """Covariance of the centroids of one copy of the plant by read-out and shot noise, (n_outputs, n_outputs)."""
+    sensor, plant = rig.sensor, rig.plant
+    if isinstance(sensor, SpotSensor):
+        noise = centroid_noise(sensor, plant.n_outputs)
+    else:
+        noise = known_flux_covariance(effective_noise_density(sensor.profile), noise_integrals(sensor.profile, 2), [1])
+    if sensor.photoelectrons:
+        spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
+        noise = noise + np.diag(spread + sensor.kernel.variance) / sensor.photoelectrons
+    return noise
+
+
+def _expected(rig: Rig) -> ExpectedError:
+    plant, n = rig.plant, rig.timing.exposure_steps
+    model = exposure_model(plant, n)
+    R, H, F = centroid_covariance(rig), model.mean_row, model.transition
+    K = steady_gain(model, added_noise(model, "lifted"), R)
+    if K is None:
+        raise EstimatorError(
+            f"exposures of {n} fast steps lose a mode that does not die out: o1 has no steady state;"
+            " `aolink rig --check` says which mode"
+        )
+    # What a unit of noise in one step does to the outputs k steps later, to the centroid and to the end state.
+    root = plant.B_w @ psd_root(plant.process_noise)
+    impulse = np.concatenate([np.zeros((plant.n_outputs, 1, root.shape[1])), model.state_rows[:, :-1] @ root], axis=1)
+    on_centroid = np.cumsum(impulse, axis=1)[:, ::-1] / n  # (n_outputs, step of the noise, noises)
+    on_end = np.empty((n, plant.n_states, root.shape[1]))
+    on_end[-1] = root
+    for j in range(n - 2, -1, -1):
+        on_end[j] = plant.A @ on_end[j + 1]
+    centroid_end = np.einsum("ojw,jsw->os", on_centroid, on_end)
+    centroid_noise_path = np.einsum("ojw,pjw->op", on_centroid, on_centroid)
+    keep = np.eye(plant.n_states) - K @ H
+    scatter = K @ (R + centroid_noise_path) @ K.T
+    over_gap, gap_noise = lift(plant, rig.timing.frame_period_steps - n)
+    # e' = G (F keep e - F K (nu + v) + w) + gap noise, nu and w from the same noise.
+    cross = F @ K @ centroid_end
+    added = F @ scatter @ F.T + model.process_noise - cross - cross.T
+    step = over_gap @ F @ keep
+    before = linalg.solve_discrete_lyapunov(step, over_gap @ added @ over_gap.T + gap_noise)
+    start = keep @ before @ keep.T + scatter
+    end = F @ keep @ before @ keep.T @ F.T + added
+    path = np.einsum("ois,st,oit->oi", model.state_rows, start, model.state_rows)
+    path += np.cumsum((impulse**2).sum(axis=2), axis=1)
+    gained = np.einsum("ois,sp->oip", model.state_rows, K)  # rows of the path for each centroid
+    for o in range(plant.n_outputs):
+        # cov(nu, noise path at i) = sum_j m_j h_(i-j).
+        both = sum(
+            np.stack([np.convolve(on_centroid[p, :, w], impulse[o, :, w])[:n] for p in range(plant.n_outputs)], axis=1)
+            for w in range(root.shape[1])
+        )
+        path[o] -= 2 * (gained[o] * both).sum(axis=1)
+    end_outputs = np.einsum("os,st,ot->o", plant.C, end, plant.C)
+    return ExpectedError(
+        exposure_steps=n,
+        path_rms=math.sqrt(max(float(path.mean()), 0.0)),
+        end_rms=math.sqrt(max(float(end_outputs.mean()), 0.0)),
+        noise_rms=math.sqrt(float(np.diag(R).mean())),
+    )

@@ -1,0 +1,75 @@
+"""A frame from a file: a two-dimensional FITS image, compressed or not, or NumPy's .npy."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import FrameError
+
+_BLOCK, _CARD = 2880, 80
+_TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
+
+
+def read_frame(path: str | Path) -> NDArray[np.float64]:
+    """The picture in a .fits, .fits.gz or .npy file, (rows, columns).
+
+    Raises
+    ------
+    FrameError
+        The file cannot be read or holds no two-dimensional picture.
+    """
+    path = Path(path)
+    try:
+        if path.suffix == ".npy":
+            picture = np.load(path)
+        else:
+            data = path.read_bytes()
+            picture = parse_fits(gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data)
+    except OSError as error:
+        raise FrameError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
+    except (EOFError, ValueError, zlib.error) as error:
+        raise FrameError(f"{path} is damaged or no picture: {error}") from None
+    except FrameError as error:
+        raise FrameError(f"{path}: {error}") from None
+    if picture.ndim != 2 or picture.dtype.kind not in "biuf":
+        raise FrameError(f"{path} holds {picture.dtype} of shape {picture.shape}, expected numbers in rows and columns")
+    return np.asarray(picture, dtype=np.float64)
+
+
+def parse_fits(data: bytes) -> NDArray[np.float64]:
+    """The primary image of a FITS file with two axes; Pence et al., Astron. Astrophys. 524, A42 (2010).
+
+    Raises
+    ------
+    FrameError
+        It is not such a file.
+    """
+    if not data.startswith(b"SIMPLE  ="):
+        raise FrameError("it is not a FITS file: it does not begin with SIMPLE")
+    values, start = {}, 0
+    while (card := data[start : start + _CARD])[:8].rstrip() != b"END":
+        if len(card) < _CARD:
+            raise FrameError("its header has no END: the file is cut off")
+        if card[8:10] == b"= ":
+            values[card[:8].decode("latin-1").rstrip()] = card[10:].split(b"/")[0].decode("latin-1").strip()
+        start += _CARD
+    start = (start // _BLOCK + 1) * _BLOCK
+    try:
+        kind = _TYPES[int(values["BITPIX"])]
+        axes = int(values["NAXIS"])
+        shape = tuple(int(values[f"NAXIS{axis}"]) for axis in range(axes, 0, -1))
+        scale, zero = (float(values.get(key, default)) for key, default in (("BSCALE", "1"), ("BZERO", "0")))
+    except (KeyError, ValueError) as error:
+        raise FrameError(f"its header has no usable {error}") from None
+    if len(shape) != 2 or min(shape) < 1:
+        raise FrameError(f"its primary image has the shape {shape}, expected two axes: take the picture out of it")
+    count = math.prod(shape)
+    if len(data) - start < count * np.dtype(kind).itemsize:
+        raise FrameError(f"it is cut off: {shape[0]} x {shape[1]} pixels are announced")
+    return np.frombuffer(data, kind, count, start).reshape(shape) * scale + zero

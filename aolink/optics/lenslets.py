@@ -1,0 +1,105 @@
+"""Lenslets over a pupil: where they are, how much light they get, and the slopes that a wavefront has over them.
+
+Positions are (x, y) from the middle of the grid, x along its columns and y along its rows. Spots are counted
+along the rows of the grid, as frames have them. A wavefront W is an optical path difference in metres, and its
+slope over a lenslet the mean of its gradient there, in radians: the spot's displacement over the focal length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# Points along a lenslet's side that tell how much of it is lit; and for means of a wavefront that is smooth over it.
+_EDGE_POINTS = 64
+_SMOOTH_POINTS = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lenslets:
+    """A grid of square lenslets without gaps, and the pupil in front of it."""
+
+    grid: tuple[int, int]
+    """Rows and columns."""
+    pitch_m: float
+    """Side of a lenslet, m."""
+    focal_length_m: float
+    """From the lenslets to the camera, m."""
+    pupil_diameter_m: float | None = None
+    """Of the round pupil, centred on the grid, m; None where the light covers the whole grid."""
+    obstruction: float = 0.0
+    """Diameter of the pupil's central obstruction over that of the pupil."""
+
+    def __post_init__(self) -> None:
+        if min(*self.grid, self.pitch_m, self.focal_length_m) <= 0 or not 0 <= self.obstruction < 1:
+            raise ValueError(f"not lenslets: {self}; sizes must be above zero and 0 <= obstruction < 1")
+
+    @property
+    def spots(self) -> int:
+        """Number of lenslets."""
+        return self.grid[0] * self.grid[1]
+
+    @cached_property
+    def centres_m(self) -> FloatArray:
+        """Middles of the lenslets, (spots, 2)."""
+        rows, columns = self.grid
+        y, x = np.mgrid[:rows, :columns].astype(np.float64)
+        return self.pitch_m * np.stack([x - (columns - 1) / 2, y - (rows - 1) / 2], axis=-1).reshape(-1, 2)
+
+    def is_lit(self, points_m: FloatArray) -> NDArray[np.bool_]:
+        """Whether points (..., 2) lie in the pupil, (...)."""
+        if self.pupil_diameter_m is None:
+            return np.ones(points_m.shape[:-1], dtype=np.bool_)
+        radius = np.linalg.norm(points_m, axis=-1) * 2 / self.pupil_diameter_m
+        return np.asarray((radius <= 1) & (radius >= self.obstruction))
+
+    @cached_property
+    def light(self) -> FloatArray:
+        """Share of each lenslet's area that is lit, (spots,): the weight of its slopes."""
+        offset = self.pitch_m * ((np.arange(_EDGE_POINTS) + 0.5) / _EDGE_POINTS - 0.5)
+        return np.array([self.is_lit(centre + _square(offset)).mean() for centre in self.centres_m])
+
+    def mean_slopes(self, gradient: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Mean gradient over the lit part of each lenslet.
+
+        Parameters
+        ----------
+        gradient:
+            From points (..., 2), m, to gradients (..., 2, *more): of one wavefront, or of many at once.
+
+        Returns
+        -------
+        (spots, 2, *more); NaN for lenslets in the dark.
+        """
+        nodes, weights = np.polynomial.legendre.leggauss(_SMOOTH_POINTS)
+        smooth, smooth_weight = _square(nodes * self.pitch_m / 2), np.outer(weights, weights).ravel() / 4
+        fine = _square(self.pitch_m * ((np.arange(_EDGE_POINTS) + 0.5) / _EDGE_POINTS - 0.5))
+        slopes = []
+        # Lenslets that the pupil's edge cuts need finer points than a smooth wavefront does.
+        for centre, light in zip(self.centres_m, self.light, strict=True):
+            points, weight = centre + smooth, smooth_weight
+            if light < 1:
+                lit = self.is_lit(centre + fine)
+                points, weight = (centre + fine)[lit], np.full(lit.sum(), 1 / max(lit.sum(), 1))
+            mean = np.tensordot(weight, gradient(points), axes=1)
+            slopes.append(mean if light else np.full_like(mean, np.nan))
+        return np.array(slopes)
+
+    def pixels_to_slope(self, pixel_m: float) -> float:
+        """Slope in radians for a displacement of one pixel of side ``pixel_m``."""
+        return pixel_m / self.focal_length_m
+
+    def diffraction_width(self, wavelength_m: float) -> float:
+        """Slope from the middle of a spot to the first zero of its sinc^2, lambda / pitch, radians."""
+        return wavelength_m / self.pitch_m
+
+
+def _square(offset: FloatArray) -> FloatArray:
+    """The points of a square from those along its sides, (n^2, 2)."""
+    return np.stack(np.meshgrid(offset, offset), axis=-1).reshape(-1, 2)

@@ -1,0 +1,177 @@
+"""Frames as a camera makes them, pixel by pixel: any kernel along any path, and the faults of real detectors.
+
+`aolink.optics.frame` makes the frames of rigs, whose kernel is a Gaussian; here are the other kernels, to see what
+estimators do with light that they do not expect.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len
+from scipy.special import sici
+
+from aolink.errors import FrameError
+
+FloatArray = NDArray[np.float64]
+
+# Numbers at once: the masses of so many spots stay in the processor's cache.
+_AT_ONCE = 16
+# Rows of the table of diffraction's masses from the middle to the first zero: linearly between them, 1e-6 is left out.
+_POINTS = 512
+# Numbers in a table at most; for wider windows it is not worth its memory.
+_LARGEST_TABLE = 4_000_000
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Psi:
+    """A kernel of unit mass. Widths are in pixels."""
+
+    shape: Literal["delta", "sinc2", "image"]
+    zero_px: float = 0.0
+    """Of ``sinc2``, diffraction at a square lenslet: from the middle to the first zero, wavelength over pitch."""
+    image: FloatArray | None = None
+    """Of ``image``: the spot on a grid of ``finer`` points a pixel, odd sides, the middle one at its origin."""
+    finer: int = 1
+
+    def __post_init__(self) -> None:
+        if self.shape == "sinc2" and self.zero_px <= 0:
+            raise FrameError(f"a diffraction kernel needs zero_px above 0, found {self.zero_px:g}")
+        if self.shape == "image":
+            good = self.image is not None and self.image.ndim == 2 and not any(n % 2 == 0 for n in self.image.shape)
+            if not good or self.image is None or not self.image.sum() > 0 or self.finer < 1:
+                raise FrameError("a kernel's image needs two odd sides, light in it, and finer >= 1")
+
+
+def spot_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
+    """Share of each spot's light in the pixels of its window, averaged over its path.
+
+    Parameters
+    ----------
+    side:
+        Pixels along each side of a window.
+    path_px:
+        x and y at each fast step, pixels, 0 at the middle of the first pixel, (spots, 2, n_steps).
+
+    Returns
+    -------
+    (spots, side, side); a spot that is wholly in its window sums to one.
+    """
+    if psi.shape == "image":
+        return _image_windows(psi, side, path_px)
+    light = np.empty((len(path_px), side, side))
+    for k in range(0, len(path_px), _AT_ONCE):
+        some = slice(k, k + _AT_ONCE)
+        masses = _delta_masses(side, path_px[some]) if psi.shape == "delta" else _sinc2_masses(psi, side, path_px[some])
+        # Both kernels are products of their two directions: the sum over the steps is a matrix product.
+        np.matmul(masses[:, 1].swapaxes(1, 2), masses[:, 0], out=light[some])
+    light /= path_px.shape[-1]
+    return light
+
+
+def _delta_masses(side: int, positions: FloatArray) -> FloatArray:
+    """One in the pixel where the spot is, (..., n_steps, side)."""
+    return np.asarray((np.floor(positions + 0.5)[..., None] == np.arange(side)), dtype=np.float64)
+
+
+def _sinc2_masses(psi: Psi, side: int, positions: FloatArray) -> FloatArray:
+    """Mass of one direction in each pixel, (..., n_steps, side): between the rows of a table, linearly."""
+    if _table_rows(psi.zero_px, side) * side > _LARGEST_TABLE:
+        away = np.arange(side + 1) - 0.5 - positions[..., None]
+        return np.asarray(np.diff(_sinc2_below(away / psi.zero_px), axis=-1))
+    table = _sinc2_table(psi.zero_px, side)
+    place = np.clip((positions + side) * (_POINTS / psi.zero_px), 0, len(table) - 2)
+    row = place.astype(np.intp)
+    low, high = table.take(row, axis=0), table.take(row + 1, axis=0)
+    high -= low
+    high *= (place - row)[..., None]
+    low += high
+    return np.asarray(low)
+
+
+def _table_rows(zero_px: float, side: int) -> int:
+    return math.ceil(3 * side / zero_px * _POINTS) + 2
+
+
+@lru_cache(maxsize=8)
+def _sinc2_table(zero_px: float, side: int) -> FloatArray:
+    """Masses of the pixels for spots from a window before the first one to a window behind the last, (rows, side)."""
+    positions = np.arange(_table_rows(zero_px, side)) * (zero_px / _POINTS) - side
+    edges = np.arange(side + 1) - 0.5
+    return np.asarray(np.diff(_sinc2_below((edges - positions[:, None]) / zero_px), axis=-1))
+
+
+def _sinc2_below(x: FloatArray) -> FloatArray:
+    """Integral of sinc^2 from minus infinity to x: 1/2 + (Si(2 pi x) - sin^2(pi x)/(pi x)) / pi."""
+    a = math.pi * x
+    safe = np.where(np.abs(a) < 1e-9, 1.0, a)
+    return np.asarray(0.5 + (sici(2 * a)[0] - np.where(np.abs(a) < 1e-9, a, np.sin(safe) ** 2 / safe)) / math.pi)
+
+
+def _image_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
+    """The image, and the path's own picture on the fine grid, convolved by their spectra.
+
+    A step's place between fine points goes to the four of them by its distances, so that its mean is exact.
+    """
+    assert psi.image is not None
+    fine, n = psi.finer, side * psi.finer
+    spots, _, steps = path_px.shape
+    place = (path_px + 0.5) * fine - 0.5
+    margin = max(psi.image.shape) // 2 + 1
+    size = next_fast_len(n + 2 * margin, real=True)
+    low = np.floor(place).astype(np.int64)
+    part = place - low
+    first = np.broadcast_to(np.arange(spots)[:, None] * size**2, (spots, steps))
+    pixels, weights = [], []
+    for dy in (0, 1):
+        for dx in (0, 1):
+            x, y = low[:, 0] + dx + margin, low[:, 1] + dy + margin
+            weight = np.where(dx, part[:, 0], 1 - part[:, 0]) * np.where(dy, part[:, 1], 1 - part[:, 1]) / steps
+            seen = (x >= 0) & (x < size) & (y >= 0) & (y < size)  # beyond, no light reaches the window
+            pixels.append((first + y * size + x)[seen])
+            weights.append(weight[seen])
+    trace = np.bincount(np.concatenate(pixels), np.concatenate(weights), spots * size**2)
+    kernel = np.zeros((size, size))
+    rows, columns = psi.image.shape
+    kernel[:rows, :columns] = psi.image / psi.image.sum()
+    kernel = np.roll(kernel, (-(rows // 2), -(columns // 2)), (0, 1))
+    spectrum = np.fft.rfft2(trace.reshape(spots, size, size)) * np.fft.rfft2(kernel)
+    whole = np.fft.irfft2(spectrum, (size, size))[:, margin : margin + n, margin : margin + n]
+    return np.asarray(whole.reshape(spots, side, fine, side, fine).sum(axis=(2, 4)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Detector:
+    """An integer camera and its faults. Light is in photo-electrons; what pixels differ in is (rows, columns)."""
+
+    bits: int = 16
+    """8 to 16."""
+    electrons_per_count: float = 1.0
+    offset_counts: float = 0.0
+    read_noise_electrons: float = 0.0
+    background_electrons: FloatArray | float = 0.0
+    """Light that is everywhere; it has shot noise."""
+    dark_electrons: FloatArray | float = 0.0
+    """What a pixel gathers without light in one exposure; it has shot noise."""
+    flat: FloatArray | float = 1.0
+    """Sensitivity."""
+    dead: NDArray[np.bool_] | None = None
+    """Pixels that always read the offset, (rows, columns)."""
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.bits <= 16 or self.electrons_per_count <= 0:
+            raise FrameError(f"a detector has 8 to 16 bits and electrons_per_count above 0, found {self.bits} bits")
+
+    def expose(self, light_electrons: FloatArray, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """Counts for the mean light of an exposure, (..., rows, columns)."""
+        mean = (light_electrons + self.background_electrons) * self.flat + self.dark_electrons
+        electrons = rng.poisson(np.maximum(mean, 0.0)) + self.read_noise_electrons * rng.standard_normal(mean.shape)
+        if self.dead is not None:
+            electrons = np.where(self.dead, 0.0, electrons)
+        counts = np.rint(self.offset_counts + electrons / self.electrons_per_count)
+        return np.clip(counts, 0, (1 << self.bits) - 1).astype(np.uint16)

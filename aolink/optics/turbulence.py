@@ -1,0 +1,103 @@
+"""Turbulence that the wind blows past the pupil: von Karman's spectrum, several layers, exact at any time.
+
+A layer is a sum of plane waves of random direction, phase and size, one for each stretch of a logarithmic ladder
+of wave numbers: Charnotskii, "Sparse spectrum model for a turbulent phase", J. Opt. Soc. Am. A 30, 479 (2013). Its
+structure function, in the mean over seeds, is the analytic one at every distance up to the ladder's ends; it
+does not repeat; the wind moves it by any distance; and its mean slope over a square is known in closed form.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gamma, kv
+
+from aolink.optics.lenslets import Lenslets
+
+FloatArray = NDArray[np.float64]
+
+# The longest wave over the outer scale: longer ones add nothing to the structure function within it.
+_LONGEST = 20.0
+_WAVES = 600
+
+
+@dataclass(frozen=True, kw_only=True)
+class Layer:
+    """One layer of turbulence."""
+
+    r0_m: float
+    """Fried's parameter at ``wavelength_m``, m."""
+    wind_m_s: tuple[float, float]
+    """Along x and y."""
+    outer_scale_m: float = 25.0
+    wavelength_m: float = 500e-9
+
+
+def structure_function(layer: Layer, distance_m: FloatArray) -> FloatArray:
+    """von Karman's phase structure function, rad^2, (...).
+
+    D(r) = (L0/r0)^(5/3) 2^(1/6) Gamma(11/6)/pi^(8/3) (24/5 Gamma(6/5))^(5/6)
+    (Gamma(5/6)/2^(1/6) - (2 pi r/L0)^(5/6) K_(5/6)(2 pi r/L0)); Conan (2000).
+    """
+    x = 2 * math.pi * np.maximum(np.asarray(distance_m, dtype=np.float64), 1e-12) / layer.outer_scale_m
+    scale = (layer.outer_scale_m / layer.r0_m) ** (5 / 3) * 2 ** (1 / 6) * gamma(11 / 6) / math.pi ** (8 / 3)
+    scale *= (24 / 5 * gamma(6 / 5)) ** (5 / 6)
+    return np.asarray(scale * (gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * kv(5 / 6, x)))
+
+
+class FrozenFlow:
+    """One layer's wavefront as a sum of plane waves: a wavefront in metres of path for any point and time.
+
+    Parameters
+    ----------
+    shortest_m:
+        Waves shorter than this are left out.
+    """
+
+    def __init__(self, layer: Layer, rng: np.random.Generator, shortest_m: float, waves: int = _WAVES) -> None:
+        self.layer = layer
+        low, high = 2 * math.pi / (layer.outer_scale_m * _LONGEST), 2 * math.pi / shortest_m
+        rungs = np.geomspace(low, high, waves + 1)
+        # Within its rung every wave number is as likely as the plane gives it room: k dk.
+        k = np.sqrt(rungs[:-1] ** 2 + (rungs[1:] ** 2 - rungs[:-1] ** 2) * rng.random(waves))
+        turn = rng.uniform(0, 2 * math.pi, waves)
+        self.wave_numbers = k[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        """Radians per metre, (waves, 2)."""
+        power = _spectrum(layer, k) * math.pi * (rungs[1:] ** 2 - rungs[:-1] ** 2)  # variance of each wave, rad^2
+        scatter = rng.standard_normal((2, waves))
+        self.amplitudes = np.sqrt(power) * (scatter[0] + 1j * scatter[1]) * layer.wavelength_m / (2 * math.pi)
+        """Metres, complex, (waves,): W(r) = Re sum_k a_k exp(i k r)."""
+
+    def wavefront(self, points_m: FloatArray, time_s: float = 0.0) -> FloatArray:
+        """Path difference at points (..., 2), m, (...)."""
+        moved = points_m - time_s * np.asarray(self.layer.wind_m_s)
+        return np.asarray((np.exp(1j * moved @ self.wave_numbers.T) @ self.amplitudes).real)
+
+    def slope_waves(self, lenslets: Lenslets) -> NDArray[np.complex128]:
+        """Mean slopes of each wave over whole lenslets in radians, (spots, 2, waves).
+
+        The mean of exp(ikr) over a square of side d is its value at the middle times two sincs.
+        """
+        k = self.wave_numbers
+        over_square = np.prod(np.sinc(k * lenslets.pitch_m / (2 * math.pi)), axis=1)
+        phase = np.exp(1j * lenslets.centres_m @ k.T)
+        return np.asarray(phase[:, None] * (1j * k.T * over_square * self.amplitudes))
+
+    def blown(self, times_s: FloatArray) -> NDArray[np.complex128]:
+        """What the wind turns each wave by at each time, (waves, times)."""
+        return np.asarray(np.exp(-1j * (self.wave_numbers @ np.asarray(self.layer.wind_m_s))[:, None] * times_s))
+
+
+def _spectrum(layer: Layer, k: FloatArray) -> FloatArray:
+    """von Karman's phase spectrum over the plane of wave numbers, rad^2 m^2; it integrates to the variance.
+
+    0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) over cycles per metre, and (2 pi)^-2 of that over radians per metre.
+    """
+    exact = gamma(11 / 6) ** 2 / (2 * math.pi ** (11 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)  # 0.0229
+    cycles = k / (2 * math.pi)
+    return np.asarray(
+        exact * layer.r0_m ** (-5 / 3) * (cycles**2 + layer.outer_scale_m**-2) ** (-11 / 6) / (2 * math.pi) ** 2
+    )

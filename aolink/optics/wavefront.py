@@ -1,0 +1,226 @@
+"""From slopes to the wavefront: zonal and modal least squares, and how good what is left of it is.
+
+Slopes are means over lenslets as `aolink.optics.lenslets` has them, (rows, columns, 2) on a grid or (spots, 2);
+wavefronts come in the unit of slopes times the lenslets' pitch.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+from scipy.special import gamma
+
+from aolink.optics.lenslets import Lenslets
+from aolink.optics.zernike import noll_to_orders, zernike, zernike_gradient
+
+FloatArray = NDArray[np.float64]
+Geometry = Literal["southwell", "fried"]
+_Equations = tuple[sparse.csr_array, sparse.csr_array, FloatArray, NDArray[np.bool_]]
+
+
+class ZonalReconstructor:
+    """Least squares of a wavefront's values from its slopes, sparse, factored once for a pattern of lit lenslets.
+
+    ``southwell`` puts a value in the middle of each lit lenslet; neighbours differ by the mean of their slopes
+    times the pitch (Southwell, J. Opt. Soc. Am. 70, 998 (1980)). ``fried`` puts values on the corners of lit
+    lenslets, whose opposite sides differ by the slope (Fried, J. Opt. Soc. Am. 67, 370 (1977)).
+
+    What slopes do not tell is zero: the mean of each part that hangs together, and in Fried's geometry waffle.
+
+    Parameters
+    ----------
+    lit:
+        Which lenslets have slopes, (rows, columns).
+    pitch:
+        Side of a lenslet.
+    weights:
+        Of the slopes of each lenslet, (rows, columns); one where None.
+    """
+
+    def __init__(
+        self, lit: NDArray[np.bool_], pitch: float, geometry: Geometry = "southwell", weights: FloatArray | None = None
+    ) -> None:
+        if not lit.any():
+            raise ValueError("no lenslet is lit")
+        self._lit = lit
+        weights = np.ones(lit.shape) if weights is None else weights
+        self._differences, self._averages, w, self._where = (_southwell if geometry == "southwell" else _fried)(
+            lit, weights, pitch
+        )
+        self._weighted = (self._differences.T * w).tocsr()
+        normal = self._weighted @ self._differences
+        self._null = _null_space(self._differences)
+        parts = self._null.shape[0]
+        right = sparse.vstack([self._null.T, sparse.csr_array((parts, parts))])
+        bordered = sparse.hstack([sparse.vstack([normal, self._null]), right])
+        self._factor = splu(sparse.csc_array(bordered))
+
+    @property
+    def where(self) -> NDArray[np.bool_]:
+        """Which points have a value: (rows, columns) of lenslets, or one more of each of their corners."""
+        return self._where
+
+    def __call__(self, slopes: FloatArray) -> FloatArray:
+        """The wavefront, NaN where there is none, (..., *where.shape), from slopes (..., rows, columns, 2)."""
+        lead = slopes.shape[:-3]
+        if slopes.shape[-3:] != (*self._lit.shape, 2):
+            raise ValueError(f"slopes have shape {slopes.shape}, expected (..., {self._lit.shape}, 2)")
+        known = slopes[..., self._lit, :].reshape(-1, 2 * int(self._lit.sum()))
+        if not np.isfinite(known).all():
+            raise ValueError("a lit lenslet has a slope that is not a number")
+        right = self._weighted @ (self._averages @ known.T)
+        right = np.concatenate([right, np.zeros((self._null.shape[0], right.shape[1]))])
+        values = self._factor.solve(right)[: self._differences.shape[1]]
+        out = np.full((len(known), *self._where.shape), np.nan)
+        out[:, self._where] = values.T
+        return out.reshape(*lead, *self._where.shape)
+
+
+def _southwell(lit: NDArray[np.bool_], weights: FloatArray, pitch: float) -> _Equations:
+    """Differences of values, means of slopes, weights and points: differences @ values = means @ slopes."""
+    number = np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
+    first, second, axis = [], [], []
+    for along, (a, b) in enumerate([(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]):
+        both = (a >= 0) & (b >= 0)
+        first.append(a[both])
+        second.append(b[both])
+        axis.append(np.full(both.sum(), along))
+    a, b, k = np.concatenate(first), np.concatenate(second), np.concatenate(axis)
+    n, row = int(lit.sum()), np.arange(len(a))
+    differences = _matrix([(row, b, 1.0), (row, a, -1.0)], (len(a), n))
+    means = _matrix([(row, 2 * a + k, pitch / 2), (row, 2 * b + k, pitch / 2)], (len(a), 2 * n))
+    w = weights[lit]
+    return differences, means, (w[a] + w[b]) / 2, lit.copy()
+
+
+def _fried(lit: NDArray[np.bool_], weights: FloatArray, pitch: float) -> _Equations:
+    corner = np.zeros((lit.shape[0] + 1, lit.shape[1] + 1), dtype=np.bool_)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            corner[dy : dy + lit.shape[0], dx : dx + lit.shape[1]] |= lit
+    number = np.cumsum(corner).reshape(corner.shape) - 1
+    y, x = np.nonzero(lit)
+    spot, parts = np.arange(len(y)), []
+    for dy in (0, 1):
+        for dx in (0, 1):
+            at = number[y + dy, x + dx]
+            parts += [(2 * spot, at, dx - 0.5), (2 * spot + 1, at, dy - 0.5)]
+    differences = _matrix(parts, (2 * len(y), int(corner.sum())))
+    return differences, sparse.csr_array(pitch * sparse.eye_array(2 * len(y))), np.repeat(weights[lit], 2), corner
+
+
+def _matrix(
+    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], float]], shape: tuple[int, int]
+) -> sparse.csr_array:
+    rows, columns = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+    values = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
+    return sparse.csr_array((values, (rows, columns)), shape=shape)
+
+
+def _null_space(differences: sparse.csr_array) -> sparse.csr_array:
+    """What differences do not see: what is even over points that they join, (parts, points).
+
+    Two points are joined where the normal matrix pulls them together.
+    """
+    joined = (differences.T @ differences).tocoo()
+    pulls = joined.data < -1e-9
+    n = differences.shape[1]
+    graph = sparse.coo_array((joined.data[pulls], (joined.row[pulls], joined.col[pulls])), shape=(n, n))
+    parts, label = connected_components(graph.tocsr(), directed=False)
+    return sparse.csr_array((np.ones(n), (label, np.arange(n))), shape=(parts, n))
+
+
+@dataclass(frozen=True, eq=False)
+class ZernikeModes:
+    """Zernike modes over a pupil, as slopes of lenslets."""
+
+    indices: tuple[int, ...]
+    """Noll's indices; 1, the piston, has no slopes and is left out."""
+    slopes: FloatArray
+    """Slopes of each mode of unit rms in the unit of path per m, (spots, 2, modes); NaN in the dark."""
+    light: FloatArray
+    """(spots,)"""
+    radius_m: float
+
+    def wavefront(self, coefficients: FloatArray, points_m: FloatArray) -> FloatArray:
+        """Sum of the modes at points (..., 2), (...)."""
+        modes = [zernike(index, points_m / self.radius_m) for index in self.indices]
+        return np.asarray(np.tensordot(coefficients, modes, axes=1))
+
+
+def zernike_modes(lenslets: Lenslets, highest: int) -> ZernikeModes:
+    """Modes 2 .. ``highest`` on the lenslets' round pupil, or on the circle about the whole grid."""
+    round_pupil = lenslets.pupil_diameter_m or lenslets.pitch_m * math.hypot(*lenslets.grid)
+    radius, indices = round_pupil / 2, tuple(range(2, highest + 1))
+    slopes = lenslets.mean_slopes(
+        lambda p: np.stack([zernike_gradient(i, p / radius) / radius for i in indices], axis=-1)
+    )
+    return ZernikeModes(indices=indices, slopes=slopes, light=lenslets.light, radius_m=radius)
+
+
+def modal_reconstructor(
+    slopes: FloatArray, weights: FloatArray, noise_variance: float = 0.0, prior_variance: FloatArray | None = None
+) -> FloatArray:
+    """The matrix from slopes to coefficients: least squares, or with a prior the smallest mean square error.
+
+    Parameters
+    ----------
+    slopes:
+        Of each mode, (spots, 2, modes).
+    weights:
+        Of each lenslet's slopes, (spots,), the light; zero leaves it out.
+    noise_variance:
+        Of a slope of weight one.
+    prior_variance:
+        Of each coefficient, (modes,), about zero; None: nothing is known.
+
+    Returns
+    -------
+    (modes, 2 spots), for slopes in the order x of spot 0, y of spot 0, x of spot 1, ...
+
+    Raises
+    ------
+    ValueError
+        Without a prior, and the slopes do not tell the modes apart.
+    """
+    both = np.repeat(weights, 2)
+    H = np.where(both[:, None] > 0, slopes.reshape(len(both), -1), 0.0)
+    normal = (H.T * both) @ H
+    if prior_variance is not None:
+        normal += np.diag(noise_variance / prior_variance)
+    # The modes may have any size: what counts is how alike their slopes are.
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    if np.linalg.cond(normal / np.outer(size, size)) > 1e10:
+        raise ValueError("the lit lenslets do not tell the modes apart: use fewer modes, or a prior")
+    return np.asarray(linalg.solve(normal, H.T * both, assume_a="pos"))
+
+
+def kolmogorov_variances(indices: tuple[int, ...], diameter_m: float, r0_m: float) -> FloatArray:
+    """Variances of Zernike coefficients in Kolmogorov turbulence, rad^2; Noll (1976), equation (25)."""
+
+    n = np.array([noll_to_orders(index)[0] for index in indices], dtype=np.float64)
+    scale = (24 / 5 * gamma(6 / 5)) ** (5 / 6) * gamma(11 / 6) ** 2 * gamma(14 / 3) / (2 ** (8 / 3) * math.pi)
+    value = scale * (n + 1) * gamma(n - 5 / 6) / (gamma(17 / 6) ** 2 * gamma(n + 23 / 6))
+    return np.asarray(value * (diameter_m / r0_m) ** (5 / 3))
+
+
+def residual_rms(wavefront: FloatArray, weights: FloatArray | None = None) -> float:
+    """Standard deviation over the pupil; points that are NaN do not count."""
+    known = np.isfinite(wavefront)
+    w = np.ones(known.sum()) if weights is None else weights[known]
+    values = wavefront[known]
+    return float(np.sqrt(np.average((values - np.average(values, weights=w)) ** 2, weights=w)))
+
+
+def strehl(wavefront_m: FloatArray, wavelength_m: float, weights: FloatArray | None = None) -> float:
+    """Peak of the point image over that without aberration, |mean exp(i phase)|^2; NaN points do not count."""
+    known = np.isfinite(wavefront_m)
+    w = np.ones(known.sum()) if weights is None else weights[known]
+    return float(abs(np.average(np.exp(2j * math.pi * wavefront_m[known] / wavelength_m), weights=w)) ** 2)

@@ -1,0 +1,94 @@
+"""A Shack-Hartmann frame that another library propagates: its slopes are those of the wavefront."""
+
+import hcipy
+import numpy as np
+import pytest
+
+from aolink.optics.centroid import correlation_centroid
+from aolink.optics.lattice import cut_windows, find_lattice, flatten, match
+from aolink.optics.lenslets import Lenslets
+from aolink.optics.wavefront import ZonalReconstructor, modal_reconstructor, residual_rms, strehl, zernike_modes
+from aolink.optics.zernike import zernike, zernike_gradient
+
+DIAMETER, N, PIXELS, WAVELENGTH, F_NUMBER = 5e-3, 12, 384, 700e-9, 40
+PITCH = DIAMETER / N
+LENSLETS = Lenslets(grid=(13, 13), pitch_m=PITCH, focal_length_m=F_NUMBER * PITCH, pupil_diameter_m=DIAMETER)
+PIXEL = DIAMETER * 1.1 / PIXELS
+COEFFICIENTS = {4: 120e-9, 6: -80e-9, 7: 60e-9, 11: 30e-9}
+
+
+@pytest.fixture(scope="module")
+def frames() -> tuple[np.ndarray, np.ndarray]:
+    """Images behind the lenslets without aberration and with it, in counts."""
+    grid = hcipy.make_pupil_grid(PIXELS, DIAMETER * 1.1)
+    aperture = hcipy.make_circular_aperture(DIAMETER)(grid)
+    optics = hcipy.SquareShackHartmannWavefrontSensorOptics(grid, F_NUMBER, N, DIAMETER)
+    points = np.stack([grid.x, grid.y], axis=1) / (DIAMETER / 2)
+    path = sum(c * zernike(i, points) for i, c in COEFFICIENTS.items())
+    images = []
+    for phase in (np.zeros(len(points)), 2 * np.pi / WAVELENGTH * path):
+        light = hcipy.Wavefront(aperture * np.exp(1j * phase), WAVELENGTH)
+        images.append(np.asarray(optics.forward(light).power).reshape(PIXELS, PIXELS))
+    return tuple(1000 + 20_000 * image / images[0].max() for image in images)
+
+
+@pytest.fixture(scope="module")
+def measured(frames) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements by correlation with the reference's own spots, pixels, and the lenslet of each."""
+    reference, frame = (find_lattice(f) for f in frames)
+    moved = match(frame, reference)
+    half = 10
+    here, _ = cut_windows(flatten(frames[1])[0], reference.spots, half)
+    there, _ = cut_windows(flatten(frames[0])[0], reference.spots, half)
+    shifts = np.array([
+        correlation_centroid(a[None], b)[0] - correlation_centroid(b[None], b)[0]
+        for a, b in zip(here, there, strict=True)
+    ])  # fmt: skip
+    assert len(moved.spots) == len(reference.spots)
+    node = np.rint((reference.spots - (PIXELS - 1) / 2) * PIXEL / PITCH).astype(int) + 6
+    return shifts, node[:, 1] * 13 + node[:, 0]
+
+
+def expected_slopes() -> np.ndarray:
+    """Of the known wavefront, radians, (spots, 2)."""
+    r = DIAMETER / 2
+    return LENSLETS.mean_slopes(lambda p: sum(c * zernike_gradient(i, p / r) / r for i, c in COEFFICIENTS.items()))
+
+
+def whole(lenslet: np.ndarray) -> np.ndarray:
+    return LENSLETS.light[lenslet] > 0.999
+
+
+def test_the_lattice_is_that_of_the_lenslets(frames):
+    lattice = find_lattice(frames[0])
+    assert lattice.pitch * PIXEL == pytest.approx(PITCH, rel=1e-3)
+    assert abs(lattice.turn_deg) < 0.05
+
+
+def test_slopes_are_the_wavefronts_within_a_twentieth_of_a_pixel(measured):
+    shifts, lenslet = measured
+    per_pixel = LENSLETS.pixels_to_slope(PIXEL)
+    expected = expected_slopes()[lenslet] / per_pixel
+    error = (shifts - expected)[whole(lenslet)]
+    assert np.abs(expected).max() > 1.0  # they move by more than a pixel
+    assert whole(lenslet).sum() > 70
+    assert np.abs(error).max() < 0.05
+
+
+def test_the_wavefront_comes_back(measured):
+    shifts, lenslet = measured
+    use = whole(lenslet)
+    slopes = np.full((169, 2), np.nan)
+    slopes[lenslet[use]] = shifts[use] * LENSLETS.pixels_to_slope(PIXEL)
+    modes = zernike_modes(LENSLETS, 15)
+    weights = np.where(np.isfinite(slopes[:, 0]), modes.light, 0.0)
+    found = modal_reconstructor(modes.slopes, weights) @ np.nan_to_num(slopes).ravel()
+    true = np.array([COEFFICIENTS.get(i, 0.0) for i in modes.indices])
+    np.testing.assert_allclose(found, true, atol=3e-9)  # a two-hundredth of a wave
+    # And zone by zone: what is left of the wavefront after subtraction makes a perfect image.
+    lit = np.isfinite(slopes[:, 0]).reshape(13, 13)
+    values = ZonalReconstructor(lit, PITCH)(slopes.reshape(13, 13, 2))
+    path = modes.wavefront(true, LENSLETS.centres_m).reshape(13, 13)
+    assert residual_rms(values - path) < 0.1 * residual_rms(np.where(lit, path, np.nan))
+    assert strehl(np.where(lit, path, np.nan), WAVELENGTH) < 0.4
+    assert strehl(values - path, WAVELENGTH) > 0.99

@@ -1,0 +1,77 @@
+"""The interaction matrix measured on simulated rigs: against the plant that made the frames."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aolink.calibration.interaction import measure_interaction, poke_inputs, spot_slopes
+from aolink.errors import CalibrationError
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+SH = load_rig("sh-8x8")
+PLANT = SH.plant
+TRUE = PLANT.C @ np.linalg.solve(np.eye(PLANT.n_states) - PLANT.A, PLANT.B)
+
+
+def without_turbulence(rig):
+    return dataclasses.replace(rig, disturbance=dataclasses.replace(rig.disturbance, layers=()))
+
+
+def poked(rig, amplitude=8.0, **options):
+    u = rig.mirror.quantise(poke_inputs(rig, amplitude, **options))
+    return simulate(rig, len(u) // rig.timing.frame_period_steps, inputs=u)
+
+
+def test_poking_the_rig_gives_the_plants_own_matrix():
+    rig = without_turbulence(SH)
+    found = measure_interaction(rig, poked(rig))
+    assert found.exposures == 32
+    error = found.matrix - TRUE
+    # Centroids of 2000 photo-electrons and the read-out noise, over the root of two pokes of 8 Pa each way.
+    assert np.sqrt((error**2).mean()) < 0.05 * np.sqrt((TRUE**2).mean())
+    assert found.residual_rms < 0.05
+    assert found.condition == pytest.approx(np.linalg.cond(TRUE), rel=0.2)
+    static = SH.disturbance.zernike_m[0, 1]
+    assert static > 0
+    assert np.sqrt((found.offset**2).mean()) > 3 * found.residual_rms / np.sqrt(32)  # the aberration is in the offset
+
+
+def test_the_control_matrix_undoes_slopes_that_the_mirror_can_make():
+    rig = without_turbulence(SH)
+    found = measure_interaction(rig, poked(rig))
+    u = np.random.default_rng(1).uniform(-5, 5, 16)
+    np.testing.assert_allclose(found.control_matrix() @ (TRUE @ u), u, atol=1.0)
+    truncated = found.control_matrix(weakest=0.5)
+    assert np.linalg.matrix_rank(truncated) == (found.singular_values > 0.5 * found.singular_values[0]).sum() < 16
+
+
+def test_turbulence_costs_accuracy_and_nothing_else():
+    found = measure_interaction(SH, poked(SH))
+    calm = measure_interaction(without_turbulence(SH), poked(without_turbulence(SH)))
+    assert np.linalg.norm(found.matrix - TRUE) > np.linalg.norm(calm.matrix - TRUE)
+    assert found.residual_rms > calm.residual_rms
+
+
+def test_spots_are_in_the_rigs_order():
+    rig = dataclasses.replace(without_turbulence(SH), sensor=dataclasses.replace(SH.sensor, photoelectrons=0.0))
+    (exposure,) = simulate(rig, 1, inputs=np.zeros((100, 16)))
+    still = spot_slopes(rig.sensor, exposure.pixels)
+    np.testing.assert_allclose(still, exposure.truth.path.mean(axis=1), atol=0.05)
+
+
+def test_what_gives_no_matrix_is_refused():
+    rig = without_turbulence(SH)
+    with pytest.raises(CalibrationError, match="beyond the mirror's limits"):
+        poke_inputs(rig, 1e3)
+    exposures = poked(rig)
+    with pytest.raises(CalibrationError, match="do not tell 16 inputs apart"):
+        measure_interaction(rig, exposures[:20])
+    with pytest.raises(CalibrationError, match="hold each poke longer"):
+        measure_interaction(rig, poked(rig, rest_exposures=0))
+    with pytest.raises(CalibrationError, match="kind 'spots'"):
+        measure_interaction(load_rig("section-vi"), [])
+    dark = [dataclasses.replace(e, pixels=np.zeros_like(e.pixels)) for e in exposures]
+    with pytest.raises(CalibrationError, match="64 spots are missing"):
+        measure_interaction(rig, dark)
