@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
+from aolink.blocks import Indices, blockwise, components, eigenvalues, null_space
 from aolink.rig import Plant, Rig
 
 FloatArray = NDArray[np.float64]
@@ -23,6 +23,10 @@ _SMALL_PRODUCT = 100_000
 _LARGEST_CHECK = 200_000
 # A mode that shrinks to this over one exposure is gone before the next, whatever the camera saw of it.
 _FORGOTTEN = 1e-3
+# Eigenvalues closer than this are one; and a vector that A moves less from its multiple is an eigenvector.
+_SAME = 1e-7
+# What an eigenvector makes of the outputs, relative to their size, below which they do not see it.
+_UNSEEN = 1e-9
 
 
 def psd_root(covariance: FloatArray) -> FloatArray:
@@ -46,9 +50,14 @@ def lift(plant: Plant, n_steps: int) -> tuple[FloatArray, FloatArray]:
 
     By doubling, so that a gap of an hour costs no more than one of a second.
     """
-    n = plant.n_states
+    Q = plant.B_w @ plant.process_noise @ plant.B_w.T
+    transition, noise = blockwise(partial(_lifted, n_steps), (plant.A, Q), components(plant.A, Q))
+    return transition, noise
+
+
+def _lifted(n_steps: int, power: FloatArray, power_noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    n = len(power)
     transition, noise = np.eye(n), np.zeros((n, n))
-    power, power_noise = plant.A, plant.B_w @ plant.process_noise @ plant.B_w.T
     while n_steps:
         if n_steps & 1:
             transition, noise = power @ transition, power @ noise @ power.T + power_noise
@@ -171,15 +180,17 @@ class ObservabilityReport:
 
 def observability(plant: Plant, n_steps: int, fast_step_s: float) -> ObservabilityReport:
     """Rank of what the camera sees, mode by mode (Popov-Belevitch-Hautus), for exposures of ``n_steps``."""
-    rows = output_rows(plant, n_steps)
-    transition, _ = lift(plant, n_steps)
-    eigenvalues = _distinct(np.linalg.eigvals(plant.A))
-    blind = _unobservable(plant.A, plant.C, eigenvalues)
-    scale = float(np.linalg.norm(rows)) / math.sqrt(n_steps)
-    lifted = eigenvalues**n_steps
-    blind_centroid = _unobservable(transition, rows.mean(axis=1), lifted, scale)
+    A, parts = plant.A, components(plant.A)
+    transition, mean, square = blockwise(partial(_powers, n_steps), (A,), parts)
+    values = _distinct(eigenvalues(A, parts))
+    blind = [_unobservable(A, plant.C / np.linalg.norm(plant.C), value, parts) for value in values]
+    # The outputs' mean over an exposure, in units of what they are in its steps.
+    centroid = plant.C @ mean / math.sqrt(float(((plant.C @ square) * plant.C).sum()))
+    lifted = values**n_steps
+    distinct = _distinct(lifted)
+    lost = [_unobservable(transition, centroid, value, parts) for value in distinct]
     modes = []
-    for value, value_n in zip(eigenvalues, lifted, strict=True):
+    for value, value_n, unseen in zip(values, lifted, blind, strict=True):
         if value.imag < 0:
             continue
         radius = abs(value)
@@ -188,54 +199,66 @@ def observability(plant: Plant, n_steps: int, fast_step_s: float) -> Observabili
                 eigenvalue=complex(value),
                 frequency_hz=float(abs(np.angle(value))) / (2 * math.pi * fast_step_s),
                 time_constant_s=math.inf if radius >= 1 - 1e-12 else -fast_step_s / math.log(max(radius, 1e-300)),
-                seen=not _has_part_in(plant.A, value, blind),
-                seen_by_centroid=abs(value_n) < _FORGOTTEN or not _has_part_in(plant.A, value, blind_centroid),
+                seen=not unseen.shape[1],
+                seen_by_centroid=abs(value_n) < _FORGOTTEN
+                or not any(
+                    _has_part_in(A, value, space, parts)
+                    for other, space in zip(distinct, lost, strict=True)
+                    if abs(other - value_n) < _SAME
+                ),
             )
         )
     n = plant.n_states
     stable = bool(np.abs(lifted).max() < 1 - 1e-9)
-    centroid_rank = n - blind_centroid.shape[1]
+    # Eigenvectors of different eigenvalues are independent.
+    rank, centroid_rank = (n - sum(space.shape[1] for space in spaces) for spaces in (blind, lost))
     return ObservabilityReport(
         n_states=n,
-        rank=n - blind.shape[1],
+        rank=rank,
         centroid_rank=centroid_rank,
         modes=tuple(modes),
         o2_needs=_o2_needs(stable, centroid_rank == n),
     )
 
 
-def _distinct(eigenvalues: NDArray[Any]) -> NDArray[Any]:
-    """Eigenvalues without repetition: a mirror's actuators are alike, and what holds for one holds for all."""
+def _powers(n_steps: int, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A^N, and the means of A^i and of A^i A^i' for i from 0 to N - 1."""
+    power, total, squares = np.eye(len(A)), np.zeros_like(A), np.zeros_like(A)
+    for _ in range(n_steps):
+        total += power
+        squares += power @ power.T
+        power = power @ A
+    return power, total / n_steps, squares / n_steps
+
+
+def _distinct(values: NDArray[Any]) -> NDArray[Any]:
+    """Values without repetition: a mirror's actuators are alike, and what holds for one holds for all."""
     keep: list[complex] = []
-    for value in eigenvalues:
-        if all(abs(value - other) > 1e-7 for other in keep):
+    for value in values:
+        if all(abs(value - other) > _SAME for other in keep):
             keep.append(value)
     return np.array(keep)
 
 
-def _unobservable(A: FloatArray, C: FloatArray, eigenvalues: NDArray[Any], scale: float | None = None) -> FloatArray:
-    """Basis of the states that (A, C) cannot tell from zero, (n_states, dimension), real and orthonormal."""
-    C = C / (scale or np.linalg.norm(C))
-    if len(C) > len(A):
-        C = np.linalg.qr(C)[1]  # many outputs see no more than as many as there are states
-    blind = []
-    for value in eigenvalues:
-        pencil = np.vstack([value * np.eye(len(A)) - A, C])
-        null = linalg.null_space(pencil, rcond=1e-9 / max(1e-9, float(np.linalg.norm(pencil, 2))))
-        blind += [null.real, null.imag]
-    space = np.concatenate(blind, axis=1)
-    if not space.size or np.abs(space).max() < 1e-6:
-        return np.zeros((len(A), 0))
-    return np.asarray(linalg.orth(space, rcond=1e-6))
+def _unobservable(A: FloatArray, C: FloatArray, value: complex, parts: list[Indices]) -> NDArray[Any]:
+    """Basis of the eigenvectors for a value that (A, C) cannot tell from zero, (n_states, dimension), orthonormal."""
+    vectors = null_space(A, value, parts, _SAME)
+    seen = C @ vectors
+    if not vectors.shape[1]:
+        return vectors
+    if len(seen) > vectors.shape[1]:
+        seen = np.linalg.qr(seen)[1]
+    _, sizes, rows = np.linalg.svd(seen)
+    hidden = np.concatenate([sizes, np.zeros(len(rows) - len(sizes))]) < _UNSEEN
+    return np.asarray(vectors @ rows[hidden].conj().T)
 
 
-def _has_part_in(A: FloatArray, value: complex, space: FloatArray) -> bool:
+def _has_part_in(A: FloatArray, value: complex, space: NDArray[Any], parts: list[Indices]) -> bool:
     """Whether the invariant subspace of an eigenvalue of A has a part in ``space``."""
     if not space.shape[1]:
         return False
     # The eigenvalue's own left space: what it cannot annihilate has a part in the mode.
-    power = np.linalg.matrix_power(value * np.eye(len(A)) - A, len(A))
-    left = linalg.null_space(power.conj().T, rcond=1e-9)
+    left = null_space(A, value, parts, _SAME, left=True, power=len(A))
     return bool(np.linalg.norm(left.conj().T @ space) > 1e-6)
 
 
@@ -329,7 +352,7 @@ def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
     (axes * n_outputs, steps), and the largest standard deviation of each output in that time, (axes * n_outputs,).
     """
     plant, timing = rig.plant, rig.timing
-    radius = float(np.abs(np.linalg.eigvals(plant.A)).max())
+    radius = float(np.abs(eigenvalues(plant.A, components(plant.A))).max())
     settle = 5 / -math.log(radius) if 0 < radius < 1 - 1e-9 else 100 * timing.exposure_steps
     turns = 2 * rig.drive.period_s / timing.fast_step_s if rig.drive.kind == "sine" else 0
     n_steps = int(min(_LARGEST_CHECK, max(timing.exposure_steps, settle) + turns))

@@ -17,12 +17,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
+from aolink.blocks import stationary_covariance
 from aolink.disturbance import Disturbance, read_disturbance
 from aolink.errors import RigError
 from aolink.optical_plant import Optics, read_membrane, read_optics, read_tip_tilt, read_voltage
 from aolink.optics.mirror import VoltageLaw
+from aolink.scene import SceneSensor, read_scene
 from aolink.sensor import BaseSensor, read_calibration, read_grid, read_sensor
 from aolink.sensor import CalibrationTable as CalibrationTable
 from aolink.sensor import Kernel as Kernel
@@ -206,6 +207,8 @@ class Rig:
     optics: Optics | None
     """The lenslets, where the file describes them."""
     disturbance: Disturbance | None
+    scene: SceneSensor | None
+    """The picture sensor that shares the exposure, where the rig has one."""
     folder: Path
     """Of the file; where a file is named in it, its path is relative to this."""
     toml: str
@@ -242,7 +245,8 @@ def load_rig(path_or_name: str | Path) -> Rig:
     """
     path = Path(path_or_name)
     if path.suffix != ".toml" and str(path_or_name) in builtin_rigs():
-        text = (resources.files("aolink") / "rigs" / f"{path_or_name}.toml").read_text()
+        path = Path(str(resources.files("aolink") / "rigs")) / f"{path_or_name}.toml"
+        text = path.read_text()
     else:
         try:
             text = path.read_text()
@@ -277,20 +281,22 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     timing = _timing(root.table("timing"))
     optics = read_optics(root.table("lenslets"), read_grid(root.table("sensor"))) if root.has("lenslets") else None
     plant = _plant(root, optics, timing)
-    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, optics.field if optics else None)
+    seen = (optics.field, optics.light) if optics else (None, None)
+    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, *seen)
     n_inputs = plant.axes * plant.n_inputs
     mirror = _mirror(root.table("mirror"), n_inputs, timing)
     drive = _drive(root.table("drive", optional=True), n_inputs, mirror)
     disturbance = read_disturbance(root.table("disturbance")) if root.has("disturbance") else None
     if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
         raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
+    scene = read_scene(root.table("scene")) if root.has("scene") else None
     simulation = _simulation(root.table("simulation", optional=True))
     calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
     root.finish()
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
         mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,
-        optics=optics, disturbance=disturbance, folder=folder or Path(), toml=text,
+        optics=optics, disturbance=disturbance, scene=scene, folder=folder or Path(), toml=text,
     )  # fmt: skip
 
 
@@ -302,7 +308,8 @@ def _plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
             raise RigError("plant.kind = 'membrane' needs [lenslets], to know the slopes that deflections make")
         model = read_membrane(table, optics, timing.fast_step_s)
     elif kind == "tip-tilt":
-        model = read_tip_tilt(table, math.prod(read_grid(root.table("sensor"))), timing.fast_step_s)
+        spots = int(optics.lit.sum()) if optics else math.prod(read_grid(root.table("sensor")))
+        model = read_tip_tilt(table, spots, timing.fast_step_s)
     else:
         return _plant_by_matrices(table)
     # A number is the variance of each noise.
@@ -310,10 +317,10 @@ def _plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
     if (W < 0).any():
         raise RigError("plant.process_noise has a variance below zero")
     table.finish()
-    initial = linalg.solve_discrete_lyapunov(model.A, model.B_w @ W @ model.B_w.T)
+    initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
-        initial_covariance=np.asarray(initial, dtype=np.float64), axes=1,
+        initial_covariance=initial, axes=1,
     )  # fmt: skip
 
 
@@ -338,7 +345,7 @@ def _plant_by_matrices(table: Table) -> Plant:
                 f"plant.initial_covariance is missing: plant.A has an eigenvalue of modulus {radius:.6g},"
                 " so there is no stationary covariance; give a matrix"
             )
-        covariance = np.asarray(linalg.solve_discrete_lyapunov(A, B_w @ W @ B_w.T), dtype=np.float64)
+        covariance = stationary_covariance(A, B_w @ W @ B_w.T)
     else:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)

@@ -143,7 +143,8 @@ class SpotSensor(BaseSensor):
     """A camera behind lenslets: a grid of windows, a spot in each, seen in two directions.
 
     The rig's outputs are spot 0's slope along x (columns), spot 0's along y (rows), spot 1's along x, ...;
-    spots are counted along the rows of the grid.
+    spots are counted along the rows of the grid, windows in the dark left out. Densities are those of a wholly lit
+    lenslet's spot: of one that is lit in part, a window has so much less.
     """
 
     kind: Literal["spots"]
@@ -151,11 +152,23 @@ class SpotSensor(BaseSensor):
     """Rows and columns of windows."""
     window: tuple[int, int]
     """Rows and columns of pixels in a window; a square."""
+    light: tuple[float, ...] | None = None
+    """Share of each window's lenslet that is lit, along the rows of the grid; 0 without a spot. None: all is."""
 
     @property
     def spots(self) -> int:
         """Number of spots."""
-        return self.grid[0] * self.grid[1]
+        return len(self.lit)
+
+    @cached_property
+    def lit(self) -> NDArray[np.intp]:
+        """Windows that have a spot, counted along the rows of the grid, (spots,)."""
+        return np.arange(self.grid[0] * self.grid[1]) if self.light is None else np.flatnonzero(self.light)
+
+    @cached_property
+    def spot_light(self) -> FloatArray | None:
+        """Share of each spot's lenslet that is lit, (spots,); None where all is."""
+        return None if self.light is None else np.array(self.light)[self.lit]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -223,14 +236,20 @@ class CalibrationTable:
     """Kind, name and SHA-256 of each recording that was used."""
 
 
-def read_sensor(table: Table, axes: int, n_outputs: int, field: tuple[float, float] | None = None) -> BaseSensor:
+def read_sensor(
+    table: Table, axes: int, n_outputs: int, field: tuple[float, float] | None = None,
+    light: tuple[float, ...] | None = None,
+) -> BaseSensor:  # fmt: skip
     """The table ``[sensor]``, for a plant of ``axes`` copies with ``n_outputs`` each. Raises `RigError`.
 
-    ``field`` follows from the lenslets where the rig file describes them.
+    ``field`` and ``light`` follow from the lenslets where the rig file describes them.
     """
     kind = table.choice("kind", ("line", "spots"))
     read_out = _read_out(table, field)
-    sensor = _line(table, axes * n_outputs, read_out) if kind == "line" else _spots(table, axes, n_outputs, read_out)
+    if kind == "line":
+        sensor: BaseSensor = _line(table, axes * n_outputs, read_out)
+    else:
+        sensor = _spots(table, axes, n_outputs, read_out | {"light": light})
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
     table.finish()
@@ -258,16 +277,17 @@ def _spots(table: Table, axes: int, n_outputs: int, read_out: dict[str, Any]) ->
     height, width = table.integers("window", 2, "rows and columns of pixels", low=2, high=256)
     if height != width:
         raise RigError(f"sensor.window = [{height}, {width}] is not square: a window needs as many rows as columns")
-    if axes * n_outputs != 2 * rows * columns:
+    sensor = SpotSensor(kind="spots", grid=(rows, columns), window=(height, width), **read_out)
+    if axes * n_outputs != 2 * sensor.spots:
+        windows = "" if sensor.light is None else f" in {sensor.spots} lit windows"
         raise RigError(
-            f"sensor.grid = [{rows}, {columns}] sees {2 * rows * columns} slopes, two a spot, but the plant has"
+            f"sensor.grid = [{rows}, {columns}] sees {2 * sensor.spots} slopes{windows}, two a spot, but the plant has"
             f" {axes * n_outputs} (plant.axes times the rows of plant.C)"
         )
     if n_outputs > 1 and n_outputs % 2:
         raise RigError(
             f"plant.C has {n_outputs} rows: for sensor.kind = 'spots' it needs one, or two for each spot that it moves"
         )
-    sensor = SpotSensor(kind="spots", grid=(rows, columns), window=(height, width), **read_out)
     if sensor.kernel.matrix is not None and n_outputs == 1:
         raise RigError(
             "sensor.kernel.sigma is a matrix, but each copy of the plant moves a spot along one direction only: give a"
@@ -284,7 +304,7 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
     if field[0] >= field[1]:
         raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
     kernel_table = table.table("kernel")
-    kernel = _kernel(kernel_table)
+    kernel = read_kernel(kernel_table)
     kernel_table.finish()
     return {
         "field": (float(field[0]), float(field[1])),
@@ -297,7 +317,8 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
     }
 
 
-def _kernel(table: Table) -> Kernel:
+def read_kernel(table: Table) -> Kernel:
+    """A table ``kernel``. Raises `RigError`."""
     shape = table.choice("shape", ("gaussian",))
     if not isinstance(table.get("sigma"), list):
         return Kernel(shape=shape, sigma=table.number("sigma", above=0.0))

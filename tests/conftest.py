@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from aolink.demo import simulated_rig
-from aolink.rig import load_rig
+from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 
 ESTIMATORS = ("open-loop", "o1", "o2", "o3")
@@ -69,3 +69,11 @@ def start_aolink(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
 def mmirs() -> Path:
     """Folder of a real telescope's frames, with their licence."""
     return Path(__file__).parent / "data" / "mmirs"
+
+
+def without_pupil(rig: Rig) -> Rig:
+    """sh-8x8 with all of its lenslets lit."""
+    lines = rig.toml.splitlines(keepends=True)
+    return parse_rig(
+        "".join(each for each in lines if not each.startswith(("pupil_m = 2.4e-3      # d", "obstr", "least")))
+    )

@@ -29,8 +29,8 @@ def test_poking_the_rig_gives_the_plants_own_matrix():
     found = measure_interaction(rig, poked(rig))
     assert found.exposures == 32
     error = found.matrix - TRUE
-    # Centroids of 2000 photo-electrons and the read-out noise, over the root of two pokes of 8 Pa each way.
-    assert np.sqrt((error**2).mean()) < 0.05 * np.sqrt((TRUE**2).mean())
+    # Centroids of 2000 photo-electrons, fewer at the pupil's edge, and read-out noise, over the root of two pokes.
+    assert np.sqrt((error**2).mean()) < 0.06 * np.sqrt((TRUE**2).mean())
     assert found.residual_rms < 0.05
     assert found.condition == pytest.approx(np.linalg.cond(TRUE), rel=0.2)
     static = SH.disturbance.zernike_m[0, 1]
@@ -73,5 +73,5 @@ def test_what_gives_no_matrix_is_refused():
     with pytest.raises(CalibrationError, match="kind 'spots'"):
         measure_interaction(load_rig("section-vi"), [])
     dark = [dataclasses.replace(e, pixels=np.zeros_like(e.pixels)) for e in exposures]
-    with pytest.raises(CalibrationError, match="64 spots are missing"):
+    with pytest.raises(CalibrationError, match="48 spots are missing"):
         measure_interaction(rig, dark)

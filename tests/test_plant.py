@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import linalg
 
+from aolink.blocks import components, stationary_covariance
 from aolink.plant import check_rig, input_response, lift, nominal_path, observability, output_rows, psd_root
 from aolink.rig import Plant, Rig, load_rig
 
@@ -228,3 +230,39 @@ def test_the_check_of_many_copies_finds_the_one_that_goes_too_far() -> None:
     drive = dataclasses.replace(rig.drive, amplitude=amplitude)
     findings = check_rig(dataclasses.replace(rig, drive=drive))
     assert [f.key for f in findings if f.severity == "error"] == ["drive.amplitude"]
+
+
+def test_blocks_give_what_the_whole_matrices_give():
+    """Small systems side by side in any order of the states, some alike, against the dense formulas."""
+    rng = np.random.default_rng(7)
+    blocks = [rng.standard_normal((k, k)) for k in (1, 3, 2)]
+    blocks = [0.9 * each / np.abs(np.linalg.eigvals(each)).max() for each in blocks]
+    A = linalg.block_diag(blocks[1], blocks[0], blocks[1], blocks[2])
+    B_w = linalg.block_diag(*(rng.standard_normal((k, 2)) for k in (3, 1, 3, 2)))
+    turn = rng.permutation(9)
+    A, B_w = A[np.ix_(turn, turn)], B_w[turn]
+    Q = B_w @ B_w.T
+    assert sorted(map(len, components(A, Q))) == [1, 2, 3, 3]
+    np.testing.assert_allclose(stationary_covariance(A, Q), linalg.solve_discrete_lyapunov(A, Q), atol=1e-12)
+    plant = dataclasses.replace(RIG.plant, A=A, B_w=B_w, process_noise=np.eye(8))
+    transition, noise = lift(plant, 5)
+    powers = [np.linalg.matrix_power(A, k) for k in range(6)]
+    np.testing.assert_allclose(transition, powers[5], atol=1e-12)
+    np.testing.assert_allclose(noise, sum(each @ Q @ each.T for each in powers[:5]), atol=1e-12)
+
+
+@pytest.mark.parametrize("outputs", [2, 5, 9])
+def test_ranks_are_those_of_the_observability_matrix(outputs):
+    """Three actuators alike, seen through few outputs or many, against the rank of all powers together."""
+    one = np.array([[0.6, 0.5], [-0.5, 0.6]])
+    A = linalg.block_diag(one, one, one, 0.8)
+    C = np.random.default_rng(8).standard_normal((outputs, 7))
+    C[:, 4:6] = C[:, :2]  # the third moves as the first does
+    plant = dataclasses.replace(RIG.plant, A=A, C=C)
+    report = observability(plant, 3, 0.001)
+    seen = np.concatenate([C @ np.linalg.matrix_power(A, k) for k in range(7)])
+    assert report.rank == np.linalg.matrix_rank(seen, tol=1e-9) == 5
+    mean = C @ sum(np.linalg.matrix_power(A, k) for k in range(3)) / 3
+    by_centroid = np.concatenate([mean @ np.linalg.matrix_power(A, 3 * k) for k in range(7)])
+    assert report.centroid_rank == np.linalg.matrix_rank(by_centroid, tol=1e-9)
+    assert [mode.seen for mode in report.modes] == [False, True]

@@ -12,6 +12,7 @@ from aolink.errors import CalibrationError
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
+from aolink.optics.frame import spot_windows
 from aolink.rig import Rig
 from aolink.sensor import SpotSensor
 
@@ -105,8 +106,7 @@ def measure_interaction(rig: Rig, exposures: Iterable[Exposure]) -> Interaction:
 
 def spot_slopes(sensor: SpotSensor, pixels: NDArray[np.uint16]) -> FloatArray:
     """Thresholded centroid of each spot in the rig's order, slope units, (2 spots,); NaN where there is no spot."""
-    (rows, columns), side = sensor.grid, sensor.window[0]
-    density = to_density(sensor, pixels).reshape(rows, side, columns, side).swapaxes(1, 2).reshape(-1, side, side)
+    density = spot_windows(sensor, to_density(sensor, pixels))
     noise = np.sqrt(sensor.noise_density / sensor.pixel_size)
     place = centre_of_gravity(density, _THRESHOLD_SD * noise)
     return np.asarray(sensor.field[0] + (place + 0.5) * sensor.pixel_width).ravel()

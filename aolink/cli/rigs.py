@@ -313,7 +313,7 @@ def replay(
     from aolink.session.replay import replay as replay_recording
 
     scorers = {name: Scorer() for name in names}
-    viewer = viewing.live_viewer(recording.rig, names) if view else nullcontext()
+    viewer = viewing.live_viewer(recording.rig, names, recording.true_scene) if view else nullcontext()
     with viewer as shown, StopRequest().installed() as stop:
         total = recording.counts.get("/camera/image", 0)
         with progress_bar(stderr, total if end is None and not start else None) as tell:
@@ -430,7 +430,7 @@ def demo(
     folder = new_folder(out)
     with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
         result = run_demo(
-            loaded, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
+            loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
         )  # fmt: skip
     if not stop():
         recording = Recording(result.recording)

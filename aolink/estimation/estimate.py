@@ -66,7 +66,7 @@ class Estimate:
     innovation: FloatArray
     """Measurement minus its prediction, (axes, n_measurements)."""
     innovation_covariance: FloatArray
-    """(axes, n_measurements, n_measurements)"""
+    """(axes, n_measurements, n_measurements); of more than 32 measurements its diagonal, (axes, n_measurements)."""
     nis: FloatArray
     """Normalised innovation squared, (axes,); zero for an axis of which nothing was measured.
 

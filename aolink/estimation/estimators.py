@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
+from aolink.estimation.centroids import centroid_covariance
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.exposure_model import InputResponse, exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
@@ -19,22 +20,19 @@ from aolink.estimation.mixture import MixtureUpdates
 from aolink.estimation.moments import (
     Flux,
     Measurement,
-    known_flux_covariance,
     least_significance,
     measure_moments,
-    noise_integrals,
     spot_significance,
 )
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
 from aolink.estimation.profile import ProfileUpdates
 from aolink.estimation.sampled import SampledUpdates
-from aolink.estimation.spots import centroid_noise, measure_spots
+from aolink.estimation.spots import measure_spots
 from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.exposure import Exposure
-from aolink.optics.camera import effective_noise_density, is_saturated, to_density
+from aolink.optics.camera import is_saturated, to_density
 from aolink.rig import Rig, Sensor, SpotSensor
-from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 Engine = Literal["aolink", "filterpy"]
@@ -49,6 +47,8 @@ ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments", *_OF
 """The names that `make_estimator` knows."""
 
 _HIGHEST_ORDER = 8
+# Of one copy of the plant, by `moments`.
+_MOST_SPOTS = 128
 # Share of the pixels that `moments` can do with.
 _LEAST_USABLE = 0.5
 # Exposures together, and numbers in them.
@@ -197,7 +197,7 @@ def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, 
         orders = observation.orders if isinstance(observation, PathMoments) else None
         return measure_spots(
             sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
-            least_usable=_LEAST_USABLE, least_significance=least_significance(sensor.profile),
+            least_usable=_LEAST_USABLE, least_significance=_least_significance(sensor),
         )  # fmt: skip
     sensor = sensor.profile
     saturated = is_saturated(sensor, pixels) & exposure.mask
@@ -219,6 +219,12 @@ def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, 
         return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
     moments = measure_moments(sensor, pixels.reshape(rows), observation.orders, options.flux)
     return (None, moments) if isinstance(moments, str) else (moments, "")
+
+
+def _least_significance(sensor: SpotSensor) -> FloatArray:
+    """`least_significance` of each profile, (n_outputs,), or of all."""
+    light = 1.0 if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)
+    return least_significance(sensor.profile, light)
 
 
 def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
@@ -260,6 +266,11 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
         raise EstimatorError(
             f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
+        )
+    if name == "moments" and rig.plant.n_outputs > 2 * _MOST_SPOTS:
+        raise EstimatorError(
+            f"moments looks at each two spots that one plant moves together: at most {_MOST_SPOTS},"
+            f" {rig.name} has {rig.plant.n_outputs // 2}; use o3"
         )
     return Estimator(rig, name, chosen)
 
@@ -327,26 +338,16 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
 
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
-    """The gain of o1 with the noise that a frame has by the rig file; None where there is none."""
+    """The gain of o1 with the noise that a frame has by the rig file, of all axes or of each; None if there is none."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
-    sensor, plant = rig.sensor, rig.plant
-    if isinstance(sensor, SpotSensor):
-        noise = centroid_noise(sensor, plant.n_outputs)
-    else:
-        line = sensor.profile
-        noise = known_flux_covariance(effective_noise_density(line), noise_integrals(line, 2), [1])
-    if sensor.photoelectrons:
-        # y_2 / photoelectrons, of a spot where the plant's prior has it.
-        spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
-        noise = noise + np.diag(spread + _kernel_variances(sensor, plant.n_outputs)) / sensor.photoelectrons
-    return steady_gain(model, added_noise(model, options.process_noise), noise)
-
-
-def _kernel_variances(sensor: BaseSensor, n_outputs: int) -> FloatArray:
-    """Variance of the kernel along each output of one copy, (n_outputs,)."""
-    if n_outputs == 1:
-        return np.array([sensor.kernel.variance])
-    return np.tile(np.diag(sensor.kernel.covariance), n_outputs // 2)
+    Q = added_noise(model, options.process_noise)
+    # Axes whose spots have as much light share a gain.
+    noises, of_axis = np.unique(centroid_covariance(rig), axis=0, return_inverse=True)
+    gains = [steady_gain(model, Q, noise) for noise in noises]
+    if len(gains) == 1:
+        return gains[0]
+    known = [gain for gain in gains if gain is not None]
+    return np.array(known)[of_axis] if len(known) == len(gains) else None
 
 
 # From good to bad; the worst of all axes is the estimate's status.

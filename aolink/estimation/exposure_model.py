@@ -62,10 +62,10 @@ class ExposureModel:
         self.transition, self.process_noise = lift(plant, n_steps)
         self.mean_row = self.state_rows.mean(axis=1)
         """C-bar, (n_outputs, n_states)."""
-        self.quadratic = np.einsum("oij,oik->ojk", self.state_rows, self.state_rows) / n_steps
-        """M = mean_i (C A^i)'(C A^i) for each output, (n_outputs, n_states, n_states)."""
         self.moved = 0.0
         """f/N: the share of the exposure that is in the step after its last, and not in its first."""
+        # Many outputs are sums of few states: what is computed then are paths of the states.
+        self._few = replace(plant, C=np.eye(plant.n_states)) if plant.n_outputs > plant.n_states else plant
 
     def starting(self, offset: float) -> ExposureModel:
         """The same for exposures that start so far into their first fast step, in fast steps, 0 <= offset < 1."""
@@ -76,9 +76,18 @@ class ExposureModel:
         model.moved = offset / self.n_steps
         first, last = self.plant.C, self.last_rows
         model.mean_row = self.mean_row + model.moved * (last - first)
-        squares = last[:, :, None] * last[:, None, :] - first[:, :, None] * first[:, None, :]
-        model.quadratic = self.quadratic + model.moved * squares
+        model.__dict__.pop("quadratic", None)  # it is another
         return model
+
+    @cached_property
+    def quadratic(self) -> FloatArray:
+        """M = mean_i (C A^i)'(C A^i) for each output, (n_outputs, n_states, n_states)."""
+        mean = np.einsum("oij,oik->ojk", self.state_rows, self.state_rows) / self.n_steps
+        if not self.moved:
+            return np.asarray(mean)
+        first, last = self.plant.C, self.last_rows
+        squares = last[:, :, None] * last[:, None, :] - first[:, :, None] * first[:, None, :]
+        return np.asarray(mean + self.moved * squares)
 
     @cached_property
     def last_rows(self) -> FloatArray:
@@ -88,12 +97,18 @@ class ExposureModel:
     @property
     def n_coefficients(self) -> int:
         """States and noise coefficients together."""
-        return int(self.basis.shape[2])
+        return int(self.end_rows.shape[1])
 
     @property
     def basis(self) -> FloatArray:
         """Paths of the coefficients, (n_outputs, n_steps, n_coefficients); the first n_states are C A^i."""
-        return self._with_noise[0]
+        outputs, paths = self.factors
+        return paths if outputs is None else np.tensordot(outputs, paths, axes=1)
+
+    @property
+    def factors(self) -> tuple[FloatArray | None, FloatArray]:
+        """The basis as a product, where outputs are more than states: C, and paths of the states, (n_states, ...)."""
+        return None if self._few is self.plant else self.plant.C, self._with_noise[0]
 
     @property
     def end_rows(self) -> FloatArray:
@@ -109,15 +124,16 @@ class ExposureModel:
 
     @cached_property
     def _with_noise(self) -> tuple[FloatArray, FloatArray]:
-        """Start columns and noise columns of path and end state.
+        """Start columns and noise columns of path and end state; of the states' paths where they are fewer.
 
         Each noise channel is a sum of cosines, of unit variance each and orthonormal over the fast steps.
         """
-        plant, n_steps = self.plant, self.n_steps
+        plant, n_steps = self._few, self.n_steps
+        rows = self.state_rows if plant is self.plant else output_rows(plant, n_steps)
         root = plant.B_w @ psd_root(plant.process_noise)
-        impulse = self.state_rows @ root  # C A^i B_w, (n_outputs, n_steps, n_noises)
-        energy = (np.arange(n_steps - 1, -1, -1)[:, None] * impulse**2).sum()
-        paths, ends, found = [self.state_rows], [self.transition], 0.0
+        impulse = rows @ root  # C A^i B_w, (n_outputs, n_steps, n_noises)
+        energy = (np.arange(n_steps - 1, -1, -1)[:, None] * self._squares(impulse)).sum()
+        paths, ends, found = [rows], [self.transition], 0.0
         phase = np.pi * (np.arange(n_steps) + 0.5) / n_steps
         driven = [replace(plant, B=column[:, None], axes=1) for column in root.T]
         for m in range(min(_MOST_NOISE_MODES, n_steps)):
@@ -127,8 +143,15 @@ class ExposureModel:
             channels = [input_response(channel, cosine[None, :, None]) for channel in driven]
             paths.append(np.stack([path[0] for path, _ in channels], axis=-1))
             ends.append(np.stack([end[0] for _, end in channels], axis=-1))
-            found += float((paths[-1] ** 2).sum())
+            found += float(self._squares(paths[-1]).sum())
         return np.concatenate(paths, axis=2), np.concatenate(ends, axis=1)
+
+    def _squares(self, paths: FloatArray) -> FloatArray:
+        """What sums up to the sum of squares over outputs, from `_few` plant's paths, (., n_steps, n)."""
+        if self._few is self.plant:
+            return paths**2
+        C = self.plant.C
+        return np.asarray(paths * np.tensordot(C.T @ C, paths, axes=1))
 
     def response(self, inputs: FloatArray) -> InputResponse:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
@@ -137,13 +160,13 @@ class ExposureModel:
     def responses(self, inputs: Sequence[FloatArray]) -> list[InputResponse]:
         """`response` of many exposures, each to the same bits, for a fraction of the calls."""
         path, end = input_response(self.plant, np.concatenate([by_axis(self.plant, each) for each in inputs]))
-        # Column by column, so that the products lie in memory as they are summed.
-        columns = [stacked.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
-        mean, slope, square = (
-            stacked.mean_over_path(path),
-            np.stack(columns, axis=-1),
-            stacked.mean_over_path(path * path),
-        )
+        mean, square = stacked.mean_over_path(path), stacked.mean_over_path(path * path)
+        if self._few is self.plant:
+            # Column by column, so that the products lie in memory as they are summed.
+            columns = [stacked.mean_over_path(path * column) for column in self._columns[: self.plant.n_states]]
+            slope = np.stack(columns, axis=-1)
+        else:
+            slope = np.matmul(path[:, :, None], self.state_rows)[:, :, 0] / self.n_steps
         if self.moved:
             # Inputs have done nothing yet in the first step.
             late = self.moved * self.last_response(end)
@@ -182,6 +205,10 @@ class ExposureModel:
     def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
         """basis @ coefficients + c; coefficients (axes, any first ones), c and result (axes, n_outputs, n_steps)."""
         path = input_path.copy()
+        if self._few is not self.plant:
+            paths = self._with_noise[0][..., : coefficients.shape[1]]
+            states = np.matmul(paths, coefficients[:, None, :, None])[..., 0]
+            return np.asarray(path + np.matmul(self.plant.C, states))
         for j in range(coefficients.shape[1]):
             path += self._columns[j] * coefficients[:, j, None, None]
         return path
@@ -190,6 +217,11 @@ class ExposureModel:
         """Standard deviation of the path, (axes, n_outputs, n_steps), from (axes, n_coefficients, n_coefficients)."""
         count = covariance.shape[1]
         covariance = np.ascontiguousarray(covariance)[:, None]
+        if self._few is not self.plant:
+            C, paths = np.ascontiguousarray(self.plant.C.T), self._with_noise[0].swapaxes(0, 1)[..., :count]
+            of_states = np.matmul(np.matmul(paths, covariance), paths.swapaxes(1, 2))  # at each step
+            each = [np.maximum((np.matmul(of_states[:, k], C) * C).sum(axis=1), 0.0) for k in range(self.n_steps)]
+            return np.asarray(np.sqrt(np.stack(each, axis=-1)))
         variance = np.empty((len(covariance), self.plant.n_outputs, self.n_steps))
         basis = self.state_rows if count <= self.plant.n_states else self.basis
         for start in range(0, self.n_steps, _TIME_BLOCK):

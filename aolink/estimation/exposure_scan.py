@@ -16,15 +16,12 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.errors import EstimatorError
+from aolink.estimation.centroids import centroid_covariance
 from aolink.estimation.exposure_model import exposure_model
 from aolink.estimation.filter import added_noise
-from aolink.estimation.moments import known_flux_covariance, noise_integrals
 from aolink.estimation.observation import steady_gain
-from aolink.estimation.spots import centroid_noise
-from aolink.optics.camera import effective_noise_density
 from aolink.plant import lift, psd_root
 from aolink.rig import Rig
-from aolink.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
 
@@ -88,23 +85,19 @@ def best(errors: Iterable[ExpectedError]) -> ExpectedError:
     return min(errors, key=lambda e: e.path_rms)
 
 
-def centroid_covariance(rig: Rig) -> FloatArray:
-    """Covariance of the centroids of one copy of the plant by read-out and shot noise, (n_outputs, n_outputs)."""
-    sensor, plant = rig.sensor, rig.plant
-    if isinstance(sensor, SpotSensor):
-        noise = centroid_noise(sensor, plant.n_outputs)
-    else:
-        noise = known_flux_covariance(effective_noise_density(sensor.profile), noise_integrals(sensor.profile, 2), [1])
-    if sensor.photoelectrons:
-        spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
-        noise = noise + np.diag(spread + sensor.kernel.variance) / sensor.photoelectrons
-    return noise
-
-
 def _expected(rig: Rig) -> ExpectedError:
+    """Over all copies of the plant, of which those whose spots have as much light are alike."""
+    noises, counts = np.unique(centroid_covariance(rig), axis=0, return_counts=True)
+    each = [_expected_of(rig, linalg.block_diag(*noise)) for noise in noises]
+    squares = np.array([[e.path_rms**2, e.end_rms**2, e.noise_rms**2] for e in each])
+    path, end, noise = np.sqrt(counts @ squares / counts.sum()).tolist()
+    return ExpectedError(exposure_steps=rig.timing.exposure_steps, path_rms=path, end_rms=end, noise_rms=noise)
+
+
+def _expected_of(rig: Rig, R: FloatArray) -> ExpectedError:
     plant, n = rig.plant, rig.timing.exposure_steps
     model = exposure_model(plant, n)
-    R, H, F = centroid_covariance(rig), model.mean_row, model.transition
+    H, F = model.mean_row, model.transition
     K = steady_gain(model, added_noise(model, "lifted"), R)
     if K is None:
         raise EstimatorError(

@@ -14,7 +14,7 @@ from scipy import special
 from aolink.estimation import entries, stacked
 from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
-from aolink.estimation.observation import Belief, Correction, Observation
+from aolink.estimation.observation import MOST_COVARIANCES, Belief, Correction, Observation
 from aolink.plant import input_response, lift
 from aolink.rig import Plant
 
@@ -42,7 +42,7 @@ class Posterior:
     innovation: FloatArray
     """(axes, n_measurements)"""
     innovation_covariance: FloatArray
-    """(axes, n_measurements, n_measurements)"""
+    """(axes, n_measurements, n_measurements), or of many measurements its diagonal, (axes, n_measurements)."""
     nis: FloatArray
     """(axes,)"""
     several: NDArray[np.bool_] | None = None
@@ -130,7 +130,7 @@ class BlurFilter:
             end=self.belief,
             status=status,
             innovation=_numbers(done.innovation),
-            innovation_covariance=_numbers(done.innovation_covariance),
+            innovation_covariance=_numbers(_kept(done.innovation_covariance)),
             nis=_numbers(done.nis),
         )
 
@@ -192,8 +192,16 @@ def _without(done: Correction, usable: NDArray[np.bool_] | None) -> Correction:
     if usable is None:
         return done
     innovation = np.where(usable[:, None], done.innovation, 0.0)
-    covariance = np.where(usable[:, None, None], done.innovation_covariance, 0.0)
+    covariance = done.innovation_covariance
+    covariance = np.where(usable.reshape(-1, *[1] * (covariance.ndim - 1)), covariance, 0.0)
     return Correction(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
+
+
+def _kept(covariance: FloatArray) -> FloatArray:
+    """An innovation covariance, or its diagonal where it is large."""
+    if covariance.ndim == 3 and covariance.shape[-1] > MOST_COVARIANCES:
+        return np.array(np.einsum("amm->am", covariance))
+    return covariance
 
 
 def _with_noise(state: Belief, count: int) -> Belief:

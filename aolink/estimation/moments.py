@@ -38,7 +38,7 @@ class Measurement:
     value: FloatArray
     """(axes, n_measurements)"""
     covariance: FloatArray
-    """(axes, n_measurements, n_measurements)"""
+    """(axes, n_measurements, n_measurements), or blocks along its diagonal, (axes, blocks, size, size)."""
     usable: NDArray[np.bool_] | None = None
     """False for axes of which nothing was measured, (axes,); None if there are none."""
 
@@ -107,7 +107,9 @@ def without_kernel(kernel: FloatArray, highest: int) -> FloatArray:
     return np.asarray(np.linalg.inv(mixing))
 
 
-def measure_moments(sensor: Sensor, counts: Counts, orders: Sequence[int], flux: Flux = "known") -> Measurement | str:
+def measure_moments(
+    sensor: Sensor, counts: Counts, orders: Sequence[int], flux: Flux = "known", light: FloatArray | None = None
+) -> Measurement | str:
     """Moments of line-sensor frames without the kernel, y_p with E[y_p] = mean(theta^p).
 
     Parameters
@@ -118,6 +120,8 @@ def measure_moments(sensor: Sensor, counts: Counts, orders: Sequence[int], flux:
         Which moments, from 1.
     flux:
         "known": the total is one, as Mishra & Wen (9) to (11) take it; "measured": divide by it, as (7) does.
+    light:
+        Light of each spot, of the sensor's whole one, (axes,); one where None.
 
     Returns
     -------
@@ -127,7 +131,10 @@ def measure_moments(sensor: Sensor, counts: Counts, orders: Sequence[int], flux:
     noise = effective_noise_density(sensor) * noise_integrals(sensor, 2 * highest)
     if sensor.photoelectrons:
         noise = with_shot_noise(noise, counts, sensor.black_level, lambda light: _shot_sums(sensor, light, 2 * highest))
-    return moments_from_sums(raw_moments(sensor, counts, highest), noise, _unmixing(sensor, highest), orders, flux)
+    raw = raw_moments(sensor, counts, highest)
+    if light is not None:
+        raw, noise = raw / light[:, None], noise / light[:, None] ** 2
+    return moments_from_sums(raw, noise, _unmixing(sensor, highest), orders, flux)
 
 
 def with_shot_noise(
@@ -223,14 +230,15 @@ def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
     return np.asarray(np.max(gained, axis=0) * math.sqrt(sensor.pixel_width / effective_noise_density(sensor)))
 
 
-def least_significance(sensor: Sensor) -> float:
+def least_significance(sensor: Sensor, light: FloatArray | float = 1.0) -> FloatArray:
     """What `spot_significance` is to reach in a frame with a spot, however widely it is smeared.
 
     Light as wide as the field stands out by its total over the total's noise, one less by chance. Where that is
     much, a frame without a spot hardly ever gets there; where it is little, most do, and their noise speaks for itself.
+    ``light`` is the spot's, of the sensor's whole one.
     """
-    total = 1 / math.sqrt(effective_noise_density(sensor) * (sensor.field[1] - sensor.field[0]))
-    return min(max(total - 1, _LEAST), _ENOUGH)
+    total = light / math.sqrt(effective_noise_density(sensor) * (sensor.field[1] - sensor.field[0]))
+    return np.clip(total - 1, _LEAST, _ENOUGH)
 
 
 @lru_cache(maxsize=16)

@@ -31,6 +31,8 @@ def measure_moments_2d(
     noise_density: float,
     orders: Sequence[Order] = PLANE_ORDERS,
     flux: Flux = "known",
+    light: FloatArray | None = None,
+    photoelectrons: float = 0.0,
 ) -> Measurement | str:
     """Moments of frames without the kernel.
 
@@ -48,6 +50,10 @@ def measure_moments_2d(
         Pairs (p, q).
     flux:
         As in `aolink.estimation.moments.measure_moments`.
+    light:
+        Light of each spot, of a whole one, (axes,); one where None.
+    photoelectrons:
+        Of a whole spot; 0 for so many that shot noise does not matter.
 
     Returns
     -------
@@ -59,13 +65,22 @@ def measure_moments_2d(
     pixel = float(x_edges[1] - x_edges[0]), float(y_edges[1] - y_edges[0])
     area = pixel[0] * pixel[1]
     weights = np.stack([np.outer(y**q, x**p).ravel() for p, q in every]) * area
-    raw = stacked.matvec(weights, density.reshape(len(density), 1, -1)[:, 0])
-    spread = noise_density * _integrals(every, x_edges, y_edges)
+    pixels = density.reshape(len(density), -1)
+    raw = stacked.matvec(weights, pixels)
+    spread = (noise_density * _integrals(every, x_edges, y_edges))[None]
+    if photoelectrons:
+        read, shot = spread, weights[:, None] * weights / (area * photoelectrons)
+        spread = read + _sums(shot, pixels)
+        # Where noise makes the light so negative that this is no covariance, light is what is above the black level.
+        poor = np.linalg.eigvalsh(spread)[:, 0] <= 0
+        spread[poor] = read + _sums(shot, np.maximum(pixels[poor], 0.0))
+    if light is not None:
+        raw, spread = raw / light[:, None], spread / light[:, None, None] ** 2
     unmix = _without_kernel(every, kernel_moments_2d(kernel, pixel, highest))[[every.index(o) for o in orders]]
     if flux == "measured":
-        total, sd = raw[:, :1], math.sqrt(spread[0, 0])
+        total, sd = raw[:, :1], np.sqrt(spread[:, :1, 0])
         if (total < LEAST_FLUX * sd).any():
-            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd:.3g}"
+            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd.max():.3g}"
         raw = raw / total
         # To first order d(M_p / M_0) = (dM_p - y_p dM_0) / M_0.
         J = np.tile(np.eye(len(every)), (len(raw), 1, 1))
@@ -73,9 +88,18 @@ def measure_moments_2d(
         covariance = stacked.congruence(J, spread) / total[:, :, None] ** 2
     else:
         raw[:, 0] = 1.0
-        spread[0], spread[:, 0] = 0.0, 0.0
-        covariance = np.tile(spread, (len(raw), 1, 1))
-    return Measurement(value=stacked.matvec(unmix, raw), covariance=stacked.congruence(unmix, covariance))
+        spread[:, 0], spread[:, :, 0] = 0.0, 0.0
+        covariance = spread
+    covariance = stacked.congruence(unmix, covariance)
+    return Measurement(
+        value=stacked.matvec(unmix, raw), covariance=np.broadcast_to(covariance, (len(raw), *covariance.shape[1:]))
+    )
+
+
+def _sums(weights: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Sums of pixels with weights (n, n, pixels) for each axis, (axes, pixels) -> (axes, n, n)."""
+    n = len(weights)
+    return stacked.matvec(weights.reshape(n * n, -1), pixels).reshape(-1, n, n)
 
 
 def _integrals(orders: Sequence[Order], x_edges: FloatArray, y_edges: FloatArray) -> FloatArray:

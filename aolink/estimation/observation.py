@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -18,6 +18,10 @@ from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.moments import Measurement
 
 FloatArray = NDArray[np.float64]
+
+
+MOST_COVARIANCES = 32
+"""Measurements of which an estimate has the whole innovation covariance; of more it has the diagonal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +42,7 @@ class Correction:
     innovation: FloatArray
     """(axes, n_measurements)"""
     innovation_covariance: FloatArray
-    """(axes, n_measurements, n_measurements)"""
+    """(axes, n_measurements, n_measurements), or its diagonal, (axes, n_measurements)."""
     nis: FloatArray
     """(axes,)"""
 
@@ -84,6 +88,12 @@ class PathMoments:
         self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
     ) -> Correction:
         """One step of the (extended) Kalman filter."""
+        if measured.covariance.ndim == 4:
+            blocks = measured.covariance.shape[1]
+            if blocks > 1 and not self.crosses:
+                expected, slope = many_moments(model, response, prior.mean, self.orders)
+                return corrected_by_blocks(prior, measured.value - expected, slope, measured.covariance, self.gain)
+            measured = replace(measured, covariance=measured.covariance[:, 0])
         h, H = _moment_entries(model, response, prior.mean, self.orders, crosses=self.crosses)
         axes = len(prior.mean)
         if max(len(H), model.plant.n_states) > entries.MOST_ROWS:
@@ -145,6 +155,23 @@ def _moment_entries(
     return moments, slopes
 
 
+def many_moments(
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
+) -> tuple[FloatArray, FloatArray]:
+    """`predicted_moments` of a plant with many outputs, all of them at once."""
+    axes, n = state.shape
+    rows = model.mean_row
+    moments, slopes = [], []
+    if 1 in orders:
+        moments.append(state @ rows.T + response.mean)
+        slopes.append(np.broadcast_to(rows, (axes, *rows.shape)))
+    if 2 in orders:
+        half = np.matmul(model.quadratic, state[:, None, :, None])[..., 0] + response.slope
+        moments.append(np.matmul(half + response.slope, state[:, :, None])[..., 0] + response.square)
+        slopes.append(2 * half)
+    return np.stack(moments, axis=2).reshape(axes, -1), np.stack(slopes, axis=2).reshape(axes, -1, n)
+
+
 def _times_state(matrix: FloatArray, state: FloatArray) -> list[Entry]:
     """A matrix (n, n) times states (axes, n)."""
     if len(matrix) > entries.MOST_ROWS:
@@ -170,6 +197,50 @@ def corrected(
     covariance = stacked.symmetric(stacked.congruence(keep, prior.covariance) + stacked.congruence(K, R))
     nis = stacked.dot(innovation, stacked.matvec(S_inverse, innovation))
     return Correction(Belief(mean, covariance), innovation, S, nis)
+
+
+def corrected_by_blocks(
+    prior: Belief, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
+) -> Correction:
+    """`corrected` for few states and many measurements, whose noise is shared within blocks only.
+
+    With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing
+    has more rows than there are states, and P may be singular. Of S there is the diagonal where it is large.
+
+    Parameters
+    ----------
+    R:
+        (axes, blocks, size, size)
+    """
+    axes, blocks, size, _ = R.shape
+    n = prior.mean.shape[1]
+    H, y = H.reshape(axes, blocks, size, n), innovation.reshape(axes, blocks, size, 1)
+    P, transposed = prior.covariance, stacked.transpose(H)
+    weighted = np.linalg.solve(R, np.concatenate([H, y], axis=3))
+    # Sums over blocks of products as small as these do not depend on threads.
+    G = stacked.symmetric((transposed @ weighted[..., :n]).sum(axis=1))
+    M = stacked.symmetric(np.asarray(np.linalg.solve(np.eye(n) + P @ G, P)))
+    optimal = (M @ (transposed @ weighted[..., n:]).sum(axis=1))[..., 0]
+    if gain is None:
+        moved, keep, from_noise = optimal, np.eye(n) - M @ G, stacked.congruence(M, G)
+    else:
+        K = np.moveaxis(gain.reshape(-1, n, blocks, size), 2, 1)  # (1 or axes, blocks, n, size)
+        moved = (K @ y).sum(axis=1)[..., 0]
+        keep = np.eye(n) - (K @ H).sum(axis=1)
+        from_noise = (K @ R @ stacked.transpose(K)).sum(axis=1)
+    covariance = stacked.symmetric(stacked.congruence(keep, P) + from_noise)
+    left = y - H @ optimal[:, None, :, None]
+    nis = (weighted[..., n:] * left).sum(axis=(1, 2, 3))
+    m = blocks * size
+    flat = H.reshape(axes, m, n)
+    if m > MOST_COVARIANCES:
+        S = (flat @ P * flat).sum(axis=2) + np.einsum("abss->abs", R).reshape(axes, m)
+    else:
+        S = flat @ P @ stacked.transpose(flat)
+        for k in range(blocks):
+            some = slice(k * size, (k + 1) * size)
+            S[:, some, some] += R[:, k]
+    return Correction(Belief(prior.mean + moved, covariance), innovation, S, nis)
 
 
 def _corrected_small(
@@ -237,10 +308,33 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
 
     It corrects the state at the start of the exposure with that exposure's centroid. None where the
     Riccati equation has no stabilising solution: the centroid loses a mode that does not die out.
+
+    Parameters
+    ----------
+    R:
+        Covariance of the centroids as blocks along its diagonal, (blocks, size, size), or whole.
     """
     H = model.mean_row
+    if R.ndim == 3 and len(H) > H.shape[1]:
+        return _compressed_gain(model, Q, R)
+    R = linalg.block_diag(*R) if R.ndim == 3 else R
     try:
         P = linalg.solve_discrete_are(model.transition.T, H.T, Q, R)
     except (np.linalg.LinAlgError, ValueError):
         return None
     return np.asarray(P @ H.T @ np.linalg.inv(H @ P @ H.T + R))
+
+
+def _compressed_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
+    """`steady_gain` for more outputs than states: of whitened ones, no more than there are states tell anything."""
+    root = np.linalg.cholesky(R)
+    blocks, size, _ = R.shape
+    white = np.linalg.solve(root, model.mean_row.reshape(blocks, size, -1)).reshape(blocks * size, -1)
+    rotation, H = np.linalg.qr(white)
+    try:
+        P = linalg.solve_discrete_are(model.transition.T, H.T, Q, np.eye(len(H)))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
+    told = np.linalg.solve(root.swapaxes(1, 2), rotation.reshape(blocks, size, -1)).reshape(blocks * size, -1)
+    return np.asarray(gain @ told.T)

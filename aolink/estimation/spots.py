@@ -18,7 +18,6 @@ from aolink.estimation.moments import (
     LEAST_FLUX,
     Flux,
     Measurement,
-    known_flux_covariance,
     measure_moments,
     noise_integrals,
     raw_moments,
@@ -28,6 +27,7 @@ from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.windowed import Profile
 from aolink.estimation.windowed_spots import SpotWindows
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
+from aolink.optics.frame import spot_windows
 from aolink.rig import Plant, Sensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -47,8 +47,7 @@ class Profiles:
 def profiles(sensor: SpotSensor, pixels: NDArray[np.uint16], usable: BoolArray) -> Profiles:
     """Sums of each window over its rows (x) and over its columns (y); both arguments are (rows, columns)."""
     # 256 counts of 16 bits, which a window has at most along a side, make a sum that single precision holds exactly.
-    light = pixels.astype(np.float32)
-    counts = _summed(sensor, light)
+    counts = _summed(sensor, pixels.astype(np.float32))
     if usable.all():
         return Profiles(counts=counts, mask=np.ones_like(counts, dtype=bool))
     mask = _summed(sensor, (~usable).astype(np.float32)) == 0
@@ -63,18 +62,14 @@ def _summed(sensor: SpotSensor, light: NDArray[np.float32]) -> FloatArray:
     # As a product: NumPy takes several times as long to sum over a short last axis.
     along_rows = light.reshape(-1, width) @ np.ones(width, np.float32)
     sums[..., 1] = along_rows.reshape(rows, height, columns).transpose(1, 0, 2)
+    if sensor.light is not None:
+        sums = sums.reshape(width, -1, 2)[:, sensor.lit]
     return sums.reshape(width, -1).T
-
-
-def windows(sensor: SpotSensor, frame: NDArray[Any]) -> NDArray[Any]:
-    """A frame cut into its windows, (rows, columns) -> (spots, rows of a window, columns of a window)."""
-    (rows, columns), (height, width) = sensor.grid, sensor.window
-    return frame.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
 
 
 def measure_spots(
     sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, orders: Sequence[int] | None,
-    flux: Flux, *, least_usable: float, least_significance: float,
+    flux: Flux, *, least_usable: float, least_significance: FloatArray | float,
 ) -> tuple[Measurement | Profile | SpotWindows | None, str]:  # fmt: skip
     """What a frame says of each axis, or nothing; and how many axes it says nothing of, and why.
 
@@ -88,15 +83,16 @@ def measure_spots(
     least_usable:
         Share of a profile's pixels that the profiles themselves can do with.
     least_significance:
-        By how many standard deviations of noise a spot must stand out.
+        By how many standard deviations of noise a spot must stand out, (n_outputs,) or one for all.
     """
     saturated = is_saturated(sensor, pixels) & arrived
+    light = None if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)
     seen: SpotWindows | None = None
     if orders is None and plant.n_outputs > 1:
-        seen = _spot_windows(sensor, plant, pixels, arrived & ~saturated)
-        light = seen.density.reshape(sensor.spots, *sensor.window) * sensor.pixel_width
+        seen = _seen(sensor, plant, pixels, arrived & ~saturated)
+        shone = seen.density.reshape(sensor.spots, *sensor.window) * sensor.pixel_width
         share = np.asarray(np.repeat(seen.mask.reshape(sensor.spots, -1).mean(axis=1), 2))
-        density = np.stack([light.sum(axis=1), light.sum(axis=2)], axis=1).reshape(2 * sensor.spots, -1)
+        density = np.stack([shone.sum(axis=1), shone.sum(axis=2)], axis=1).reshape(2 * sensor.spots, -1)
     else:
         found = profiles(sensor, pixels, arrived & ~saturated)
         share = np.count_nonzero(found.mask, axis=1) / sensor.profile.pixels
@@ -107,8 +103,8 @@ def measure_spots(
         lit &= _enough_light(sensor.profile, found.counts)
     usable: BoolArray = np.asarray((whole & lit).reshape(plant.axes, plant.n_outputs).all(axis=1))
     reasons = [
-        (pixels.size - np.count_nonzero(arrived), f"of {pixels.size} pixels are missing"),
-        (np.count_nonzero(saturated), f"of {pixels.size} pixels are at an end of the scale"),
+        (np.count_nonzero(spot_windows(sensor, ~arrived)), f"of {pixels.size} pixels are missing"),
+        (np.count_nonzero(spot_windows(sensor, saturated)), f"of {pixels.size} pixels are at an end of the scale"),
         (np.count_nonzero(whole & ~lit), f"of {len(lit)} profiles show no spot"),
     ]
     remark = ", ".join(f"{count} {what}" for count, what in reasons if count)
@@ -120,13 +116,15 @@ def measure_spots(
         return None, remark
     measured: Measurement | Profile | SpotWindows | str
     if seen is not None:
-        measured = seen
+        measured = seen.per_light(sensor.spot_light)
     elif orders is None:
         # An axis without a measurement needs one that can be computed with.
-        measured = Profile(density=density, mask=found.mask | ~usable[:, None])
+        if light is not None:
+            density = density / light[:, None]
+        measured = Profile(density=density, mask=found.mask | ~usable[:, None], light=light)
     elif plant.n_outputs == 1:
         counts = found.counts if usable.all() else found.counts[usable]
-        measured = measure_moments(sensor.profile, counts, orders, flux)
+        measured = measure_moments(sensor.profile, counts, orders, flux, None if light is None else light[usable])
     else:
         measured = _coupled_moments(sensor, plant, pixels, usable, orders, flux)
     if isinstance(measured, str):
@@ -136,20 +134,11 @@ def measure_spots(
     return measured, remark
 
 
-def _spot_windows(sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], good: BoolArray) -> SpotWindows:
+def _seen(sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], good: BoolArray) -> SpotWindows:
     shape = (plant.axes, plant.n_outputs // 2, *sensor.window)
     density = np.where(good, to_density(sensor, pixels), 0.0)
-    return SpotWindows(density=windows(sensor, density).reshape(shape), mask=windows(sensor, good).reshape(shape))
-
-
-def centroid_noise(sensor: SpotSensor, n_outputs: int) -> FloatArray:
-    """Covariance of the first moments of one copy's outputs, known flux, (n_outputs, n_outputs)."""
-    integrals = noise_integrals(sensor.profile, 2)
-    own = known_flux_covariance(effective_noise_density(sensor.profile), integrals, [1])
-    if n_outputs == 1:
-        return own
-    other = effective_noise_density(sensor) * integrals[1] ** 2
-    return np.kron(np.eye(n_outputs // 2), np.array([[own[0, 0], other], [other, own[0, 0]]]))
+    mask = spot_windows(sensor, good).reshape(shape)
+    return SpotWindows(density=spot_windows(sensor, density).reshape(shape), mask=mask)
 
 
 def _enough_light(line: Sensor, counts: NDArray[Any]) -> BoolArray:
@@ -166,26 +155,28 @@ def _coupled_moments(
 ) -> Measurement | str:
     """Moments where one copy of the plant moves whole spots: a spot's two slopes share the noise of its pixels."""
     spots = plant.n_outputs // 2
-    density = windows(sensor, to_density(sensor, pixels))[np.repeat(usable, spots)]
+    used = np.repeat(usable, spots)
+    density = spot_windows(sensor, to_density(sensor, pixels))[used]
+    light = None if sensor.spot_light is None else sensor.spot_light[used]
     edges = sensor.profile.edges
     along = [(p, 0) for p in orders] + [(0, p) for p in orders]
     noise = effective_noise_density(sensor)
-    found = measure_moments_2d(density, edges, edges, sensor.kernel.covariance, noise, along, flux)
+    found = measure_moments_2d(
+        density, edges, edges, sensor.kernel.covariance, noise, along, flux, light, sensor.photoelectrons
+    )
     if isinstance(found, str):
         return found
     copies, m = len(density) // spots, len(along)
-    covariance = np.zeros((copies, spots, m, spots, m))
-    for k in range(spots):
-        covariance[:, k, :, k] = found.covariance[k::spots]
-    size = spots * m
-    return Measurement(value=found.value.reshape(copies, size), covariance=covariance.reshape(copies, size, size))
+    value = found.value.reshape(copies, spots * m)
+    return Measurement(value=value, covariance=found.covariance.reshape(copies, spots, m, m))
 
 
 def _spread(measured: Measurement | Profile | SpotWindows, usable: BoolArray) -> Measurement | Profile | SpotWindows:
     """Moments of the usable axes in the places of these; the others get zero with unit covariance."""
     if not isinstance(measured, Measurement):
         return measured
-    m = measured.value.shape[1]
-    value, covariance = np.zeros((len(usable), m)), np.tile(np.eye(m), (len(usable), 1, 1))
+    value = np.zeros((len(usable), measured.value.shape[1]))
+    *lead, size, _ = measured.covariance.shape[1:]
+    covariance = np.tile(np.eye(size), (len(usable), *lead, 1, 1))
     value[usable], covariance[usable] = measured.value, measured.covariance
     return Measurement(value=value, covariance=covariance)

@@ -72,12 +72,15 @@ class Profile:
     """One over slope units, (axes, pixels)."""
     mask: NDArray[np.bool_]
     """True where the pixel can be used, (axes, pixels)."""
+    light: FloatArray | None = None
+    """Light of each spot, of a whole one, which densities are divided by, (axes,); one where None."""
     usable: NDArray[np.bool_] | None = None
     """False for axes of which nothing was measured, (axes,); None if there are none."""
 
     def part(self, axes: slice) -> Profile:
         """Of these axes alone."""
-        return Profile(density=self.density[axes], mask=self.mask[axes])
+        light = None if self.light is None else self.light[axes]
+        return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -252,7 +255,7 @@ class WindowedMoments(Windowed[Profile]):
         mean = stacked.matvec(basis, about.mean) + nodes.inputs[:, 0]
         spread = stacked.congruence(basis, about.covariance)
         W = self.window_weights(mean, np.einsum("akk->ak", spread), measured.mask)
-        y, noise = self.measured(W, measured.density)
+        y, noise = self.measured(W, measured.density, measured.light)
         return y, noise, self.regression(W, mean, spread, basis, nodes.weights)
 
     def window_weights(self, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
@@ -286,12 +289,16 @@ class WindowedMoments(Windowed[Profile]):
         slope = stacked.matmul(stacked.transpose(light * g[1]), np.broadcast_to(basis, (len(W), *basis.shape)))
         return Regression((light * g[0]).sum(axis=1), slope, stacked.symmetric(np.asarray(remainder)))
 
-    def measured(self, W: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def measured(
+        self, W: FloatArray, density: FloatArray, light: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """The weighted sums, (axes, m), and the covariance of their pixels' noise, (axes, m, m)."""
-        return weighted_sums(self.sensor, W, density)
+        return weighted_sums(self.sensor, W, density, light)
 
 
-def weighted_sums(sensor: BaseSensor, W: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
+def weighted_sums(
+    sensor: BaseSensor, W: FloatArray, density: FloatArray, light: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Weighted sums of pixels and the covariance of the pixels' noise in them.
 
     Parameters
@@ -300,6 +307,8 @@ def weighted_sums(sensor: BaseSensor, W: FloatArray, density: FloatArray) -> tup
         (..., m, pixels)
     density:
         (..., pixels), zero where a pixel cannot be used; its weights are zero as well.
+    light:
+        Light of the spot, of a whole one, that the density was divided by, (...); one where None.
 
     Returns
     -------
@@ -309,7 +318,10 @@ def weighted_sums(sensor: BaseSensor, W: FloatArray, density: FloatArray) -> tup
     y = stacked.matvec(W, density * D)
     variance = np.full_like(density, effective_noise_density(sensor) * D)
     if sensor.photoelectrons:
-        variance += np.maximum(density, 0.0) * (D / sensor.photoelectrons)
+        electrons = sensor.photoelectrons if light is None else sensor.photoelectrons / light[..., None]
+        variance += np.maximum(density, 0.0) * (D / electrons)
+    if light is not None:
+        variance /= light[..., None] ** 2
     noise = stacked.matmul(W * variance[..., None, :], stacked.transpose(W))
     # Where a window has too few pixels for its functions, their sums hang together.
     noise += 1e-12 * np.eye(W.shape[-2]) * noise.max(axis=(-2, -1), keepdims=True)

@@ -45,12 +45,22 @@ class SpotWindows:
     """One over slope units squared, zero where the mask is, (axes, spots, rows, columns)."""
     mask: BoolArray
     """True where the pixel can be used, (axes, spots, rows, columns)."""
+    light: FloatArray | None = None
+    """Light of each spot, of a whole one, which densities are divided by, (axes, spots); one where None."""
     usable: BoolArray | None = None
     """False for axes of which nothing was measured, (axes,); None if there are none."""
 
+    def per_light(self, light: FloatArray | None) -> SpotWindows:
+        """The same with densities divided by the light of each spot in the rig's order, (axes * spots,)."""
+        if light is None:
+            return self
+        light = light.reshape(self.density.shape[:2])
+        return SpotWindows(density=self.density / light[..., None, None], mask=self.mask, light=light)
+
     def part(self, axes: slice) -> SpotWindows:
         """Of these axes alone."""
-        return SpotWindows(density=self.density[axes], mask=self.mask[axes])
+        light = None if self.light is None else self.light[axes]
+        return SpotWindows(density=self.density[axes], mask=self.mask[axes], light=light)
 
 
 class WindowedSpots(Windowed[SpotWindows]):
@@ -92,7 +102,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         own = np.einsum("askdske->askde", spread)
         along, across = self.window_functions(mean, np.einsum("askdd->askd", own), measured.mask)
         fit = self.regression(along, across, mean, spread, rows, nodes.weights)
-        y, noise = self.measured(along, across, measured.density)
+        y, noise = self.measured(along, across, measured.density, measured.light)
         return y, noise, fit
 
     def window_functions(
@@ -195,11 +205,13 @@ class WindowedSpots(Windowed[SpotWindows]):
         expected = value.sum(axis=2).reshape(axes, -1)
         return Regression(expected, slope.reshape(axes, spots * size, -1), joined)
 
-    def measured(self, along: FloatArray, across: FloatArray, density: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def measured(
+        self, along: FloatArray, across: FloatArray, density: FloatArray, light: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
         """The weighted sums, (axes, spots * m), and their noise, which spots do not share, (axes, ., .)."""
         axes, spots, size, _ = along.shape
         W = (across[..., :, None] * along[..., None, :]).reshape(axes, spots, size, -1)
-        y, noise = weighted_sums(self.sensor, W, density.reshape(axes, spots, -1))
+        y, noise = weighted_sums(self.sensor, W, density.reshape(axes, spots, -1), light)
         joint = np.zeros((axes, spots, size, spots, size))
         for k in range(spots):
             joint[:, k, :, k] = noise[:, k]

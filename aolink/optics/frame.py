@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from aolink.optics.plane import exposure_density_2d
 from aolink.sensor import BaseSensor, Kernel, Sensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 # Spots together: their masses stay in the processor's cache.
 _AT_ONCE = 16
@@ -35,7 +37,7 @@ def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (rows, columns)
+    (rows, columns); of a lenslet that is lit in part, so much less.
     """
     if isinstance(sensor, SpotSensor):
         rows, columns = sensor.grid
@@ -44,10 +46,20 @@ def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
             windows = spots_density(sensor.kernel, edges, paths)
         else:
             windows = exposure_density_2d(sensor.kernel.covariance, edges, edges, paths.swapaxes(1, 2))
+        if sensor.spot_light is not None:
+            lit, windows = windows, np.zeros((rows * columns, *sensor.window))
+            windows[sensor.lit] = lit * sensor.spot_light[:, None, None]
         tiled = windows.reshape(rows, columns, *sensor.window).swapaxes(1, 2)
         return np.asarray(np.ascontiguousarray(tiled).reshape(sensor.shape))
     assert isinstance(sensor, Sensor)
     return exposure_density(sensor.kernel, sensor.edges, path)
+
+
+def spot_windows(sensor: SpotSensor, frame: NDArray[Scalar]) -> NDArray[Scalar]:
+    """A frame cut into its spots' windows, (rows, columns) -> (spots, rows of a window, columns of a window)."""
+    (rows, columns), (height, width) = sensor.grid, sensor.window
+    cut = frame.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
+    return cut if sensor.light is None else cut[sensor.lit]
 
 
 def spots_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatArray:

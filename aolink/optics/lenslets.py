@@ -62,8 +62,18 @@ class Lenslets:
     @cached_property
     def light(self) -> FloatArray:
         """Share of each lenslet's area that is lit, (spots,): the weight of its slopes."""
-        offset = self.pitch_m * ((np.arange(_EDGE_POINTS) + 0.5) / _EDGE_POINTS - 0.5)
-        return np.array([self.is_lit(centre + _square(offset)).mean() for centre in self.centres_m])
+        if self.pupil_diameter_m is None:
+            return np.ones(self.spots)
+        return np.array([self.lit_part(spot).mean() for spot in range(self.spots)])
+
+    def offsets_m(self, per_side: int = _EDGE_POINTS) -> FloatArray:
+        """Even points along a lenslet's side from its middle, (per_side,)."""
+        return self.pitch_m * ((np.arange(per_side) + 0.5) / per_side - 0.5)
+
+    def lit_part(self, spot: int, per_side: int = _EDGE_POINTS) -> NDArray[np.bool_]:
+        """Which of even points over a lenslet are in the pupil, (y, x)."""
+        points = self.centres_m[spot] + _square(self.offsets_m(per_side))
+        return self.is_lit(points).reshape(per_side, per_side)
 
     def mean_slopes(self, gradient: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """Mean gradient over the lit part of each lenslet.
@@ -79,14 +89,13 @@ class Lenslets:
         """
         nodes, weights = np.polynomial.legendre.leggauss(_SMOOTH_POINTS)
         smooth, smooth_weight = _square(nodes * self.pitch_m / 2), np.outer(weights, weights).ravel() / 4
-        fine = _square(self.pitch_m * ((np.arange(_EDGE_POINTS) + 0.5) / _EDGE_POINTS - 0.5))
-        slopes = []
+        fine, slopes = _square(self.offsets_m()), []
         # Lenslets that the pupil's edge cuts need finer points than a smooth wavefront does.
-        for centre, light in zip(self.centres_m, self.light, strict=True):
-            points, weight = centre + smooth, smooth_weight
+        for spot, light in enumerate(self.light):
+            points, weight = self.centres_m[spot] + smooth, smooth_weight
             if light < 1:
-                lit = self.is_lit(centre + fine)
-                points, weight = (centre + fine)[lit], np.full(lit.sum(), 1 / max(lit.sum(), 1))
+                points = self.centres_m[spot] + fine[self.lit_part(spot).ravel()]
+                weight = np.full(len(points), 1 / max(len(points), 1))
             mean = np.tensordot(weight, gradient(points), axes=1)
             slopes.append(mean if light else np.full_like(mean, np.nan))
         return np.array(slopes)

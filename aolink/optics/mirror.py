@@ -130,28 +130,26 @@ class MirrorPlant:
 
 
 def mirror_plant(
-    gain: FloatArray,
-    slopes: FloatArray,
-    dynamics: tuple[FloatArray, FloatArray],
-    drift_per_step: float | None = None,
+    slopes: FloatArray, dynamics: tuple[FloatArray, FloatArray], drift_per_step: float | None = None
 ) -> MirrorPlant:
     """A mirror whose every actuator has the same dynamics.
 
+    The states are the inputs as the mirror follows them. Actuators couple in what those deflect, not in how they move:
+    A falls apart into small systems, and a mirror of a thousand actuators can be calculated with.
+
     Parameters
     ----------
-    gain:
-        Deflection at each actuator for each input, at rest, (actuators, inputs).
     slopes:
-        Slopes for each deflection, (outputs, actuators).
+        Slopes for each input, at rest, (outputs, inputs): of the deflection that the actuators make together.
     dynamics:
-        A (n, n) and B (n, 1) of one actuator, whose first state is its deflection.
+        A (n, n) and B (n, 1) of one actuator, whose first state follows its input with unit gain.
     drift_per_step:
         None: process noise adds to each input. Otherwise to a state of each input's own, which keeps this
         share of itself over a fast step and adds to the input: disturbances slower than the mirror.
     """
     one_A, one_B = dynamics
-    actuators, inputs = gain.shape
-    A, B = np.asarray(np.kron(np.eye(actuators), one_A)), np.asarray(np.kron(gain, one_B))
+    inputs = slopes.shape[1]
+    A, B = np.asarray(np.kron(np.eye(inputs), one_A)), np.asarray(np.kron(np.eye(inputs), one_B))
     C = np.asarray(np.kron(slopes, np.eye(1, len(one_A))))
     if drift_per_step is None:
         return MirrorPlant(A=A, B=B, B_w=B.copy(), C=C)

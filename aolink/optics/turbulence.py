@@ -22,6 +22,8 @@ FloatArray = NDArray[np.float64]
 # The longest wave over the outer scale: longer ones add nothing to the structure function within it.
 _LONGEST = 20.0
 _WAVES = 600
+# Along the side of a lenslet that the pupil cuts; the shortest wave is half a lenslet long.
+_POINTS = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,14 +79,21 @@ class FrozenFlow:
         return np.asarray((np.exp(1j * moved @ self.wave_numbers.T) @ self.amplitudes).real)
 
     def slope_waves(self, lenslets: Lenslets) -> NDArray[np.complex128]:
-        """Mean slopes of each wave over whole lenslets in radians, (spots, 2, waves).
+        """Mean slopes of each wave over the lit part of each lenslet in radians, (spots, 2, waves); NaN in the dark.
 
         The mean of exp(ikr) over a square of side d is its value at the middle times two sincs.
         """
         k = self.wave_numbers
         over_square = np.prod(np.sinc(k * lenslets.pitch_m / (2 * math.pi)), axis=1)
-        phase = np.exp(1j * lenslets.centres_m @ k.T)
-        return np.asarray(phase[:, None] * (1j * k.T * over_square * self.amplitudes))
+        middle = np.exp(1j * lenslets.centres_m @ k.T)
+        mean = middle * over_square
+        offsets = lenslets.offsets_m(_POINTS)
+        along, across = (np.exp(1j * offsets[:, None] * each) for each in k.T)
+        for spot in map(int, np.flatnonzero(lenslets.light < 1)):
+            lit = lenslets.lit_part(spot, _POINTS)
+            part = (across * (lit @ along)).sum(axis=0)
+            mean[spot] = middle[spot] * part / lit.sum() if lit.any() else np.nan
+        return np.asarray(mean[:, None] * (1j * k.T * self.amplitudes))
 
     def blown(self, times_s: FloatArray) -> NDArray[np.complex128]:
         """What the wind turns each wave by at each time, (waves, times)."""

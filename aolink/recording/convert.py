@@ -38,10 +38,27 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
         frames_lost_before=frame.frames_lost_before,
         exposure_offset_ns=frame.exposure_offset_ns,
     )
-    image = RawImage(frame_id="camera", width=width, height=height, encoding="mono16", step=2 * width)
+    sensor = "scene" if frame.plane else "camera"
+    image = RawImage(frame_id=sensor, width=width, height=height, encoding="mono16", step=2 * width)
     image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
     image.data = frame.pixels.astype("<u2").tobytes()
     return info, image
+
+
+def float_image(picture: NDArray[np.float32], time_ns: int) -> RawImage:
+    """A restored picture as it is recorded."""
+    height, width = picture.shape
+    image = RawImage(frame_id="restored", width=width, height=height, encoding="32FC1", step=4 * width)
+    image.timestamp.FromNanoseconds(time_ns)
+    image.data = picture.astype("<f4").tobytes()
+    return image
+
+
+def picture_from_float_image(image: RawImage) -> NDArray[np.float32]:
+    """Inverse of `float_image`. Raises RecordingError for a picture that is not what it says."""
+    if image.encoding != "32FC1" or len(image.data) != 4 * image.width * image.height:
+        raise RecordingError("a restored picture is damaged or not 32FC1: run `aolink info` on the file")
+    return np.frombuffer(image.data, dtype="<f4").astype(np.float32).reshape(image.height, image.width)
 
 
 def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
@@ -80,6 +97,7 @@ def _is_exposure(info: pb.ExposureInfo) -> bool:
 def estimate_message(estimate: Estimate) -> pb.Estimate:
     """An estimate as it is recorded: the path as coefficients of the exposure basis."""
     axes, n_states = estimate.end_state.shape
+    spread = estimate.innovation_covariance.ravel()
     return pb.Estimate(
         estimator=estimate.estimator,
         frame_id=estimate.frame_id,
@@ -96,7 +114,8 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
         coefficients=estimate.coefficients.ravel(),
         coefficient_covariance=estimate.coefficient_covariance.ravel(),
         innovation=estimate.innovation.ravel(),
-        innovation_covariance=estimate.innovation_covariance.ravel(),
+        innovation_covariance=spread if estimate.innovation_covariance.ndim == 3 else None,
+        innovation_variance=spread if estimate.innovation_covariance.ndim == 2 else None,
         nis=estimate.nis,
     )
 
@@ -106,6 +125,10 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
     axes, n, c, m = message.axes, message.n_states, message.n_coefficients, message.n_measurements
     coefficients = _array(message.coefficients, axes, c)
     covariance = _array(message.coefficient_covariance, axes, c, c)
+    if message.innovation_variance:
+        spread = _array(message.innovation_variance, axes, m)
+    else:
+        spread = _array(message.innovation_covariance, axes, m, m)
     return Estimate(
         estimator=message.estimator,
         frame_id=message.frame_id,
@@ -122,7 +145,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         inputs=exposure.inputs,
         model=model,
         innovation=_array(message.innovation, axes, m),
-        innovation_covariance=_array(message.innovation_covariance, axes, m, m),
+        innovation_covariance=spread,
         nis=_array(message.nis, axes),
     )
 
@@ -133,7 +156,7 @@ def truth_from_message(message: wire.Truth) -> Truth:
     return Truth(
         start_state=_array(message.start_state, axes, -1),
         end_state=_array(message.end_state, axes, -1),
-        path=_array(message.path, outputs, -1),
+        path=_array(message.path or message.path_single, outputs, -1),
     )
 
 

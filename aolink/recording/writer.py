@@ -13,6 +13,7 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
@@ -41,14 +42,27 @@ _Item = tuple[str, Message, bytes, int]
 """A message on its way to the file: topic, message, its bytes, log time."""
 
 
-def begin_recording(file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int) -> None:
-    """Write what a recording begins with: the rig file, twice, the exposure basis, and facts about the session."""
+def begin_recording(
+    file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int, attachments: Mapping[str, bytes]
+) -> None:
+    """Write what a recording begins with: the rig file, twice, the exposure basis, and facts about the session.
+
+    Of ``attachments``, by name, those are added that are not of its own.
+    """
     file.start()
-    model, basis = ExposureModel(rig.plant, rig.timing.exposure_steps), io.BytesIO()
+    model = ExposureModel(rig.plant, rig.timing.exposure_steps)
+    outputs, basis = model.factors
     # Of a large one only the columns of the start state, which are all that o1 to o3 have.
-    np.save(basis, model.basis if model.basis.nbytes <= _LARGEST_BASIS else model.state_rows)
+    basis = basis if basis.nbytes <= _LARGEST_BASIS else basis[..., : rig.plant.n_states]
     file.add_attachment(topics.RIG_ATTACHMENT, "application/toml", rig.toml.encode(), start_ns)
-    file.add_attachment(topics.BASIS_ATTACHMENT, "application/octet-stream", basis.getvalue(), start_ns)
+    arrays = {topics.BASIS_ATTACHMENT: basis} | ({} if outputs is None else {topics.OUTPUTS_ATTACHMENT: outputs})
+    for name, array in arrays.items():
+        data = io.BytesIO()
+        np.save(data, array)
+        file.add_attachment(name, "application/octet-stream", data.getvalue(), start_ns)
+    for name, value in attachments.items():
+        if name not in topics.OF_EACH_FILE:
+            file.add_attachment(name, "application/octet-stream", value, start_ns)
     file.add_metadata(topics.SESSION_METADATA, metadata)
     file.add_metadata(topics.RIG_METADATA, {"toml": rig.toml})  # nothing can be read without it
 
@@ -67,6 +81,8 @@ class RecordingWriter:
         Facts about the session, written at the start.
     start_ns:
         Host time of the start.
+    attachments:
+        What else goes into the file at its start, by name.
     deterministic:
         Cut the file by the messages' own times only, not by the wall clock as well: the same messages
         give the same bytes. For sessions on virtual time and for re-estimation.
@@ -86,6 +102,7 @@ class RecordingWriter:
         *,
         overwrite: bool = False,
         deterministic: bool = False,
+        attachments: Mapping[str, bytes] | None = None,
         options: WriteOptions | None = None,
     ) -> None:
         self.path = Path(path)
@@ -93,6 +110,7 @@ class RecordingWriter:
         """The files so far."""
         self._options = options or WriteOptions()
         self._rig, self._metadata, self._overwrite = rig, metadata, overwrite
+        self._attachments = attachments or {}
         self._deterministic = deterministic
         self._schemas: dict[type[Message], Schema] = {}
         self._lead = Lead() if self._options.split_bytes or self._options.split_s else None
@@ -166,7 +184,7 @@ class RecordingWriter:
         self.paths.append(path)
         self._file = McapFile(path, self._options, overwrite=self._overwrite)
         self._part_start_ns = start_ns
-        begin_recording(self._file, self._rig, metadata, start_ns)
+        begin_recording(self._file, self._rig, metadata, start_ns, self._attachments)
 
     def _run(self) -> None:
         options = self._options

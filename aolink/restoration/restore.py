@@ -113,8 +113,7 @@ def restore(
     picture = np.asarray(image)
     psf = as_psf(psf)
     good = _checked_mask(picture, mask)
-    if method not in METHODS:
-        raise RestorationError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
+    checked_method(method)
     planes = _planes(picture, good)
     if not psf.on_line and 1 in psf.values.shape:
         # A motion along one axis is exact on lines.
@@ -142,6 +141,14 @@ def restore(
                 )
         done = _on_plane(planes, psf, method, noise_sd, good, denoise)
     return replace(done, image=_as_given(done.image, picture))
+
+
+def checked_method(name: str) -> Method:
+    """The method of a name. Raises RestorationError where there is none."""
+    for method in METHODS:
+        if name == method:
+            return method
+    raise RestorationError(f"method is {name!r}, expected one of {', '.join(METHODS)}")
 
 
 def _checked_mask(picture: NDArray[Any], mask: ArrayLike | None) -> BoolArray | None:

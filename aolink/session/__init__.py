@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -19,6 +20,7 @@ from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
+from aolink.scene import framed, read_scene_picture
 from aolink.session.loop import Inputs, SessionLoop, Watch
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as wire
@@ -72,6 +74,15 @@ def open_devices(
         )
     finally:
         hub.close()
+
+
+def _true_scene(rig: Rig, camera: NativeCamera) -> dict[str, bytes]:
+    """The scene at rest as an attachment, where the camera was made from this rig file: a simulated one shows it."""
+    if rig.scene is None or not rig.scene.picture or camera.identity.rig_digest != rig.digest:
+        return {}
+    data = io.BytesIO()
+    np.save(data, rig.scene.to_counts(framed(rig.scene, read_scene_picture(rig.scene, rig.folder))))
+    return {topics.TRUE_SCENE_ATTACHMENT: data.getvalue()}
 
 
 def record(
@@ -143,9 +154,11 @@ def record(
         }
         if calibration:
             facts[topics.CALIBRATION] = calibration
+        attachments = _true_scene(rig, camera)
         writer = RecordingWriter(
-            path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, options=options
-        )
+            path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, attachments=attachments,
+            options=options,
+        )  # fmt: skip
         loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, watch)
         report = loop.report
         report.warnings += warnings

@@ -39,13 +39,13 @@ class DisturbancePlayer:
         if optics is not None and len(disturbance.zernike_m):
             indices, metres = disturbance.zernike_m.T
             modes = zernike_modes(optics.lenslets, int(indices.max()))
-            some = modes.slopes[..., indices.astype(int) - 2] @ metres
+            some = modes.slopes[optics.lit][..., indices.astype(int) - 2] @ metres
             self._still = some.reshape(-1) / optics.slope_unit_rad
         if optics is not None:
             lenslets = optics.seen(disturbance.pupil_m) if disturbance.layers else optics.lenslets
             for layer in disturbance.layers:
                 flow = FrozenFlow(layer, rng, shortest_m=_SHORTEST * lenslets.pitch_m)
-                waves = flow.slope_waves(lenslets).reshape(rig.n_outputs, -1)
+                waves = flow.slope_waves(lenslets)[optics.lit].reshape(rig.n_outputs, -1)
                 # Re(w t) = Re w Re t - Im w Im t, as one real product.
                 both = optics.slopes(np.concatenate([waves.real, -waves.imag], axis=1), disturbance.pupil_m)
                 self._layers.append((flow, both))

@@ -94,6 +94,7 @@ def log_spot_paths(
     known = [e for e in exposures if e.frame_id in by_frame]
     (rows, columns), (height, width) = sensor.grid, sensor.window
     corner = np.stack(np.meshgrid(width * np.arange(columns), height * np.arange(rows)), axis=-1).reshape(-1, 2)
+    corner = corner[sensor.lit]
     strips = []
     for exposure in known:
         path = by_frame[exposure.frame_id]

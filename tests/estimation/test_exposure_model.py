@@ -126,3 +126,25 @@ def test_paths_do_not_depend_on_the_axes_beside_them(mimo, with_axes, axes):
 def test_a_plant_without_noise_has_no_noise_columns(mimo):
     still = dataclasses.replace(mimo, process_noise=np.zeros((2, 2)))
     assert ExposureModel(still, 20).n_coefficients == 3
+
+
+def test_many_outputs_of_few_states_are_what_each_of_them_is_alone(mimo):
+    """Their paths are made of the states' paths."""
+    rng = np.random.default_rng(6)
+    plant = dataclasses.replace(mimo, C=rng.standard_normal((5, 3)))
+    model, u = ExposureModel(plant, 40), rng.standard_normal((40, mimo.axes * mimo.n_inputs))
+    assert model.factors[0] is plant.C
+    count = model.n_coefficients
+    root = rng.standard_normal((mimo.axes, count, count))
+    mean, covariance = rng.standard_normal((mimo.axes, count)), root @ root.swapaxes(1, 2)
+    path, sd = path_from_coefficients(model, mean, covariance, u)
+    response = model.response(u)
+    expected = np.einsum("oij,aj->aoi", model.basis, mean) + response.path
+    np.testing.assert_allclose(path, expected.reshape(path.shape), atol=1e-10)
+    variance = np.einsum("oij,ajk,oik->aoi", model.basis, covariance, model.basis)
+    np.testing.assert_allclose(sd, np.sqrt(variance).reshape(sd.shape), rtol=1e-9)
+    for o in range(5):
+        alone = ExposureModel(dataclasses.replace(plant, C=plant.C[o : o + 1]), 40)
+        columns = min(count, alone.n_coefficients)
+        np.testing.assert_allclose(model.basis[o, :, :columns], alone.basis[0, :, :columns], atol=1e-11)
+        np.testing.assert_allclose(response.slope[:, o], alone.response(u).slope[:, 0], atol=1e-11)

@@ -5,13 +5,21 @@ import dataclasses
 import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
-from scipy import stats
+from scipy import linalg, stats
 
 from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import exposure_model
 from aolink.estimation.filter import BlurFilter
 from aolink.estimation.moments import Measurement
-from aolink.estimation.observation import Belief, PathMoments, corrected, predicted_moments, steady_gain
+from aolink.estimation.observation import (
+    Belief,
+    PathMoments,
+    corrected,
+    corrected_by_blocks,
+    many_moments,
+    predicted_moments,
+    steady_gain,
+)
 from aolink.plant import lift
 from aolink.rig import load_rig
 
@@ -372,3 +380,49 @@ def test_the_short_correction_is_josephs(rank, first, correlation, one_noise):
     np.testing.assert_allclose(ours.innovation_covariance, josephs.innovation_covariance, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(ours.nis, josephs.nis, rtol=1e-7)
     assert np.linalg.eigvalsh(ours.posterior.covariance).min() > -1e-12
+
+
+@pytest.mark.parametrize("blocks", [3, 40])
+@pytest.mark.parametrize("rank", [2, 5])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_by_blocks_it_is_the_same_correction(blocks, rank, fixed):
+    """Few states, measurements whose noise is shared within blocks of two; priors that may be singular."""
+    rng, axes, n, m = np.random.default_rng(2), 3, 5, 2 * blocks
+    root = rng.standard_normal((axes, n, rank))
+    prior = Belief(rng.standard_normal((axes, n)), root @ root.swapaxes(1, 2))
+    R = rng.standard_normal((axes, blocks, 2, 2))
+    R = 1e-3 * (R @ R.swapaxes(2, 3) + np.eye(2))
+    H, innovation = rng.standard_normal((axes, m, n)), rng.standard_normal((axes, m))
+    gain = 0.01 * rng.standard_normal((n, m)) if fixed else None
+    ours = corrected_by_blocks(prior, innovation, H, R, gain)
+    theirs = corrected(prior, innovation, H, np.array([linalg.block_diag(*each) for each in R]), gain)
+    np.testing.assert_allclose(ours.posterior.mean, theirs.posterior.mean, rtol=1e-9, atol=1e-9)
+    scale = np.abs(theirs.posterior.covariance).max()
+    np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, atol=1e-9 * scale)
+    np.testing.assert_allclose(ours.nis, theirs.nis, rtol=1e-9)
+    whole = theirs.innovation_covariance
+    np.testing.assert_allclose(
+        ours.innovation_covariance, whole if m <= 32 else np.einsum("amm->am", whole), rtol=1e-9, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("orders", [(1,), (2,), (1, 2)])
+def test_many_moments_at_once_are_the_same_moments(mimo, orders):
+    rng = np.random.default_rng(4)
+    model = exposure_model(dataclasses.replace(mimo, C=rng.standard_normal((7, 3))), 30)
+    response = model.response(rng.standard_normal((30, model.plant.axes * model.plant.n_inputs)))
+    state = rng.standard_normal((model.plant.axes, 3))
+    for ours, theirs in zip(
+        many_moments(model, response, state, orders), predicted_moments(model, response, state, orders), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-12)
+
+
+def test_the_gain_of_many_outputs_is_that_of_all_of_them(mimo):
+    rng = np.random.default_rng(5)
+    model = exposure_model(dataclasses.replace(mimo, C=rng.standard_normal((12, 3))), 30)
+    blocks = rng.standard_normal((6, 2, 2))
+    noise = blocks @ blocks.swapaxes(1, 2) + 0.1 * np.eye(2)
+    ours = steady_gain(model, model.process_noise, noise)
+    theirs = steady_gain(model, model.process_noise, linalg.block_diag(*noise))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-10)

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from aolink.estimation import run
+from aolink.estimation.centroids import centroid_covariance
 from aolink.estimation.estimate import Status
 from aolink.estimation.moments import measure_moments, spot_significance
 from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.score import score
-from aolink.estimation.spots import centroid_noise, measure_spots, profiles, windows
+from aolink.estimation.spots import measure_spots, profiles
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, to_counts, to_density
-from aolink.optics.frame import frame_density
+from aolink.optics.frame import frame_density, spot_windows
 from aolink.optics.plane import kernel_covariance
 from aolink.rig import Plant, Rig, SpotSensor, load_rig
 from aolink.simulation.model import simulate
@@ -77,7 +78,7 @@ def test_profiles_are_the_sums_in_whole_numbers(grid, window):
     pixels[:, :window] = 65_535
     usable = np.ones(sensor.shape, dtype=bool)
     usable[1, 2] = False
-    each, good = windows(sensor, pixels.astype(np.int64)), windows(sensor, usable)
+    each, good = spot_windows(sensor, pixels.astype(np.int64)), spot_windows(sensor, usable)
     sums = np.stack([each.sum(axis=1), each.sum(axis=2)], axis=1).reshape(-1, window)
     mask = np.stack([good.all(axis=1), good.all(axis=2)], axis=1).reshape(-1, window)
     found = profiles(sensor, pixels, usable)
@@ -90,7 +91,7 @@ def test_profiles_are_the_sums_in_whole_numbers(grid, window):
 def test_moments_of_spots_are_those_of_the_plane_without_its_cross_terms(exposures, flux):
     measured, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels, (1, 2), flux)
     edges, orders = SENSOR.profile.edges, [(1, 0), (2, 0), (0, 1), (0, 2)]
-    density = windows(SENSOR, to_density(SENSOR, exposures[0].pixels))
+    density = spot_windows(SENSOR, to_density(SENSOR, exposures[0].pixels))
     kernel, noise = kernel_covariance(SENSOR.kernel.sigma * np.eye(2)), effective_noise_density(SENSOR)
     theirs = measure_moments_2d(density, edges, edges, kernel, noise, orders, flux)
     np.testing.assert_allclose(measured.value.reshape(16, 4), theirs.value, atol=1e-12)
@@ -145,12 +146,12 @@ def test_a_coupled_plant_is_told_that_its_slopes_share_the_pixels_noise():
     rig = coupled()
     found = [measured_of(ONE, rig.plant, frame)[0] for frame in noisy_frames(ONE, (0.3, -0.2), FRAMES)]
     values = np.array([each.value[0] for each in found])
-    claimed = found[0].covariance[0]
+    claimed = found[0].covariance[0, 0]
     sd = np.sqrt(claimed.diagonal() / FRAMES)
     assert (np.abs(values.mean(axis=0) - [0.3, 0.09, -0.2, 0.04]) < 5 * sd).all()
     np.testing.assert_allclose(np.cov(values.T), claimed, atol=0.1 * claimed.max())
     assert claimed[1, 3] > 0.4 * claimed[1, 1]
-    np.testing.assert_allclose(centroid_noise(ONE, 2), claimed[::2, ::2], atol=1e-12)
+    np.testing.assert_allclose(centroid_covariance(rig)[0, 0], claimed[::2, ::2], atol=1e-12)
 
 
 def test_a_coupled_plant_is_estimated_better_than_by_prediction():

@@ -10,8 +10,9 @@ from aolink.optics.turbulence import Layer, structure_function
 from aolink.rig import load_rig, parse_rig
 from aolink.simulation.disturbance import DisturbancePlayer
 from aolink.simulation.model import RigModel, simulate
+from tests.conftest import without_pupil
 
-SH, TILT = load_rig("sh-8x8"), load_rig("tip-tilt")
+SH, TILT = without_pupil(load_rig("sh-8x8")), load_rig("tip-tilt")
 
 
 def disturbed(rig, **changes):

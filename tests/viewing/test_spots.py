@@ -90,3 +90,13 @@ def test_the_profile_is_that_of_the_first_spot_along_x(recording: Simulated, sav
 def test_no_view_is_empty(saved: Path) -> None:
     missing = [each for each in absent_from_views(saved) if not each.startswith(("/link", "/mirror"))]
     assert missing == []
+
+
+def test_windows_in_the_dark_have_no_paths(tmp_path: Path) -> None:
+    rig = load_rig("sh-8x8")
+    saved = save_rrd(Simulated(rig, ["o1"]), tmp_path / "pupil.rrd")  # type: ignore[arg-type]
+    (strips, *_) = read_rrd(saved)["/camera/image/path/truth"]["LineStrips2D:strips"]
+    assert rig.optics is not None
+    lit = np.argwhere(rig.optics.lenslets.light.reshape(8, 8) >= 0.4)
+    where = np.array([np.mean(path, axis=0) for path in strips]) // 16
+    np.testing.assert_array_equal(where[:, ::-1], lit)

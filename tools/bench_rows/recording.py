@@ -79,7 +79,7 @@ def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
     """A recording of several MB, and of each chunk its first byte, the byte after its last, and its messages."""
     path = folder / "long.mcap"
     file = McapFile(path, WriteOptions())
-    begin_recording(file, load_rig("section-vi"), {}, 0)
+    begin_recording(file, load_rig("section-vi"), {}, 0, {})
     rng = np.random.default_rng(2)
     for k in range(3000):
         data = RawImage(width=32, height=32, encoding="mono16", step=64, data=rng.bytes(2048)).SerializeToString()

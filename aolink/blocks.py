@@ -1,0 +1,79 @@
+"""Systems that fall apart: a mirror's actuators are many small systems side by side, and most of them are alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+FloatArray = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+def components(*matrices: FloatArray) -> list[Indices]:
+    """States that hang together by any of square matrices, (n, n) each."""
+    linked = np.any([matrix != 0 for matrix in matrices], axis=0)
+    count, of_state = connected_components(csr_array(linked), directed=False)
+    order = np.argsort(of_state, kind="stable")
+    return np.split(order, np.searchsorted(of_state[order], np.arange(1, count)))
+
+
+def blockwise(
+    function: Callable[..., tuple[FloatArray, ...]], matrices: tuple[FloatArray, ...], parts: list[Indices]
+) -> tuple[FloatArray, ...]:
+    """A function of square matrices that works on each component by itself; once on those that are alike."""
+    if len(parts) == 1:
+        return function(*matrices)
+    known: dict[bytes, tuple[FloatArray, ...]] = {}
+    whole: tuple[FloatArray, ...] = ()
+    for part in parts:
+        blocks = [np.ascontiguousarray(matrix[np.ix_(part, part)]) for matrix in matrices]
+        key = b"".join(block.tobytes() for block in blocks)
+        if key not in known:
+            known[key] = function(*blocks)
+        whole = whole or tuple(np.zeros_like(matrices[0]) for _ in known[key])
+        for out, block in zip(whole, known[key], strict=True):
+            out[np.ix_(part, part)] = block
+    return whole
+
+
+def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """P = A P A' + Q for a stable A, (n, n)."""
+
+    def solved(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, ...]:
+        return (np.asarray(linalg.solve_discrete_lyapunov(A, Q), dtype=np.float64),)
+
+    return blockwise(solved, (A, Q), components(A, Q))[0]
+
+
+def eigenvalues(A: FloatArray, parts: list[Indices]) -> NDArray[np.complex128]:
+    """Of each component that is unlike the others, (k,)."""
+    blocks = {block.tobytes(): block for block in (np.ascontiguousarray(A[np.ix_(part, part)]) for part in parts)}
+    return np.concatenate([np.linalg.eigvals(block) for block in blocks.values()]).astype(np.complex128)
+
+
+def null_space(
+    A: FloatArray, value: complex, parts: list[Indices], tolerance: float, *, left: bool = False, power: int = 1
+) -> NDArray[np.complex128]:
+    """Orthonormal basis of the eigenvectors of A for a value, (n, k); or of left ones, or up to a power."""
+    known: dict[bytes, NDArray[np.complex128]] = {}
+    columns: list[tuple[Indices, NDArray[np.complex128]]] = []
+    for part in parts:
+        block = np.ascontiguousarray(A[np.ix_(part, part)])
+        key = block.tobytes()
+        if key not in known:
+            pencil = np.linalg.matrix_power(value * np.eye(len(block)) - block, min(power, len(block)))
+            _, sizes, rows = np.linalg.svd(pencil.conj().T if left else pencil)
+            known[key] = rows[sizes <= tolerance].conj().T
+        if known[key].size:
+            columns.append((part, known[key]))
+    out = np.zeros((len(A), sum(vectors.shape[1] for _, vectors in columns)), dtype=np.complex128)
+    first = 0
+    for part, vectors in columns:
+        out[part, first : first + vectors.shape[1]] = vectors
+        first += vectors.shape[1]
+    return out

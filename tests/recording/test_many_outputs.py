@@ -1,0 +1,75 @@
+"""Recordings of plants that move many spots at once: what is large in them is kept small."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+
+from aolink.demo import simulated_rig
+from aolink.estimation import run
+from aolink.recording import convert
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, reestimate
+from aolink.rig import load_rig
+from aolink.session import record
+from aolink.simulation.devices import truth_message
+from aolink.simulation.model import simulate
+from tests.conftest import Session
+
+NAMES = ("open-loop", "o1", "o3")
+
+
+@pytest.fixture(scope="module")
+def pupil(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    """48 spots behind a pupil, one plant for all of them."""
+    path = tmp_path_factory.mktemp("pupil") / "session.mcap"
+    with simulated_rig("sh-8x8") as (camera, mirror):
+        return Session(path, record(load_rig("sh-8x8"), camera, mirror, path, estimators=NAMES, exposures=5))
+
+
+def test_online_and_offline_estimates_agree_bit_for_bit(pupil: Session) -> None:
+    recording = Recording(pupil.path)
+    for name, again in reestimate(recording, NAMES).items():
+        recorded = recording.estimates(name)
+        assert len(recorded) == 5
+        assert first_difference(recorded, again) is None
+    (estimate, *_) = recording.estimates("o3")
+    assert estimate.innovation_covariance.shape == (1, 192)
+
+
+def test_the_attached_arrays_expand_the_recorded_coefficients(pupil: Session) -> None:
+    recording = Recording(pupil.path)
+    outputs, basis = (
+        np.load(io.BytesIO(recording.attachments[f"exposure_{name}.npy"])) for name in ("outputs", "basis")
+    )
+    for name in ("open-loop", "o3"):
+        estimate = recording.estimates(name)[-1]
+        count = estimate.coefficients.shape[1]
+        path = np.tensordot(outputs, basis[..., :count] @ estimate.coefficients[0], axes=1)
+        response = estimate.model.response(estimate.inputs).path[0]
+        np.testing.assert_allclose(estimate.path, path + response, atol=1e-10)
+
+
+def test_a_whole_innovation_covariance_of_an_older_file_is_read() -> None:
+    rig = load_rig("sh-8x8")
+    exposures = simulate(rig, 1)
+    (estimate,) = run(rig, exposures, ["o3"])["o3"]
+    message = convert.estimate_message(estimate)
+    assert not message.innovation_covariance
+    whole = np.diag(estimate.innovation_covariance[0])
+    message.innovation_covariance.extend(whole.ravel())
+    del message.innovation_variance[:]
+    read = convert.estimate_from_message(message, estimate.model, exposures[0])
+    np.testing.assert_array_equal(read.innovation_covariance[0], whole)
+
+
+def test_a_truth_of_very_many_outputs_is_in_single_precision() -> None:
+    truth = simulate("sh-30x30", 1)[0].truth
+    assert truth is not None
+    message = truth_message(1, truth)
+    assert message.ByteSize() < 4.1 * truth.path.size
+    read = convert.truth_from_message(message)
+    np.testing.assert_allclose(read.path, truth.path, rtol=1e-7)
+    np.testing.assert_array_equal(read.end_state, truth.end_state)
