@@ -114,10 +114,20 @@ def _sinc2_below(x: FloatArray) -> FloatArray:
 
 
 def _image_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
+    """Some spots at a time, of which the paths are about as long."""
+    light = np.empty((len(path_px), side, side))
+    order = np.argsort(np.ptp(path_px, axis=2).max(axis=1))
+    for k in range(0, len(order), _AT_ONCE):
+        some = order[k : k + _AT_ONCE]
+        light[some] = _image_of_some(psi, side, path_px[some])
+    return light
+
+
+def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     """The image, and the path's own picture on the fine grid, convolved by their spectra.
 
-    A step's place between fine points goes to the four of them by its distances, so that its mean is exact. Each
-    spot has a square just large enough for its path; its spectrum, folded, is that of the sums over pixels.
+    A step's place between fine points goes to the four of them by its distances, so that its mean is exact. Spots
+    have squares just large enough for their paths; the squares' spectra, folded, are those of sums over pixels.
     """
     assert psi.image is not None
     fine, reach = psi.finer, max(psi.image.shape) // 2 + 1
