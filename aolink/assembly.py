@@ -8,6 +8,7 @@ order, so what is missing shows as soon as something later has come.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,10 +43,12 @@ class Frame:
     clock_sigma_ns: float = float("nan")
     exposure_offset_ns: int = 0
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
+    plane: int = 0
+    """Which of the camera's pictures of the exposure: 0 of the spots, 1 of the scene."""
 
 
 class FrameReassembly:
-    """Chunks of frames of ``shape`` (rows, columns) become frames. Lost chunks leave masked pixels."""
+    """Chunks of frames of ``shape`` (rows, columns) of one plane become frames. Lost chunks leave masked pixels."""
 
     def __init__(self, shape: tuple[int, int], fast_step_ns: int) -> None:
         self._shape, self._fast_step_ns = shape, fast_step_ns
@@ -110,7 +113,42 @@ class FrameReassembly:
             host_first_byte_ns=self._first_byte_ns,
             host_receive_ns=self._last_byte_ns,
             exposure_offset_ns=first.exposure_offset_ns,
+            plane=first.plane,
         )
+
+
+class PlanesReassembly:
+    """Chunks of all the pictures of an exposure become frames, each plane's with losses of its own.
+
+    A camera sends one plane after the other, so a chunk of one ends what has come of the other.
+
+    Parameters
+    ----------
+    shapes:
+        Rows and columns of plane 0, 1, ...
+    """
+
+    def __init__(self, shapes: Sequence[tuple[int, int]], fast_step_ns: int) -> None:
+        self._planes = [FrameReassembly(shape, fast_step_ns) for shape in shapes]
+        self._unknown = 0
+
+    @property
+    def refused(self) -> int:
+        """Chunks that made no sense, those of planes that the camera does not have among them."""
+        return self._unknown + sum(plane.refused for plane in self._planes)
+
+    def add(self, chunk: pb.FrameChunk, receive_ns: int) -> list[Frame]:
+        """Take a chunk; gives the frames that are over with it."""
+        if chunk.plane >= len(self._planes):
+            self._unknown += 1
+            return []
+        own = self._planes[chunk.plane]
+        ended = [frame for plane in self._planes if plane is not own for frame in plane.flush()]
+        return ended + own.add(chunk, receive_ns)
+
+    def flush(self) -> list[Frame]:
+        """The frames that are in progress, as they are."""
+        return [frame for plane in self._planes for frame in plane.flush()]
 
 
 class TruthReassembly:

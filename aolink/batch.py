@@ -6,14 +6,12 @@ import csv
 import hashlib
 import itertools
 import json
-import os
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ from aolink.estimation import Engine, Scorer
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import recorded_estimates, write_reestimated
 from aolink.rig import parse_rig
+from aolink.workers import processes
 
 COLUMNS = (
     "recording", "model", "estimator", "exposures", "path_rmse", "start_rmse", "end_rmse",
@@ -164,30 +163,13 @@ def run(
             yield _do(job)
             progress(count := count + 1)
         return
-    # One thread each: the workers share the cores already, and numbers must not depend on how many there are.
-    environment = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-            waiting = {pool.submit(_do, job) for job in fresh}
-            try:
-                while waiting and not stop():
-                    finished, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-                    for future in finished:
-                        yield future.result()
-                        progress(count := count + 1)
-            finally:
-                for future in waiting:
-                    future.cancel()
-    finally:
-        for name, value in environment.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+    with processes(workers) as pool:
+        waiting = {pool.submit(_do, job) for job in fresh}
+        while waiting and not stop():
+            finished, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+            for future in finished:
+                yield future.result()
+                progress(count := count + 1)
 
 
 def write_table(path: Path, done: Sequence[Done]) -> None:

@@ -59,7 +59,7 @@ def eigenvalues(A: FloatArray, parts: list[Indices]) -> NDArray[np.complex128]:
 def null_space(
     A: FloatArray, value: complex, parts: list[Indices], tolerance: float, *, left: bool = False, power: int = 1
 ) -> NDArray[np.complex128]:
-    """Orthonormal basis of the eigenvectors of A for a value, (n, k); of left ones, or of a power of the pencil."""
+    """Orthonormal basis of the eigenvectors of A for a value, (n, k); or of left ones, or up to a power."""
     known: dict[bytes, NDArray[np.complex128]] = {}
     columns: list[tuple[Indices, NDArray[np.complex128]]] = []
     for part in parts:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import select
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from aolink.errors import AolinkError, DeviceError, EstimatorError, ViewerError
 from aolink.estimation import make_estimator
+from aolink.recording.deblur import Summary, write_deblurred
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import Rig
@@ -34,6 +36,12 @@ class DemoResult:
     no_picture: str
     """Why there is no picture; empty where there is one."""
     report: Report
+    deblurred: Summary | None = None
+    """What came of the pictures that a picture sensor took; None where the rig has none."""
+    deblurred_by: str = ""
+    """Whose path they were restored with."""
+    deblurred_recording: Path | None = None
+    """The session with them."""
     differences: dict[str, str]
     """Where online and offline estimates differ, by estimator; empty if nowhere."""
     seconds: dict[str, float]
@@ -99,6 +107,7 @@ def new_folder(parent: Path) -> Path:
 
 def run_demo(
     rig: Rig,
+    source: str | Path,
     folder: Path,
     *,
     exposures: int,
@@ -107,11 +116,13 @@ def run_demo(
     stop: Callable[[], bool],
     progress: Callable[[str, int], None],
 ) -> DemoResult:
-    """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays."""
+    """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays.
+
+    The rig runs from its ``source``, file or name: what that names is relative to it.
+    """
     from aolink import viewing
 
-    rig_file = folder / "rig.toml"
-    rig_file.write_text(rig.toml)
+    (folder / "rig.toml").write_text(rig.toml)
     path, rrd, picture = folder / "session.mcap", folder / "session.rrd", folder / "session.png"
     seconds: dict[str, float] = {}
     estimators = possible_estimators(rig)
@@ -125,7 +136,7 @@ def run_demo(
 
     options = ["--real-time"] if real_time else []
     options += ["--seed", str(seed)] if seed is not None else []
-    with part("record") as tell, simulated_rig(rig_file, *options) as (camera, mirror):
+    with part("record") as tell, simulated_rig(source, *options) as (camera, mirror):
         report = record(
             rig, camera, mirror, path, estimators=estimators, exposures=exposures, note="aolink demo", stop=stop,
             progress=tell,
@@ -143,6 +154,14 @@ def run_demo(
             for name, again in offline.items()
             if (difference := first_difference(recording.estimates(name), again))
         }
+    deblurred, deblurred_recording = None, None
+    if rig.scene is not None:
+        deblurred_recording = folder / "deblurred.mcap"
+        with part("deblur") as tell:
+            deblurred = write_deblurred(
+                recording, deblurred_recording, estimator=estimators[-1], workers=os.cpu_count() or 1, progress=tell
+            )
+        recording = Recording(deblurred_recording)
     with part("write .rrd"):
         viewing.save_rrd(recording, rrd)
     no_picture = ""
@@ -157,6 +176,9 @@ def run_demo(
         picture=None if no_picture else picture,
         no_picture=no_picture,
         report=report,
+        deblurred=deblurred,
+        deblurred_by=estimators[-1],
+        deblurred_recording=deblurred_recording,
         differences=differences,
         seconds=seconds,
     )

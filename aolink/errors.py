@@ -57,3 +57,9 @@ class FrameError(AolinkError):
     """A frame that does not show what it should: no spots, no grid of them, not a picture."""
 
     exit_code = 9
+
+
+class RestorationError(AolinkError):
+    """A picture or a point spread function that cannot be restored with, or not by the method asked for."""
+
+    exit_code = 10

@@ -30,6 +30,16 @@ class Truth:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Picture:
+    """What the picture sensor saw in one exposure."""
+
+    pixels: NDArray[np.uint16]
+    """Counts, (rows, columns)."""
+    mask: NDArray[np.bool_]
+    """True where the pixel arrived, (rows, columns)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
     """One camera integration."""
 
@@ -70,6 +80,9 @@ class Exposure:
     """When the host had the last chunk, host clock, ns."""
     clock_sigma_ns: float = float("nan")
     """Standard deviation of ``host_start_ns`` by the clock regression, ns; NaN where there is none."""
+    scene: Picture | None = None
+    """The picture of the same exposure, where the rig has a picture sensor. It comes after the spot's frame, so
+    that an exposure that is estimated live does not have it yet."""
     truth: Truth | None = None
     """What really happened, where it is known."""
 

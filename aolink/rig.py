@@ -23,6 +23,7 @@ from aolink.disturbance import Disturbance, read_disturbance
 from aolink.errors import RigError
 from aolink.optical_plant import Optics, read_membrane, read_optics, read_tip_tilt, read_voltage
 from aolink.optics.mirror import VoltageLaw
+from aolink.scene import SceneSensor, read_scene
 from aolink.sensor import BaseSensor, read_calibration, read_grid, read_sensor
 from aolink.sensor import CalibrationTable as CalibrationTable
 from aolink.sensor import Kernel as Kernel
@@ -206,6 +207,8 @@ class Rig:
     optics: Optics | None
     """The lenslets, where the file describes them."""
     disturbance: Disturbance | None
+    scene: SceneSensor | None
+    """The picture sensor that shares the exposure, where the rig has one."""
     folder: Path
     """Of the file; where a file is named in it, its path is relative to this."""
     toml: str
@@ -242,7 +245,8 @@ def load_rig(path_or_name: str | Path) -> Rig:
     """
     path = Path(path_or_name)
     if path.suffix != ".toml" and str(path_or_name) in builtin_rigs():
-        text = (resources.files("aolink") / "rigs" / f"{path_or_name}.toml").read_text()
+        path = Path(str(resources.files("aolink") / "rigs")) / f"{path_or_name}.toml"
+        text = path.read_text()
     else:
         try:
             text = path.read_text()
@@ -285,13 +289,14 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     disturbance = read_disturbance(root.table("disturbance")) if root.has("disturbance") else None
     if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
         raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
+    scene = read_scene(root.table("scene")) if root.has("scene") else None
     simulation = _simulation(root.table("simulation", optional=True))
     calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
     root.finish()
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
         mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,
-        optics=optics, disturbance=disturbance, folder=folder or Path(), toml=text,
+        optics=optics, disturbance=disturbance, scene=scene, folder=folder or Path(), toml=text,
     )  # fmt: skip
 
 

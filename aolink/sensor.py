@@ -304,7 +304,7 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
     if field[0] >= field[1]:
         raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
     kernel_table = table.table("kernel")
-    kernel = _kernel(kernel_table)
+    kernel = read_kernel(kernel_table)
     kernel_table.finish()
     return {
         "field": (float(field[0]), float(field[1])),
@@ -317,7 +317,8 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
     }
 
 
-def _kernel(table: Table) -> Kernel:
+def read_kernel(table: Table) -> Kernel:
+    """A table ``kernel``. Raises `RigError`."""
     shape = table.choice("shape", ("gaussian",))
     if not isinstance(table.get("sigma"), list):
         return Kernel(shape=shape, sigma=table.number("sigma", above=0.0))

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from aolink.demo import DemoResult
     from aolink.estimation.exposure_scan import ExpectedError
     from aolink.recording.compare import TopicComparison
+    from aolink.recording.deblur import Summary
     from aolink.rig import Rig
     from aolink.slopes import FrameSlopes
 
@@ -40,8 +41,8 @@ _LATENCY_STEPS = (
 )
 
 _LOSSES = (
-    "frames_lost", "frames_incomplete", "packets_missing", "packets_bad_crc", "packets_bad_framing",
-    "packets_bad_payload", "chunks_refused", "steps_late", "steps_clipped", "steps_parked",
+    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
+    "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_clipped", "steps_parked",
 )  # fmt: skip
 """What a session counts of what went wrong."""
 
@@ -248,6 +249,32 @@ def _latency_ms(latencies: Sequence[pb.Latency], since: str, until: str) -> list
     return [len(values), *map(float, np.percentile(values, [50, 99]))] if values else [0.0]
 
 
+def deblurred(summary: Summary) -> dict[str, Any]:
+    """What came of restored pictures; PSNRs are means over the scenes, None where the true scene is not known."""
+    blurred, restored = summary.psnr_blurred, summary.psnr_restored
+    return {
+        "exposures": summary.exposures,
+        "scenes_restored": summary.scenes,
+        "missing": dict(summary.reasons),
+        "psnr_blurred_db": float(np.mean(blurred)) if blurred else None,
+        "psnr_restored_db": float(np.mean(restored)) if restored else None,
+        "psnr_restored_least_db": min(restored) if restored else None,
+    }
+
+
+def deblurred_lines(summary: Summary, estimator: str, method: str) -> list[str]:
+    """The same in words."""
+    facts = deblurred(summary)
+    scenes = f"{facts['scenes_restored']} scenes" if facts["scenes_restored"] else "spots"
+    lines = [f"{scenes} of {facts['exposures']} exposures restored with the path of {estimator}, {method}"]
+    if facts["psnr_blurred_db"] is not None:
+        lines.append(
+            f"PSNR of the scene: {facts['psnr_blurred_db']:.1f} dB as it came (its shift forgiven),"
+            f" {facts['psnr_restored_db']:.1f} dB restored (at least {facts['psnr_restored_least_db']:.1f})"
+        )
+    return lines + [f"{count} not restored: {reason}" for reason, count in summary.reasons.items()]
+
+
 def demo_summary(result: DemoResult, command: str) -> list[str]:
     """What came of the demo, and what to run next with ``command``."""
     if result.rrd is None:
@@ -256,8 +283,12 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
         lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
     else:
         lines = ["online and offline estimates agree bit for bit"]
+    if result.deblurred is not None:
+        lines += deblurred_lines(result.deblurred, result.deblurred_by, "tv")
     lines.append("times     " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in result.seconds.items()))
     lines.append(f"recording {result.recording}")
+    if result.deblurred_recording is not None:
+        lines.append(f"deblurred {result.deblurred_recording}")
     lines.append(f"rerun     {result.rrd}")
     lines.append(f"picture   {result.picture}" if result.picture else f"picture   none: {result.no_picture}")
     lines.append(f"next      {command} view {result.recording}")

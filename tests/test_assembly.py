@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.assembly import Assembler, Frame, FrameReassembly, TruthReassembly, _InputHistory
+from aolink.assembly import Assembler, Frame, FrameReassembly, PlanesReassembly, TruthReassembly, _InputHistory
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as pb
 
@@ -227,3 +227,34 @@ def test_every_step_has_its_last_report_or_command_or_the_input_before(calls: li
         for known in (applied, commanded):
             for step in [step for step in known if step < end]:
                 del known[step]
+
+
+def planes(lost: set[int], plane: int, frame_id: int = 1) -> list[pb.FrameChunk]:
+    parts = chunks(frame_id)
+    for part in parts:
+        part.plane = plane
+    return [part for i, part in enumerate(parts) if i not in lost]
+
+
+@given(st.sets(st.integers(0, 5), max_size=6), st.sets(st.integers(0, 5), max_size=6))
+def test_each_picture_of_an_exposure_has_losses_of_its_own(spots: set[int], scene: set[int]) -> None:
+    reassembly = PlanesReassembly([SHAPE, SHAPE], 1_000_000)
+    sent = planes(spots, 0) + planes(scene, 1) + planes(set(), 0, 2) + planes(set(), 1, 2)
+    frames = [frame for i, part in enumerate(sent) for frame in reassembly.add(part, 1000 + i)]
+    assert not reassembly.flush()
+    found = {(frame.frame_id, frame.plane): frame for frame in frames}
+    assert list(found) == sorted(found)  # in the order in which the camera sends
+    for plane, lost in ((0, spots), (1, scene)):
+        assert found[2, plane].mask.all()
+        if len(lost) == 6:
+            assert (1, plane) not in found
+        else:
+            assert found[1, plane].chunks_lost == len(lost)
+            assert np.count_nonzero(~found[1, plane].mask) == 50 * len(lost)
+    assert reassembly.refused == 0
+
+
+def test_a_picture_that_the_camera_does_not_have_is_refused() -> None:
+    reassembly = PlanesReassembly([SHAPE], 1_000_000)
+    assert [frame for part in planes(set(), 1) for frame in reassembly.add(part, 0)] == []
+    assert reassembly.refused == 6

@@ -29,7 +29,7 @@ def test_poking_the_rig_gives_the_plants_own_matrix():
     found = measure_interaction(rig, poked(rig))
     assert found.exposures == 32
     error = found.matrix - TRUE
-    # Centroids of 2000 photo-electrons, fewer at the pupil's edge, and read-out noise.
+    # Centroids of 2000 photo-electrons, fewer at the pupil's edge, and read-out noise, over the root of two pokes.
     assert np.sqrt((error**2).mean()) < 0.06 * np.sqrt((TRUE**2).mean())
     assert found.residual_rms < 0.05
     assert found.condition == pytest.approx(np.linalg.cond(TRUE), rel=0.2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -31,6 +32,10 @@ from aolink.rig import Rig, load_rig, parse_light
 from aolink.terminal import StopRequest, ask, input_ended, progress_bar
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from aolink.estimation import Estimate
+    from aolink.exposure import Exposure
     from aolink.recording.reader import Recording
 
 MOST_EXPOSURES = 2**32 - 1
@@ -177,6 +182,9 @@ def record(
         Light | None,
         typer.Option(help="Frames of this for `aolink calibrate`: the mirror stays parked, whatever the rig's drive."),
     ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show it in Rerun as it goes on; the viewer skips what it has no time for.")
+    ] = False,
     split_mib: Annotated[
         float, typer.Option(min=0, metavar="MIB", help="Begin another file at this size; 0 for one file.")
     ] = 0.0,
@@ -211,7 +219,11 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
+    with (
+        _live_view(loaded, estimator or [], shown=view) as watch,
+        StopRequest().installed() as stop,
+        progress_bar(stderr, exposures) as tell,
+    ):
         report = session.record(
             loaded,
             camera,
@@ -221,6 +233,7 @@ def record(
             exposures=exposures or 0,
             note=note,
             calibration=calibration or "",
+            watch=watch,
             overwrite=overwrite,
             options=options,
             stop=stop,
@@ -239,6 +252,26 @@ def record(
         text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; look at it: {program()} view {written}"
         stdout.print(text, markup=False)
     stop.exit_if_asked()
+
+
+@contextmanager
+def _live_view(
+    rig: Rig, estimators: Sequence[str], *, shown: bool
+) -> Iterator[Callable[[Exposure, Sequence[Estimate]], None] | None]:
+    """What shows a session's exposures, or nothing; says how many it skipped."""
+    if not shown:
+        yield None
+        return
+    from aolink import viewing
+
+    with viewing.live_viewer(rig, estimators) as live:
+        view = viewing.Decimating(live)
+        try:
+            yield view.show
+        finally:
+            view.close()
+            if view.skipped:
+                stderr.print(f"aolink: the viewer had no time for {view.skipped} exposures; all are in the recording")
 
 
 @app.command(
@@ -280,7 +313,7 @@ def replay(
     from aolink.session.replay import replay as replay_recording
 
     scorers = {name: Scorer() for name in names}
-    viewer = viewing.live_viewer(recording.rig, names) if view else nullcontext()
+    viewer = viewing.live_viewer(recording.rig, names, recording.true_scene) if view else nullcontext()
     with viewer as shown, StopRequest().installed() as stop:
         total = recording.counts.get("/camera/image", 0)
         with progress_bar(stderr, total if end is None and not start else None) as tell:
@@ -397,7 +430,7 @@ def demo(
     folder = new_folder(out)
     with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
         result = run_demo(
-            loaded, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
+            loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
         )  # fmt: skip
     if not stop():
         recording = Recording(result.recording)

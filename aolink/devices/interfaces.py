@@ -66,7 +66,7 @@ class Camera(Device, Protocol):
         """Chunks that made no sense."""
 
     def flush(self) -> list[Frame]:
-        """The frame that is still incomplete, as it is."""
+        """The frames that are still incomplete, as they are."""
 
 
 class Mirror(Device, Protocol):

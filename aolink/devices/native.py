@@ -9,7 +9,7 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.assembly import Frame, FrameReassembly, TruthReassembly
+from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.errors import DeviceError
 from aolink.rig import Rig
@@ -64,7 +64,11 @@ class NativeCamera(_NativeDevice):
 
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
         super().__init__(hub, link, identity)
-        self._frames = FrameReassembly((identity.camera.height, identity.camera.width), identity.fast_step_ns)
+        geometry = identity.camera
+        shapes = [(geometry.height, geometry.width)]
+        if geometry.scene_width:
+            shapes.append((geometry.scene_height, geometry.scene_width))
+        self._frames = PlanesReassembly(shapes, identity.fast_step_ns)
         self._truths = TruthReassembly()
 
     def start(self, first_step: int, exposures: int) -> None:
@@ -261,12 +265,18 @@ def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> lis
             f"camera {camera.serial_number} and mirror {mirror.serial_number} do not belong to the same rig:"
             " a rig on virtual time needs both of its ports"
         )
-    limits = mirror.mirror
+    limits, scene = mirror.mirror, rig.scene
     pairs = [
         ("timing.fast_step_s (camera, ns)", camera.fast_step_ns, rig.timing.fast_step_ns),
         ("timing.fast_step_s (mirror, ns)", mirror.fast_step_ns, rig.timing.fast_step_ns),
         ("sensor shape (rows, columns)", (camera.camera.height, camera.camera.width), rig.sensor.shape),
         ("sensor.bit_depth", camera.camera.bit_depth, rig.sensor.bit_depth),
+        (
+            "scene.pixels (rows, columns)",
+            (camera.camera.scene_height, camera.camera.scene_width),
+            scene.shape if scene else (0, 0),
+        ),
+        ("scene.bit_depth", camera.camera.scene_bit_depth, scene.bit_depth if scene else 0),
         ("timing.exposure_steps", camera.camera.exposure_steps, rig.timing.exposure_steps),
         ("timing.frame_period_steps", camera.camera.frame_period_steps, rig.timing.frame_period_steps),
         ("number of inputs", limits.n_inputs, rig.n_inputs),

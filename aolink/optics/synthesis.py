@@ -165,7 +165,7 @@ def _image_spectrum(image: FloatArray, fine: int, size: int) -> NDArray[np.compl
     kernel = np.zeros((size, size))
     kernel[:rows, :columns] = image / image.sum()
     kernel = np.roll(kernel, (-(rows // 2), -(columns // 2)), (0, 1))
-    over_pixel = sum(np.roll(kernel, -k, axis=0) for k in range(fine))
+    over_pixel = np.sum([np.roll(kernel, -k, axis=0) for k in range(fine)], axis=0)
     return np.asarray(fft.rfft2(over_pixel))
 
 

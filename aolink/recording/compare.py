@@ -133,14 +133,14 @@ def _alternating(
 def _named(messages: Iterator[RecordedMessage]) -> Iterator[tuple[tuple[str, object], Message, int | None]]:
     """Each message with a name that its counterpart has too, and the exposure that it belongs to."""
     places: dict[tuple[str, object], int] = {}
-    exposure: int | None = None
+    exposures: dict[str, int] = {}
     for recorded in messages:
         message, frame_id = recorded.message, None
         name: object = ""
-        if isinstance(message, schemas_pb2.ExposureInfo):
-            exposure = message.frame_id
-        if recorded.topic in topics.PICTURES and exposure is not None:
-            frame_id = name = exposure
+        if isinstance(message, schemas_pb2.ExposureInfo | schemas_pb2.Restoration):
+            exposures |= dict.fromkeys(topics.PICTURES.get(recorded.topic, ()), message.frame_id)
+        if recorded.topic in exposures:
+            frame_id = name = exposures[recorded.topic]
         elif isinstance(value := getattr(message, "frame_id", None), int):
             frame_id = name = value
         elif isinstance(message, wire.CommandBlock | wire.Applied):

@@ -38,10 +38,27 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
         frames_lost_before=frame.frames_lost_before,
         exposure_offset_ns=frame.exposure_offset_ns,
     )
-    image = RawImage(frame_id="camera", width=width, height=height, encoding="mono16", step=2 * width)
+    sensor = "scene" if frame.plane else "camera"
+    image = RawImage(frame_id=sensor, width=width, height=height, encoding="mono16", step=2 * width)
     image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
     image.data = frame.pixels.astype("<u2").tobytes()
     return info, image
+
+
+def float_image(picture: NDArray[np.float32], time_ns: int) -> RawImage:
+    """A restored picture as it is recorded."""
+    height, width = picture.shape
+    image = RawImage(frame_id="restored", width=width, height=height, encoding="32FC1", step=4 * width)
+    image.timestamp.FromNanoseconds(time_ns)
+    image.data = picture.astype("<f4").tobytes()
+    return image
+
+
+def picture_from_float_image(image: RawImage) -> NDArray[np.float32]:
+    """Inverse of `float_image`. Raises RecordingError for a picture that is not what it says."""
+    if image.encoding != "32FC1" or len(image.data) != 4 * image.width * image.height:
+        raise RecordingError("a restored picture is damaged or not 32FC1: run `aolink info` on the file")
+    return np.frombuffer(image.data, dtype="<f4").astype(np.float32).reshape(image.height, image.width)
 
 
 def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:

@@ -20,6 +20,7 @@ from aolink.recording.scan import Loss
 from aolink.recording.writer import begin_recording
 from aolink.wire import messages_pb2 as wire
 
+_ALL_PICTURES = frozenset(picture for pictures in topics.PICTURES.values() for picture in pictures)
 _ALIKE_NS = 2_000_000_000
 """Log times between which the same message in two files is one."""
 
@@ -35,7 +36,7 @@ class Edited:
     """Parts of the source that could not be read."""
 
 
-class _Copy:
+class RecordingCopy:
     """A recording that is written message by message, with what the first source has besides its messages."""
 
     def __init__(self, source: Recording, target: Path, notes: dict[str, str], *, overwrite: bool) -> None:
@@ -45,10 +46,7 @@ class _Copy:
         self.result = Edited(target)
         self._schemas = source.schemas
         self._file = McapFile(target, WriteOptions(), overwrite=overwrite)
-        begin_recording(self._file, source.rig, source.metadata | notes, source.start_ns)
-        for name, data in source.attachments.items():
-            if name not in topics.OF_EACH_FILE:
-                self._file.add_attachment(name, "application/octet-stream", data, source.start_ns)
+        begin_recording(self._file, source.rig, source.metadata | notes, source.start_ns, source.attachments)
 
     def add(self, message: RawMessage) -> None:
         known = topics.SCHEMAS.get(message.schema)
@@ -160,7 +158,7 @@ def _copied(
     overwrite: bool,
     progress: Callable[[int], None],
 ) -> Edited:
-    copy = _Copy(recording, target, notes, overwrite=overwrite)
+    copy = RecordingCopy(recording, target, notes, overwrite=overwrite)
     try:
         for message in messages:
             copy.add(message)
@@ -181,20 +179,23 @@ def _decoded(message: RawMessage) -> Message | None:
 
 def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
     lead, frames = Lead(), set[int]()
-    image_wanted, last_step = False, -1
+    wanted: set[str] = set()  # pictures that belong to an exposure between the two
+    last_step = -1
     for raw in recording.raw_messages():
         message = _decoded(raw)
         inside = low <= raw.log_time_ns < high
+        if raw.topic in topics.PICTURES:
+            among = inside if raw.topic == topics.EXPOSURE else getattr(message, "frame_id", None) in frames
+            (wanted.update if among else wanted.difference_update)(topics.PICTURES[raw.topic])
         if raw.topic == topics.EXPOSURE and message is not None:
-            image_wanted = inside
             if inside:
                 if not frames:
                     yield from _raw(lead)
                 frames.add(message.frame_id)  # type: ignore[attr-defined]
                 last_step = message.last_step  # type: ignore[attr-defined]
                 yield raw
-        elif raw.topic in topics.PICTURES:
-            if image_wanted:
+        elif raw.topic in _ALL_PICTURES:
+            if raw.topic in wanted:
                 yield raw
         elif raw.topic in (topics.COMMAND, topics.APPLIED):
             # Also after the end, until all is known of the last exposure.

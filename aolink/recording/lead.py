@@ -21,7 +21,7 @@ class Lead:
         """Take the next message."""
         if topic in (topics.COMMAND, topics.APPLIED):
             self._kept.append((topic, message, log_time_ns, sequence))
-        elif isinstance(message, schemas_pb2.ExposureInfo):
+        elif topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
             # Exposures still to come begin after the last step of this one.
             self._kept = deque(each for each in self._kept if _end_step(each[1]) > message.last_step + 1)
 

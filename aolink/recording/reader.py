@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import io
 from collections import deque
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, Schema
 from mcap.records import Message as McapMessage
+from numpy.typing import NDArray
 
 from aolink.assembly import Assembler
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel
-from aolink.exposure import Exposure, Truth
+from aolink.exposure import Exposure, Picture, Truth
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
@@ -45,6 +48,16 @@ class RawMessage(NamedTuple):
     log_time_ns: int
     sequence: int
     data: bytes
+
+
+class RestoredPictures(NamedTuple):
+    """An exposure's pictures without their blur, as they are recorded."""
+
+    info: schemas_pb2.Restoration
+    scene: NDArray[np.float32] | None
+    """Intensity, (rows, columns)."""
+    spots: NDArray[np.float32] | None
+    """Share of a spot's light, (rows, columns) of the camera's frame."""
 
 
 class Recording:
@@ -169,7 +182,7 @@ class Recording:
                 assembler.add_command(message)
             elif isinstance(message, wire.Applied):
                 exposures = assembler.add_applied(message)
-            elif isinstance(message, schemas_pb2.ExposureInfo):
+            elif recorded.topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
                 info = message
             elif recorded.topic == topics.IMAGE and isinstance(message, RawImage) and info is not None:
                 exposures = assembler.add_frame(convert.frame_from_messages(info, message))
@@ -178,19 +191,61 @@ class Recording:
         yield None, assembler.flush()
 
     def exposures(self) -> Iterator[Exposure]:
-        """The exposures in order, with their truth where the file has it."""
+        """The exposures in order, with their truth and their scene where the file has them."""
         truths: dict[int, Truth] = {}
+        scenes: dict[int, Picture] = {}
+        kept: list[tuple[str, dict[int, Any]]] = [(topics.TRUTH, truths), (topics.SCENE, scenes)]
+        expected = [found for topic, found in kept if topic in self.counts]
         waiting: deque[Exposure] = deque()
-        for recorded, exposures in self.assembled(topics.TRUTH):
-            if recorded is not None and isinstance(recorded.message, wire.Truth):
-                truths[recorded.message.frame_id] = convert.truth_from_message(recorded.message)
+        info: schemas_pb2.ExposureInfo | None = None
+        for recorded, exposures in self.assembled(topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE):
+            message = recorded.message if recorded is not None else None
+            if isinstance(message, wire.Truth):
+                truths[message.frame_id] = convert.truth_from_message(message)
+            elif recorded and recorded.topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
+                info = message
+            elif recorded and recorded.topic == topics.SCENE and isinstance(message, RawImage) and info is not None:
+                frame = convert.frame_from_messages(info, message)
+                scenes[frame.frame_id], info = Picture(pixels=frame.pixels, mask=frame.mask), None
             waiting.extend(exposures)
-            # The truth may come after its exposure, but not after the next one.
-            while waiting and (waiting[0].frame_id in truths or len(waiting) > 1):
+            # They may come after their exposure, but not after the next one.
+            while waiting and (len(waiting) > 1 or all(waiting[0].frame_id in found for found in expected)):
                 exposure = waiting.popleft()
-                yield replace(exposure, truth=truths.pop(exposure.frame_id, None))
+                truth, scene = truths.pop(exposure.frame_id, None), scenes.pop(exposure.frame_id, None)
+                yield replace(exposure, truth=truth, scene=scene)
         for exposure in waiting:
-            yield replace(exposure, truth=truths.get(exposure.frame_id))
+            yield replace(exposure, truth=truths.get(exposure.frame_id), scene=scenes.get(exposure.frame_id))
+
+    @property
+    def true_scene(self) -> NDArray[np.uint16] | None:
+        """Counts that the picture sensor would read of the scene at rest, without noise; None where it is not known.
+
+        Raises RecordingError if the file has something else in its place.
+        """
+        data = self.attachments.get(topics.TRUE_SCENE_ATTACHMENT)
+        if data is None or self.rig.scene is None:
+            return None
+        try:
+            counts = np.load(io.BytesIO(data), allow_pickle=False)
+        except (ValueError, EOFError, OSError):
+            counts = np.zeros(0)
+        if counts.shape != self.rig.scene.shape or counts.dtype != np.uint16:
+            raise RecordingError(f"{self.path}: the attachment {topics.TRUE_SCENE_ATTACHMENT} is not the rig's scene")
+        return np.asarray(counts)
+
+    def restored(self) -> Iterator[RestoredPictures]:
+        """What `aolink deblur` wrote, exposure by exposure."""
+        info: schemas_pb2.Restoration | None = None
+        pictures: dict[str, NDArray[np.float32]] = {}
+        for recorded in self.messages(topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS):
+            if isinstance(recorded.message, schemas_pb2.Restoration):
+                if info is not None:
+                    yield _restored(info, pictures)
+                info, pictures = recorded.message, {}
+            elif isinstance(recorded.message, RawImage):
+                pictures[recorded.topic] = convert.picture_from_float_image(recorded.message)
+        if info is not None:
+            yield _restored(info, pictures)
 
     def estimates(self, name: str) -> list[Estimate]:
         """The estimates that are in the file under a name, in order. Raises RecordingError if there are none."""
@@ -293,6 +348,10 @@ class Recording:
         self._losses.setdefault(loss.offset, loss)
 
 
+def _restored(info: schemas_pb2.Restoration, pictures: dict[str, NDArray[np.float32]]) -> RestoredPictures:
+    return RestoredPictures(info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS))
+
+
 def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:
     """Raise RigError where another rig cannot stand in for the one that a recording was made with."""
     if rig is None:
@@ -300,11 +359,16 @@ def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:
     for name, ours, theirs in (
         ("mirror inputs", rig.n_inputs, recorded.n_inputs),
         ("rows and columns of pixels", rig.sensor.shape, recorded.sensor.shape),
+        ("rows and columns of scene.pixels", _scene_shape(rig), _scene_shape(recorded)),
         ("fast steps in an exposure", rig.timing.exposure_steps, recorded.timing.exposure_steps),
         ("seconds in a fast step", rig.timing.fast_step_s, recorded.timing.fast_step_s),
     ):
         if ours != theirs:
             raise RigError(f"the rig file has {ours} {name}, but {path} was recorded with {theirs}")
+
+
+def _scene_shape(rig: Rig) -> tuple[int, int]:
+    return rig.scene.shape if rig.scene else (0, 0)
 
 
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)

@@ -111,11 +111,12 @@ def write_reestimated(
     if engine != "aolink":
         metadata["engine"] = engine
     with RecordingWriter(
-        path, recording.rig, metadata, recording.start_ns, overwrite=overwrite, deterministic=True
-    ) as writer:
+        path, recording.rig, metadata, recording.start_ns, overwrite=overwrite, deterministic=True,
+        attachments=recording.attachments,
+    ) as writer:  # fmt: skip
         last_ns = recording.start_ns
         for recorded, exposures in recording.assembled():
-            if recorded is not None and not recorded.topic.startswith(topics.ESTIMATE):
+            if recorded is not None and not recorded.topic.startswith((topics.ESTIMATE, topics.RESTORED)):
                 writer.write(recorded.topic, recorded.message, recorded.log_time_ns)
                 last_ns = recorded.log_time_ns
             for exposure in exposures:

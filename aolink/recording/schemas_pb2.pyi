@@ -168,3 +168,19 @@ class Estimate(_message.Message):
     nis: _containers.RepeatedScalarFieldContainer[float]
     innovation_variance: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ..., innovation_variance: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Restoration(_message.Message):
+    __slots__ = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
+    METHOD_FIELD_NUMBER: _ClassVar[int]
+    SCENE_NOISE_SD_FIELD_NUMBER: _ClassVar[int]
+    PATH_NOISE_SD_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    frame_id: int
+    estimator: str
+    method: str
+    scene_noise_sd: float
+    path_noise_sd: float
+    reason: str
+    def __init__(self, frame_id: _Optional[int] = ..., estimator: _Optional[str] = ..., method: _Optional[str] = ..., scene_noise_sd: _Optional[float] = ..., path_noise_sd: _Optional[float] = ..., reason: _Optional[str] = ...) -> None: ...

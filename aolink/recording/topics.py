@@ -10,10 +10,17 @@ from aolink.recording import schemas_pb2
 from aolink.wire import messages_pb2
 
 IMAGE = "/camera/image"
+EXPOSURE = "/camera/exposure"
 SCENE = "/scene/image"
 """A second, picture sensor that shares the exposure."""
-PICTURES = (IMAGE, SCENE)
-EXPOSURE = "/camera/exposure"
+SCENE_EXPOSURE = "/scene/exposure"
+RESTORED = "/restored/"
+"""Prefix."""
+RESTORED_SCENE = "/restored/image"
+RESTORED_SPOTS = "/restored/spot"
+RESTORATION = "/restored/exposure"
+PICTURES = {EXPOSURE: (IMAGE,), SCENE_EXPOSURE: (SCENE,), RESTORATION: (RESTORED_SCENE, RESTORED_SPOTS)}
+"""What is known about the pictures of an exposure, and which pictures follow it."""
 COMMAND = "/mirror/command"
 APPLIED = "/mirror/applied"
 CLOCK = "/clock"
@@ -34,6 +41,7 @@ SCHEMAS: dict[str, type[Message]] = {
         schemas_pb2.LinkStatistics,
         schemas_pb2.Latency,
         schemas_pb2.Estimate,
+        schemas_pb2.Restoration,
         messages_pb2.CommandBlock,
         messages_pb2.Applied,
         messages_pb2.Truth,
@@ -46,6 +54,8 @@ BASIS_ATTACHMENT = "exposure_basis.npy"
 OUTPUTS_ATTACHMENT = "exposure_outputs.npy"
 OF_EACH_FILE = (RIG_ATTACHMENT, BASIS_ATTACHMENT, OUTPUTS_ATTACHMENT)
 """Attachments that every recording is begun with."""
+TRUE_SCENE_ATTACHMENT = "true_scene.npy"
+"""Simulated rigs: what the picture sensor would read out of the scene at rest, without noise and blur."""
 SESSION_METADATA = "aolink"
 """Written at the start: versions, rig, devices, note."""
 RIG_METADATA = "aolink/rig"

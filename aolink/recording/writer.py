@@ -10,10 +10,10 @@ import contextlib
 import errno
 import io
 import os
-import queue
 import threading
 import time
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Self
 
@@ -23,31 +23,32 @@ from mcap.records import Schema
 
 from aolink.errors import RecordingError
 from aolink.estimation import ExposureModel
-from aolink.recording import schemas_pb2, topics
+from aolink.recording import topics
 from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.rig import Rig
 
 _QUEUE_BYTES = 256 << 20
 """What may wait for the disk."""
+_POLL_S = 0.005
+"""How often the thread looks for what is queued: woken for each message, it would cost more than the writing."""
 _STALL_S = 5.0
 """A disk that takes longer over one write stops the session."""
 _LARGEST_BASIS = 32 << 20
 """Bytes of an exposure basis that are kept whole."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Item:
-    """A message on its way to the file."""
-
-    topic: str
-    message: Message
-    data: bytes
-    log_time_ns: int
+_Item = tuple[str, Message, bytes, int]
+"""A message on its way to the file: topic, message, its bytes, log time."""
 
 
-def begin_recording(file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int) -> None:
-    """Write what a recording begins with: the rig file, twice, the exposure basis, and facts about the session."""
+def begin_recording(
+    file: McapFile, rig: Rig, metadata: dict[str, str], start_ns: int, attachments: Mapping[str, bytes]
+) -> None:
+    """Write what a recording begins with: the rig file, twice, the exposure basis, and facts about the session.
+
+    Of ``attachments``, by name, those are added that are not of its own.
+    """
     file.start()
     model = ExposureModel(rig.plant, rig.timing.exposure_steps)
     outputs, basis = model.factors
@@ -59,6 +60,9 @@ def begin_recording(file: McapFile, rig: Rig, metadata: dict[str, str], start_ns
         data = io.BytesIO()
         np.save(data, array)
         file.add_attachment(name, "application/octet-stream", data.getvalue(), start_ns)
+    for name, value in attachments.items():
+        if name not in topics.OF_EACH_FILE:
+            file.add_attachment(name, "application/octet-stream", value, start_ns)
     file.add_metadata(topics.SESSION_METADATA, metadata)
     file.add_metadata(topics.RIG_METADATA, {"toml": rig.toml})  # nothing can be read without it
 
@@ -77,6 +81,8 @@ class RecordingWriter:
         Facts about the session, written at the start.
     start_ns:
         Host time of the start.
+    attachments:
+        What else goes into the file at its start, by name.
     deterministic:
         Cut the file by the messages' own times only, not by the wall clock as well: the same messages
         give the same bytes. For sessions on virtual time and for re-estimation.
@@ -96,6 +102,7 @@ class RecordingWriter:
         *,
         overwrite: bool = False,
         deterministic: bool = False,
+        attachments: Mapping[str, bytes] | None = None,
         options: WriteOptions | None = None,
     ) -> None:
         self.path = Path(path)
@@ -103,14 +110,16 @@ class RecordingWriter:
         """The files so far."""
         self._options = options or WriteOptions()
         self._rig, self._metadata, self._overwrite = rig, metadata, overwrite
+        self._attachments = attachments or {}
         self._deterministic = deterministic
         self._schemas: dict[type[Message], Schema] = {}
-        self._lead = Lead()
+        self._lead = Lead() if self._options.split_bytes or self._options.split_s else None
         self._sequence = 0
         self._end_metadata: dict[str, str] = {}
         self._error: RecordingError | None = None
         self._closed = False
-        self._queue: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
+        self._queue: deque[_Item] = deque()
+        self._ending = threading.Event()
         self._put_bytes = self._taken_bytes = 0
         self._busy_since: float | None = None
         """When the thread began what it is doing with the file."""
@@ -127,15 +136,15 @@ class RecordingWriter:
         """Record a message. Raises RecordingError if the file can no longer be written."""
         if self._error:
             raise self._error
-        item = _Item(topic, message, message.SerializeToString(deterministic=True), log_time_ns)
+        data = message.SerializeToString(deterministic=True)
         while self._is_stalled() or self._put_bytes - self._taken_bytes > _QUEUE_BYTES:
             if self._error:
                 raise self._error
             if self._is_stalled() or not self._deterministic:  # who has time to wait, waits
                 raise RecordingError(f"the disk of {self.path} is too slow for this session: record to a faster one")
             time.sleep(0.01)
-        self._put_bytes += len(item.data)
-        self._queue.put(item)
+        self._put_bytes += len(data)
+        self._queue.append((topic, message, data, log_time_ns))
 
     def _is_stalled(self) -> bool:
         since = self._busy_since
@@ -147,7 +156,7 @@ class RecordingWriter:
             return
         self._closed = True
         self._end_metadata = end_metadata or {}
-        self._queue.put(None)
+        self._ending.set()
         while self._thread.is_alive() and not self._is_stalled():
             self._thread.join(0.1)
         if self._thread.is_alive():
@@ -175,46 +184,48 @@ class RecordingWriter:
         self.paths.append(path)
         self._file = McapFile(path, self._options, overwrite=self._overwrite)
         self._part_start_ns = start_ns
-        begin_recording(self._file, self._rig, metadata, start_ns)
+        begin_recording(self._file, self._rig, metadata, start_ns, self._attachments)
 
     def _run(self) -> None:
-        last_sync = time.monotonic()
         options = self._options
+        last_sync = last_write = time.monotonic()
         while True:
+            ending = self._ending.is_set()  # what is queued after this is written too, or not there
+            self._busy_since = now = time.monotonic()
             try:
-                item = self._queue.get(timeout=None if self._deterministic else options.flush_s)
-            except queue.Empty:
-                item = _NOTHING
-            self._busy_since = time.monotonic()
-            try:
-                if item is None:
+                while self._queue:
+                    item = self._queue.popleft()
+                    self._add(*item)
+                    self._taken_bytes += len(item[2])
+                    self._busy_since = last_write = time.monotonic()
+                if ending:
                     self._finish(self._end_metadata)
                     return
-                if item is not _NOTHING:
-                    self._add(item)
-                    self._taken_bytes += len(item.data)
-                elif self._file.has_unwritten:
-                    self._file.flush()
-                if not self._deterministic and time.monotonic() - last_sync > options.fsync_s:
-                    self._file.sync()
-                    last_sync = time.monotonic()
+                if not self._deterministic:
+                    if self._file.has_unwritten and now - last_write > options.flush_s:
+                        self._file.flush()
+                    if now - last_sync > options.fsync_s:
+                        self._file.sync()
+                        last_sync = time.monotonic()
             except Exception as error:  # whatever it is, the session must hear of it
                 self._give_up(error)
                 return
             finally:
                 self._busy_since = None
+            self._ending.wait(_POLL_S)
 
-    def _add(self, item: _Item) -> None:
-        if item.topic == topics.EXPOSURE and self._part_is_full(item.log_time_ns):
-            self._finish({"ended": "goes on in the next part"})
-            self._begin(item.log_time_ns)
-            for topic, message, log_time_ns, sequence in self._lead.messages():
-                data = message.SerializeToString(deterministic=True)
-                self._file.add(topic, self._schema(type(message)), data, log_time_ns, sequence)
+    def _add(self, topic: str, message: Message, data: bytes, log_time_ns: int) -> None:
+        if self._lead is not None:
+            if topic == topics.EXPOSURE and self._part_is_full(log_time_ns):
+                self._finish({"ended": "goes on in the next part"})
+                self._begin(log_time_ns)
+                for lead_topic, each, time_ns, sequence in self._lead.messages():
+                    lead_data = each.SerializeToString(deterministic=True)
+                    self._file.add(lead_topic, self._schema(type(each)), lead_data, time_ns, sequence)
+            self._lead.add(topic, message, log_time_ns, self._sequence + 1)
         # Streams may share a log time: the sequence is the order.
         self._sequence += 1
-        self._lead.add(item.topic, item.message, item.log_time_ns, self._sequence)
-        self._file.add(item.topic, self._schema(type(item.message)), item.data, item.log_time_ns, self._sequence)
+        self._file.add(topic, self._schema(type(message)), data, log_time_ns, self._sequence)
 
     def _part_is_full(self, now_ns: int) -> bool:
         size, seconds = self._options.split_bytes, self._options.split_s
@@ -243,6 +254,3 @@ class RecordingWriter:
         self._error = RecordingError(
             f"cannot write {self.paths[-1]}: {what}; what was recorded until then is in it and can be read"
         )
-
-
-_NOTHING = _Item("", schemas_pb2.ClockSample(), b"", 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -19,7 +20,8 @@ from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
-from aolink.session.loop import Inputs, SessionLoop
+from aolink.scene import framed, read_scene_picture
+from aolink.session.loop import Inputs, SessionLoop, Watch
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.hub import Hub
@@ -74,6 +76,15 @@ def open_devices(
         hub.close()
 
 
+def _true_scene(rig: Rig, camera: NativeCamera) -> dict[str, bytes]:
+    """The scene at rest as an attachment, where the camera was made from this rig file: a simulated one shows it."""
+    if rig.scene is None or not rig.scene.picture or camera.identity.rig_digest != rig.digest:
+        return {}
+    data = io.BytesIO()
+    np.save(data, rig.scene.to_counts(framed(rig.scene, read_scene_picture(rig.scene, rig.folder))))
+    return {topics.TRUE_SCENE_ATTACHMENT: data.getvalue()}
+
+
 def record(
     rig: Rig,
     camera_port: str,
@@ -85,6 +96,7 @@ def record(
     note: str = "",
     calibration: str = "",
     inputs: Inputs | None = None,
+    watch: Watch | None = None,
     overwrite: bool = False,
     options: WriteOptions | None = None,
     stop: Callable[[], bool] = lambda: False,
@@ -109,6 +121,8 @@ def record(
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
         What to command, instead of the rig's drive.
+    watch:
+        Told each exposure with its estimates, on the loop's own time.
     options:
         How the recording is cut into chunks and files.
     stop, progress:
@@ -140,10 +154,12 @@ def record(
         }
         if calibration:
             facts[topics.CALIBRATION] = calibration
+        attachments = _true_scene(rig, camera)
         writer = RecordingWriter(
-            path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, options=options
-        )
-        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs)
+            path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, attachments=attachments,
+            options=options,
+        )  # fmt: skip
+        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, watch)
         report = loop.report
         report.warnings += warnings
         try:

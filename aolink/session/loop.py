@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from aolink.assembly import Assembler, Frame
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
 from aolink.errors import DeviceError
-from aolink.estimation import Driver
-from aolink.exposure import Exposure
+from aolink.estimation import Driver, Estimate
+from aolink.exposure import Exposure, Picture
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
@@ -47,6 +47,9 @@ _NOT_YET = 1 << 63
 Inputs = Callable[[int, int], NDArray[np.float64]]
 """First fast step since the session's start and number of steps -> what to command, (n_steps, n_inputs)."""
 
+Watch = Callable[[Exposure, Sequence[Estimate]], None]
+"""Told each exposure with its estimates; must not take time."""
+
 
 class SessionLoop:
     """One session, from the first command to the last frame."""
@@ -60,10 +63,14 @@ class SessionLoop:
         writer: RecordingWriter,
         driver: Driver,
         inputs: Inputs | None = None,
+        watch: Watch | None = None,
     ) -> None:
         self.report = Report(virtual_time=hub.virtual)
         self._rig, self._hub, self._camera, self._mirror = rig, hub, camera, mirror
         self._writer, self._driver = writer, driver
+        self._watch = watch
+        self._unseen: tuple[Exposure, Sequence[Estimate]] | None = None
+        """The exposure that its watcher has not been given yet."""
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
@@ -212,9 +219,12 @@ class SessionLoop:
         self._receive(0.0)
         self._take(self._camera.link, list(self._camera.flush()), now)
         self._estimate(self._assembler.flush(), now)
+        self._show_unseen()
         self._latencies.close(now)
         if exposures and self.report.ended == "complete":
             self.report.frames_lost = exposures - self.report.frames_received
+            if self._rig.scene:
+                self.report.scenes_lost = exposures - self.report.scenes_received
         self._record_links(now)
         self._log(Log.INFO, f"session {self.report.ended}: {self.report.exposures} exposures")
 
@@ -222,7 +232,8 @@ class SessionLoop:
         for event in events:
             if isinstance(event, Frame):
                 if event.first_step >= self._first_step:  # not one of a session before
-                    self._take_frame(event, receive_ns)
+                    take = self._take_scene if event.plane else self._take_frame
+                    take(event, receive_ns)
             elif isinstance(event, wire.Applied):
                 self._take_applied(event, receive_ns)
             elif isinstance(event, wire.Truth):
@@ -236,11 +247,7 @@ class SessionLoop:
                 self._log(level, f"{link.name}: {event.text}")
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
-        host_start_ns, sigma_ns = self._camera.clock.host_ns(frame.device_start_ns)
-        frame = replace(frame, host_start_ns=host_start_ns, clock_sigma_ns=sigma_ns)
-        info, image = convert.frame_messages(frame)
-        self._record(topics.EXPOSURE, info, receive_ns)
-        self._record(topics.IMAGE, image, receive_ns)
+        frame = self._record_picture(frame, topics.EXPOSURE, topics.IMAGE, receive_ns)
         report = self.report
         report.frames_received += 1
         report.frames_incomplete += frame.chunks_lost > 0
@@ -258,13 +265,53 @@ class SessionLoop:
             )
         self._estimate(self._assembler.add_frame(frame), receive_ns)
 
+    def _take_scene(self, frame: Frame, receive_ns: int) -> None:
+        self._record_picture(frame, topics.SCENE_EXPOSURE, topics.SCENE, receive_ns)
+        self.report.scenes_received += 1
+        self.report.scenes_incomplete += frame.chunks_lost > 0
+        self.report.scenes_lost += frame.frames_lost_before
+        self._show_unseen(frame)
+
+    def _show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
+        """Hand an exposure to who watches; with a picture sensor, when its scene is there or the next one comes."""
+        if self._watch is None:
+            return
+        if self._unseen is not None:
+            self._watch(*self._unseen)
+        self._unseen = (exposure, estimates)
+        if self._rig.scene is None:
+            self._show_unseen()
+
+    def _show_unseen(self, scene: Frame | None = None) -> None:
+        """Hand over the exposure that waits; with ``scene`` only if it is of the same exposure."""
+        if self._watch is None or self._unseen is None:
+            return
+        exposure, estimates = self._unseen
+        if scene is not None:
+            if scene.frame_id != exposure.frame_id:
+                return
+            exposure = replace(exposure, scene=Picture(pixels=scene.pixels, mask=scene.mask))
+        self._watch(exposure, estimates)
+        self._unseen = None
+
+    def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
+        """Record a picture and what is known about it; gives it with the host's time of its start."""
+        host_start_ns, sigma_ns = self._camera.clock.host_ns(frame.device_start_ns)
+        frame = replace(frame, host_start_ns=host_start_ns, clock_sigma_ns=sigma_ns)
+        info, image = convert.frame_messages(frame)
+        self._record(exposure_topic, info, receive_ns)
+        self._record(topic, image, receive_ns)
+        return frame
+
     def _estimate(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
         for exposure in exposures:
-            for estimate in self._driver.step(exposure):
+            estimates = self._driver.step(exposure)
+            for estimate in estimates:
                 self._record(topics.estimate_topic(estimate.estimator), convert.estimate_message(estimate), log_time_ns)
             self.report.exposures += 1
             self._newest_frame = exposure.frame_id
             self._latencies.estimated(exposure.frame_id, self._hub.now_ns())
+            self._show(exposure, estimates)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._record(topics.APPLIED, applied, receive_ns)

@@ -24,6 +24,10 @@ class Report:
     """Received with chunks missing; their pixels are masked."""
     frames_lost: int = 0
     """Never received at all."""
+    scenes_received: int = 0
+    """Of the picture sensor, as the three above."""
+    scenes_incomplete: int = 0
+    scenes_lost: int = 0
     packets_bad_crc: int = 0
     packets_bad_framing: int = 0
     packets_bad_payload: int = 0

@@ -178,6 +178,9 @@ class SimulatedDevices:
                     frame_period_steps=rig.timing.frame_period_steps,
                 )
             )
+            if rig.scene is not None:
+                identity.camera.scene_height, identity.camera.scene_width = rig.scene.shape
+                identity.camera.scene_bit_depth = rig.scene.bit_depth
         else:
             identity.kind = pb.Identity.MIRROR
             mirror = rig.mirror
@@ -270,10 +273,23 @@ class SimulatedDevices:
             start = k
 
     def _send_frame(self, frame: CameraFrame) -> None:
-        height, width = frame.pixels.shape
+        """The spots' picture, the truth, and last the scene's: the estimators do not wait for that."""
+        last_step = frame.first_step + frame.n_steps - 1
+        self._send_picture(frame, frame.pixels, plane=0)
+        data = truth_message(frame.frame_id, frame.truth).SerializeToString()
+        for offset in range(0, len(data), MAX_CHUNK):
+            piece = data[offset : offset + MAX_CHUNK]
+            self._say(
+                "camera", pb.TruthChunk(frame_id=frame.frame_id, offset=offset, total=len(data), data=piece), last_step
+            )
+        if frame.scene is not None:
+            self._send_picture(frame, frame.scene, plane=1)
+
+    def _send_picture(self, frame: CameraFrame, pixels: NDArray[np.uint16], plane: int) -> None:
+        height, width = pixels.shape
         last_step = frame.first_step + frame.n_steps - 1
         late_ns = self.rig.timing.exposure_offset_ns
-        data = frame.pixels.astype("<u2").tobytes()
+        data = pixels.astype("<u2").tobytes()
         for offset in range(0, len(data), MAX_CHUNK):
             picture = pb.FrameChunk(
                 frame_id=frame.frame_id,
@@ -287,14 +303,9 @@ class SimulatedDevices:
                 exposure_end_ns=self.device_ns(last_step + 1) + late_ns,
                 exposure_offset_ns=late_ns,
                 data=data[offset : offset + MAX_CHUNK],
+                plane=plane,
             )
             self._say("camera", picture, last_step)
-        data = truth_message(frame.frame_id, frame.truth).SerializeToString()
-        for offset in range(0, len(data), MAX_CHUNK):
-            piece = data[offset : offset + MAX_CHUNK]
-            self._say(
-                "camera", pb.TruthChunk(frame_id=frame.frame_id, offset=offset, total=len(data), data=piece), last_step
-            )
 
 
 def truth_message(frame_id: int, truth: Truth) -> pb.Truth:

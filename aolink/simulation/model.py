@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.exposure import Exposure, Truth
+from aolink.exposure import Exposure, Picture, Truth
 from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.frame import frame_density
 from aolink.plant import psd_root
 from aolink.rig import Rig, load_rig
 from aolink.simulation.disturbance import DisturbancePlayer
+from aolink.simulation.scene import SceneCamera
 
 FloatArray = NDArray[np.float64]
 
@@ -29,6 +30,8 @@ class CameraFrame:
     n_steps: int
     pixels: NDArray[np.uint16]
     """Counts, (rows, columns)."""
+    scene: NDArray[np.uint16] | None
+    """Counts of the picture sensor, (rows, columns), where the rig has one."""
     truth: Truth
 
 
@@ -37,7 +40,7 @@ class RigModel:
 
     What comes out depends on the rig, the seed, the inputs and when the camera was started, and not on
     how the steps are cut into calls of `advance`: initial state, process noise, read-out noise,
-    photo-electrons and disturbance have random streams of their own, drawn in the order of time.
+    photo-electrons, disturbance and scene have random streams of their own, drawn in the order of time.
     """
 
     def __init__(self, rig: Rig, seed: int | None = None) -> None:
@@ -45,12 +48,15 @@ class RigModel:
         self.rig = rig
         self.step = 0
         """The next fast step."""
-        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(5)
-        initial, self._process_noise, self._pixel_noise, self._electrons, disturbed = map(np.random.default_rng, seeds)
+        # 5 to 7 are the link's.
+        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(9)
+        streams = map(np.random.default_rng, (*seeds[:5], seeds[8]))
+        initial, self._process_noise, self._pixel_noise, self._electrons, disturbed, seen = streams
         scatter = initial.standard_normal((plant.axes, plant.n_states, 1))
         self._state = plant.initial_mean + (psd_root(plant.initial_covariance) @ scatter)[..., 0]
         self._noise_input = plant.B_w @ psd_root(plant.process_noise)
         self._disturbance = DisturbancePlayer(rig, disturbed) if rig.disturbance else None
+        self._scene = SceneCamera(rig, seen) if rig.scene else None
         if rig.disturbance and not rig.disturbance.plant_noise:
             self._noise_input = np.zeros_like(self._noise_input)
             self._state = np.tile(plant.initial_mean, (plant.axes, 1))
@@ -125,6 +131,7 @@ class RigModel:
             first_step=first_step,
             n_steps=path.shape[1],
             pixels=to_counts(sensor, density),
+            scene=None if self._scene is None else self._scene.frame(*self._held(path, end_state), self._light.kind),
             truth=Truth(start_state=self._start_state.copy(), end_state=end_state.copy(), path=path),
         )
 
@@ -142,11 +149,23 @@ class RigModel:
             return path, frame_density(sensor, path)
         density, offset = frame_density(sensor, path), self.rig.timing.exposure_offset
         if offset:
-            # Each step is held: so much of the first one is not in the exposure, but in the step after its last.
-            after = (self.rig.plant.C @ end_state[..., None]).reshape(-1, 1)
-            gained = frame_density(sensor, after) - frame_density(sensor, path[:, :1])
-            density = np.maximum(density + offset / path.shape[1] * gained, 0.0)
+            held, weights = self._held(path, end_state)
+            gained = frame_density(sensor, held[:, -1:]) - frame_density(sensor, path[:, :1])
+            density = np.maximum(density + weights[-1] * gained, 0.0)
         return path, density
+
+    def _held(self, path: FloatArray, end_state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the spots rest, step by step, (n_outputs, k), and each step's share of the exposure, (k,).
+
+        With an offset so much of the first step is not in the exposure, but in the step after its last.
+        """
+        n_steps, offset = path.shape[1], self.rig.timing.exposure_offset
+        weights = np.full(n_steps, 1 / n_steps)
+        if not offset or self._light.kind == "still":
+            return path, weights
+        weights[0] *= 1 - offset
+        after = (self.rig.plant.C @ end_state[..., None]).reshape(-1, 1)
+        return np.concatenate([path, after], axis=1), np.append(weights, offset / n_steps)
 
 
 def simulate(
@@ -205,5 +224,6 @@ def _exposure(rig: Rig, frame: CameraFrame, inputs: FloatArray, after: int) -> E
         host_start_ns=start * step_ns + late_ns,
         host_receive_ns=end * step_ns + late_ns,
         clock_sigma_ns=0.0,
+        scene=None if frame.scene is None else Picture(pixels=frame.scene, mask=np.ones(frame.scene.shape, dtype=bool)),
         truth=frame.truth,
     )

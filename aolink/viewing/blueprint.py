@@ -10,6 +10,7 @@ import rerun.blueprint as rrb
 from aolink.rig import Rig, SpotSensor
 from aolink.viewing.camera import HISTORY, profile_bounds
 from aolink.viewing.motion import BAND, NIS_COVERAGE
+from aolink.viewing.scene import RESTORED_SCENE, RESTORED_SPOTS, SCENE, TRUE_SCENE
 from aolink.viewing.timebase import DEVICE_TIME, FAST_STEP
 
 PATH_WINDOW = 2
@@ -28,6 +29,9 @@ class Contents:
     density_top: float
     """Of the intensity profile's plot, one over slope units."""
     truth: bool
+    scenes: list[str]
+    """Entities of the scene: as it came, restored, at rest; those that there are."""
+    restored_spots: bool
     commands: bool
     clock: bool
     link: bool
@@ -49,8 +53,12 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
         rows.append(rrb.Horizontal(contents=beliefs))
     bottom = _devices(contents)
     rows.append(rrb.Horizontal(contents=bottom, column_shares=[2.0] * (len(bottom) - 1) + [3.0]))
+    layout: rrb.Container = rrb.Vertical(contents=rows, row_shares=[10, 7, 7] if len(rows) == 3 else [10, 7])
+    if contents.scenes:
+        scenes = rrb.Vertical(contents=[_scene(contents, path) for path in contents.scenes])
+        layout = rrb.Horizontal(contents=[layout, scenes], column_shares=[4, 1])
     return rrb.Blueprint(
-        rrb.Vertical(contents=rows, row_shares=[10, 7, 7] if len(rows) == 3 else [10, 7]),
+        layout,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline=FAST_STEP, fps=contents.rig.timing.exposure_steps),
@@ -60,16 +68,30 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
 def _camera(contents: Contents) -> rrb.Container | rrb.View:
     """The last exposures; where there are many spots they are those of the first one, behind the whole frame."""
     sensor = contents.rig.sensor
-    if not isinstance(sensor, SpotSensor):
-        return _history(contents, "paths in their blur")
     rows, columns = sensor.shape
+    restored = [_picture(RESTORED_SPOTS, "Camera: frame restored (pixels)", rows, columns)]
+    restored = restored if contents.restored_spots else []
+    if not isinstance(sensor, SpotSensor):
+        history = _history(contents, "paths in their blur")
+        return rrb.Tabs(history, *restored, active_tab=0) if restored else history
     shown = ["camera/image", *(f"camera/image/path/{name}" for name in ("truth", contents.focus) if name)]
     frame = rrb.Spatial2DView(
         name="Camera: frame (pixels), paths in their blur",
         contents=_exactly(shown),
         visual_bounds=rrb.VisualBounds2D(x_range=(0, columns), y_range=(0, rows)),
     )
-    return rrb.Tabs(frame, _history(contents, "first spot along x"), active_tab=0)
+    return rrb.Tabs(frame, _history(contents, "first spot along x"), *restored, active_tab=0)
+
+
+def _scene(contents: Contents, path: str) -> rrb.View:
+    assert contents.rig.scene is not None
+    name = {SCENE: "Scene as it came", RESTORED_SCENE: "Scene restored", TRUE_SCENE: "Scene at rest (truth)"}[path]
+    return _picture(path, f"{name} (pixels)", *contents.rig.scene.shape)
+
+
+def _picture(path: str, name: str, rows: int, columns: int) -> rrb.View:
+    bounds = rrb.VisualBounds2D(x_range=(0, columns), y_range=(0, rows))
+    return rrb.Spatial2DView(name=name, contents=_exactly([path]), visual_bounds=bounds)
 
 
 def _history(contents: Contents, what: str) -> rrb.View:

@@ -19,7 +19,7 @@ from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
 from aolink.exposure import Exposure
 from aolink.rig import Rig, SpotSensor
-from aolink.viewing import camera, devices, motion
+from aolink.viewing import camera, devices, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.palette import by_rank
 from aolink.viewing.timebase import Timebase
@@ -87,6 +87,12 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
     for sequence in estimates.values():
         motion.log_estimates(stream, timebase, sequence)
         motion.log_errors(stream, timebase, sequence, truths)
+    scenes = rig.scene is not None and scene.log_scenes(stream, rig.scene, timebase, exposures)
+    restored = list(recording.restored())
+    scenes_restored = scene.log_restored(stream, timebase, exposures, restored)
+    true_scene = recording.true_scene
+    if rig.scene is not None and true_scene is not None:
+        scene.log_true_scene(stream, rig.scene, true_scene)
     found = _send_devices(stream, recording, timebase)
     stream.log(
         "session", rr.TextDocument(_summary(recording, exposures, estimates), media_type="text/markdown"), static=True
@@ -97,6 +103,16 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
         measuring=[name for name, sequence in estimates.items() if any(e.innovation.shape[1] for e in sequence)],
         density_top=top,
         truth=bool(truths),
+        scenes=[
+            path
+            for path, shown in (
+                (scene.SCENE, scenes),
+                (scene.RESTORED_SCENE, scenes_restored),
+                (scene.TRUE_SCENE, true_scene is not None),
+            )
+            if shown
+        ],
+        restored_spots=any(each.spots is not None for each in restored),
         commands=bool(found & {"/mirror/command", "/mirror/applied"}),
         clock="/clock" in found,
         link="/link" in found,
@@ -152,8 +168,8 @@ def send_camera(
 
 def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> set[str]:
     """Send what does not come from exposures and estimates; the topics that had messages."""
-    topics = ("/mirror/command", "/mirror/applied", "/camera/exposure", "/latency", "/link", "/clock", "/log")
-    records = sorted(recording.messages(*topics), key=lambda r: r.topic)
+    names = ("/mirror/command", "/mirror/applied", "/camera/exposure", "/latency", "/link", "/clock", "/log")
+    records = sorted(recording.messages(*names), key=lambda r: r.topic)
     by_topic: dict[str, list[Any]] = {topic: list(group) for topic, group in groupby(records, key=lambda r: r.topic)}
     for topic, log in (
         ("/mirror/command", devices.log_commands),

@@ -69,18 +69,24 @@ class Identity(_message.Message):
     def __init__(self, nonce: _Optional[int] = ..., kind: _Optional[_Union[Identity.Kind, str]] = ..., model: _Optional[str] = ..., serial_number: _Optional[str] = ..., firmware: _Optional[str] = ..., protocol_version: _Optional[int] = ..., schema_hash: _Optional[bytes] = ..., fast_step_ns: _Optional[int] = ..., next_step: _Optional[int] = ..., step_zero_ns: _Optional[int] = ..., virtual_time: _Optional[bool] = ..., rig_digest: _Optional[str] = ..., camera: _Optional[_Union[CameraGeometry, _Mapping]] = ..., mirror: _Optional[_Union[MirrorLimits, _Mapping]] = ...) -> None: ...
 
 class CameraGeometry(_message.Message):
-    __slots__ = ("width", "height", "bit_depth", "exposure_steps", "frame_period_steps")
+    __slots__ = ("width", "height", "bit_depth", "exposure_steps", "frame_period_steps", "scene_width", "scene_height", "scene_bit_depth")
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
     EXPOSURE_STEPS_FIELD_NUMBER: _ClassVar[int]
     FRAME_PERIOD_STEPS_FIELD_NUMBER: _ClassVar[int]
+    SCENE_WIDTH_FIELD_NUMBER: _ClassVar[int]
+    SCENE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    SCENE_BIT_DEPTH_FIELD_NUMBER: _ClassVar[int]
     width: int
     height: int
     bit_depth: int
     exposure_steps: int
     frame_period_steps: int
-    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., bit_depth: _Optional[int] = ..., exposure_steps: _Optional[int] = ..., frame_period_steps: _Optional[int] = ...) -> None: ...
+    scene_width: int
+    scene_height: int
+    scene_bit_depth: int
+    def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., bit_depth: _Optional[int] = ..., exposure_steps: _Optional[int] = ..., frame_period_steps: _Optional[int] = ..., scene_width: _Optional[int] = ..., scene_height: _Optional[int] = ..., scene_bit_depth: _Optional[int] = ...) -> None: ...
 
 class MirrorLimits(_message.Message):
     __slots__ = ("n_inputs", "input_min", "input_max", "park", "dac_bits", "queue_steps", "watchdog_s", "parked")
@@ -181,7 +187,7 @@ class Ack(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., code: _Optional[_Union[Code, str]] = ..., text: _Optional[str] = ...) -> None: ...
 
 class FrameChunk(_message.Message):
-    __slots__ = ("frame_id", "offset", "total", "width", "height", "first_step", "last_step", "exposure_start_ns", "exposure_end_ns", "data", "exposure_offset_ns")
+    __slots__ = ("frame_id", "offset", "total", "width", "height", "first_step", "last_step", "exposure_start_ns", "exposure_end_ns", "data", "exposure_offset_ns", "plane")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]
     OFFSET_FIELD_NUMBER: _ClassVar[int]
     TOTAL_FIELD_NUMBER: _ClassVar[int]
@@ -193,6 +199,7 @@ class FrameChunk(_message.Message):
     EXPOSURE_END_NS_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
     EXPOSURE_OFFSET_NS_FIELD_NUMBER: _ClassVar[int]
+    PLANE_FIELD_NUMBER: _ClassVar[int]
     frame_id: int
     offset: int
     total: int
@@ -204,7 +211,8 @@ class FrameChunk(_message.Message):
     exposure_end_ns: int
     data: bytes
     exposure_offset_ns: int
-    def __init__(self, frame_id: _Optional[int] = ..., offset: _Optional[int] = ..., total: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., first_step: _Optional[int] = ..., last_step: _Optional[int] = ..., exposure_start_ns: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., data: _Optional[bytes] = ..., exposure_offset_ns: _Optional[int] = ...) -> None: ...
+    plane: int
+    def __init__(self, frame_id: _Optional[int] = ..., offset: _Optional[int] = ..., total: _Optional[int] = ..., width: _Optional[int] = ..., height: _Optional[int] = ..., first_step: _Optional[int] = ..., last_step: _Optional[int] = ..., exposure_start_ns: _Optional[int] = ..., exposure_end_ns: _Optional[int] = ..., data: _Optional[bytes] = ..., exposure_offset_ns: _Optional[int] = ..., plane: _Optional[int] = ...) -> None: ...
 
 class ClockQuery(_message.Message):
     __slots__ = ("query_id", "host_send_ns")

@@ -32,7 +32,7 @@ def many_chunks(recorded: Session, tmp_path_factory: pytest.TempPathFactory) -> 
     recording = Recording(recorded.path)
     path = tmp_path_factory.mktemp("chunks") / "a.mcap"
     file = McapFile(path, WriteOptions(chunk_bytes=4096))
-    begin_recording(file, recording.rig, {}, 0)
+    begin_recording(file, recording.rig, {}, 0, {})
     for raw in recording.raw_messages():
         file.add(raw.topic, schema_of(topics.SCHEMAS[raw.schema]), raw.data, raw.log_time_ns, raw.sequence)
     file.finish()
@@ -166,7 +166,7 @@ def test_an_index_that_lies_costs_no_memory(recorded: Session, tmp_path: Path) -
 
 def test_an_exposure_of_a_billion_steps_is_refused(tmp_path: Path) -> None:
     file = McapFile(tmp_path / "a.mcap", WriteOptions())
-    begin_recording(file, load_rig("section-vi"), {}, 0)
+    begin_recording(file, load_rig("section-vi"), {}, 0, {})
     from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
     info = pb.ExposureInfo(frame_id=1, first_step=0, last_step=2**40)

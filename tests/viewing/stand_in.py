@@ -16,6 +16,7 @@ from aolink.estimation.exposure_model import exposure_model
 from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.recording import schemas_pb2 as schemas
+from aolink.recording.reader import RestoredPictures
 from aolink.rig import Rig, load_rig
 from aolink.wire import messages_pb2 as wire
 
@@ -93,6 +94,13 @@ class StandIn:
     @property
     def estimators(self) -> list[str]:
         return list(self.names)
+
+    @property
+    def true_scene(self) -> None:
+        return None
+
+    def restored(self) -> Iterator[RestoredPictures]:
+        return iter(())
 
     def exposures(self) -> Iterator[Exposure]:
         return iter(self._exposures)

@@ -339,3 +339,32 @@ def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session
             )
             assert ours == theirs, (entity, column)
             assert ours
+
+
+def test_a_slow_viewer_skips_and_nobody_waits_for_it(recorded: Session) -> None:
+    import threading
+
+    from aolink.viewing import Decimating
+
+    class Slow:
+        """Shows one exposure until it is let go on."""
+
+        def __init__(self) -> None:
+            self.shown: list[int] = []
+            self.began, self.go_on = threading.Event(), threading.Event()
+
+        def show(self, exposure, estimates) -> None:
+            self.began.set()
+            self.go_on.wait(10)
+            self.shown.append(exposure.frame_id)
+
+    exposures, slow = list(Recording(recorded.path).exposures()), Slow()
+    view = Decimating(slow)
+    view.show(exposures[0], [])
+    assert slow.began.wait(10)
+    for exposure in exposures[1:]:
+        view.show(exposure, [])  # the viewer is still at the first
+    slow.go_on.set()
+    view.close()
+    assert slow.shown == [exposures[0].frame_id, exposures[-1].frame_id]
+    assert view.skipped == len(exposures) - 2

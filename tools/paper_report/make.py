@@ -12,7 +12,7 @@ from pathlib import Path
 import matplotlib as mpl
 
 from aolink.rig import load_rig
-from paper_report import figures
+from paper_report import figures, shahin
 from paper_report import numbers as n
 from paper_report.blocks import as_html, as_markdown
 from paper_report.ensemble import Cell, map_cells
@@ -28,8 +28,8 @@ def _timed(what: str) -> Iterator[None]:
     print(f"{time.monotonic() - start:.1f} s", file=sys.stderr)
 
 
-def make(out: Path, effort: n.Effort) -> Path:
-    """Make everything in ``out``; the page's path."""
+def make(out: Path, effort: n.Effort) -> list[Path]:
+    """Make everything in ``out``; the pages' paths."""
     mpl.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
     results = compute(effort)
@@ -40,7 +40,9 @@ def make(out: Path, effort: n.Effort) -> Path:
     page = out / "paper.md"
     page.write_text(as_markdown(blocks), encoding="utf-8")
     (out / "paper.html").write_text(as_html(blocks, out), encoding="utf-8")
-    return page
+    with _timed("Shahin"):
+        restored = shahin.make(out, effort is n.QUICK)
+    return [page, restored]
 
 
 def compute(effort: n.Effort) -> Results:

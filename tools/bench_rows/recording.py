@@ -1,4 +1,4 @@
-"""Figures of recordings: what a crash costs, what damage costs, how long the loop waits for the recorder."""
+"""Figures of recordings: their pace, what a crash and damage cost, how long the loop waits for the recorder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-from benchmarks.row import Row
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.reader import make_reader
 
@@ -21,6 +20,7 @@ from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
+from bench_rows.row import Row, median_s, resident_mb
 
 KILLS = 100
 _LOOP_S = 20.0
@@ -79,7 +79,7 @@ def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
     """A recording of several MB, and of each chunk its first byte, the byte after its last, and its messages."""
     path = folder / "long.mcap"
     file = McapFile(path, WriteOptions())
-    begin_recording(file, load_rig("section-vi"), {}, 0)
+    begin_recording(file, load_rig("section-vi"), {}, 0, {})
     rng = np.random.default_rng(2)
     for k in range(3000):
         data = RawImage(width=32, height=32, encoding="mono16", step=64, data=rng.bytes(2048)).SerializeToString()
@@ -134,3 +134,120 @@ def loop_stall() -> Row:
     return Row(
         "loop's wait for the recorder, 1 kHz", f"worst {worst:.2f} ms, 99.9 % {p999:.2f}", "limit 5 ms", 5 / worst, 1.0
     )
+
+
+def recording_rate() -> Row:
+    """Messages a second into a file: small ones at 1 kHz's ratio to frames."""
+    from mcap.writer import CompressionType
+    from mcap_protobuf.writer import Writer
+
+    from aolink.recording import topics
+    from aolink.recording.writer import RecordingWriter
+    from aolink.wire import messages_pb2 as pb
+
+    rig = load_rig("section-vi")
+    messages = [pb.Applied(block_id=k, first_step=k, n_steps=1, u=[0.1]) for k in range(60_000)]
+
+    def ours() -> None:
+        with tempfile.TemporaryDirectory() as folder, RecordingWriter(Path(folder) / "a", rig, {}, 0) as writer:
+            for k, message in enumerate(messages):
+                writer.write(topics.APPLIED, message, k * 1_000_000)
+
+    def plain() -> None:
+        with tempfile.TemporaryFile() as file:
+            writer = Writer(file, compression=CompressionType.LZ4)
+            for k, message in enumerate(messages):
+                writer.write_message(topics.APPLIED, message, k * 1_000_000, k * 1_000_000, k)
+            writer.finish()
+
+    mine, theirs = (len(messages) / each / 1e3 for each in median_s(ours, 5, plain))
+    return Row("recording small messages", f"{mine:.0f} k/s", f"mcap's writer {theirs:.0f} k/s", mine / theirs, 0.8)
+
+
+def record_long(path: Path, exposures: int) -> None:
+    """A recording of many exposures, made from a short one played again and again."""
+    import aolink
+    from aolink.assembly import Frame
+    from aolink.recording import convert, topics
+    from aolink.recording.writer import RecordingWriter
+    from aolink.wire import messages_pb2 as pb
+
+    rig = load_rig("section-vi-lively")
+    some = aolink.simulate(rig, 100)
+    with RecordingWriter(path, rig, {}, 0, deterministic=True) as writer:
+        for k in range(exposures):
+            each, first, now = some[k % 100], 200 * k, 200_000_000 * k
+            applied = pb.Applied(first_step=first, n_steps=200, u=each.inputs.ravel())
+            frame = Frame(
+                frame_id=k + 1, first_step=first, last_step=first + 199, pixels=each.pixels, mask=each.mask,
+                chunks_lost=0, frames_lost_before=0, device_start_ns=now, device_end_ns=now, host_first_byte_ns=now,
+                host_receive_ns=now,
+            )  # fmt: skip
+            info, image = convert.frame_messages(frame)
+            for topic, message in ((topics.APPLIED, applied), (topics.EXPOSURE, info), (topics.IMAGE, image)):
+                writer.write(topic, message, now)
+
+
+def reestimation_rate() -> Row:
+    """o3 over a recording, against reading the same file and decoding its frames, no more."""
+    from aolink.recording import topics
+    from aolink.recording.reader import Recording
+    from aolink.recording.reestimate import reestimate
+
+    with tempfile.TemporaryDirectory() as folder:
+        record_long(Path(folder) / "a.mcap", 1500)
+        recording = Recording(Path(folder) / "a.mcap")
+        estimating, reading = median_s(
+            lambda: reestimate(recording, ["o3"]),
+            5,
+            lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)),
+        )
+    return Row(
+        "re-estimation with o3",
+        f"{1500 / estimating:.0f} frames/s",
+        f"reading {1500 / reading:.0f}",
+        reading / estimating,
+        0.5,
+    )
+
+
+def memory_of_an_hour() -> Row:
+    """Growth while an hour at 5 Hz is estimated with o3, against the file's size."""
+    from aolink.estimation import Driver
+    from aolink.recording.reader import Recording
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mcap"
+        record_long(path, 18_000)
+        size, recording = path.stat().st_size / 1e6, Recording(path)
+        driver, marks = Driver(recording.rig, ["o3"]), []
+        for number, exposure in enumerate(recording.exposures()):
+            driver.step(exposure)
+            if number % 4000 == 1000:
+                marks.append(resident_mb())
+    growth = max(marks) - marks[0]
+    return Row(
+        "memory over an hour's recording, o3", f"+{growth:.1f} MB", f"file {size:.0f} MB", size / max(growth, 0.1), 10
+    )
+
+
+def batch_workers() -> Row:
+    """Eight recordings estimated again with moments on two processes, against one."""
+    from aolink import batch
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sources = [folder / f"{k}.mcap" for k in range(8)]
+        for source in sources:
+            record_long(source, 600)
+
+        def work(jobs: int) -> float:
+            target = folder / f"on-{jobs}-{time.monotonic_ns()}"
+            target.mkdir()
+            todo = batch.jobs(sources, batch.models(None, []), ["moments"], target)
+            start = time.perf_counter()
+            assert not any(each.error for each in batch.run(todo, jobs))
+            return time.perf_counter() - start
+
+        one, two = (statistics.median(work(jobs) for _ in range(3)) for jobs in (1, 2))
+    return Row("8 recordings estimated again on 2 processes", f"{two:.1f} s", f"on one {one:.1f} s", one / two, 1.8)

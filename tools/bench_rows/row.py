@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 
@@ -31,3 +33,15 @@ def median_s(work: Callable[[], Any], runs: int, peer: Callable[[], Any] | None 
                 each()
                 times.append(time.perf_counter() - start)
     return statistics.median(ours), statistics.median(theirs) if theirs else float("nan")
+
+
+def timed(work: Callable[[], Any]) -> float:
+    """Time that a piece of work takes, s."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def resident_mb() -> float:
+    """Memory of this process, MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,0 +1,99 @@
+"""Commands that take blur out of pictures: deblur."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, stderr, stdout
+from aolink.errors import RestorationError
+from aolink.terminal import progress_bar
+
+
+@app.command(
+    epilog="Example: aolink deblur session.mcap -e moments -o sharp.mcap"
+    "  |  aolink deblur --image moved.png --psf psf.csv -o sharp.png"
+)
+def deblur(
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="OUT", help="File to write: a recording, or a picture of its type.")
+    ],
+    file: Annotated[
+        Path | None, typer.Argument(metavar="[FILE]", help="A recording, of which every exposure is restored.")
+    ] = None,
+    estimator: Annotated[
+        str, typer.Option("--estimator", "-e", help="Whose path; estimated again where the recording has none of it.")
+    ] = "moments",
+    image: Annotated[
+        Path | None, typer.Option("--image", metavar="IN.png", help="A blurred picture: .png, .tif, .jpg, .npy.")
+    ] = None,
+    psf: Annotated[
+        Path | None,
+        typer.Option(
+            "--psf",
+            metavar="PSF.csv",
+            help="Its PSF: .npy, or rows of numbers; one row of n taps lies along the picture's rows. Tap n // 2"
+            " is where the scene stays in place.",
+        ),
+    ] = None,
+    method: Annotated[
+        str,
+        typer.Option(help="tv, gauss_markov, pnp (slow); on lines: smoother, lag, filter, predictor, inverse."),
+    ] = "tv",
+    noise_sd: Annotated[
+        float | None, typer.Option(help="Of --image's noise, in its own counts; found in it if not given.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Take the motion's blur out of every picture of a recording; or a known one's out of a single picture."""
+    if file is not None and not (image or psf or noise_sd):
+        _deblur_recording(file, out, estimator, method, overwrite=overwrite, as_json=as_json)
+    elif file is None and image is not None and psf is not None:
+        _deblur_picture(image, psf, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
+    else:
+        raise typer.BadParameter("give a recording, or --image and --psf")
+
+
+def _deblur_recording(
+    file: Path, out: Path, estimator: str, method: str, *, overwrite: bool, as_json: bool
+) -> None:  # fmt: skip
+    from aolink import tables
+    from aolink.recording.deblur import write_deblurred
+    from aolink.restoration import checked_method
+
+    recording = open_recording(file)
+    with progress_bar(stderr, recording.counts.get("/camera/image", 0)) as tell:
+        summary = write_deblurred(
+            recording, out, estimator=estimator, method=checked_method(method), overwrite=overwrite,
+            workers=os.cpu_count() or 1, progress=lambda n: tell("deblur", n),
+        )  # fmt: skip
+    if as_json:
+        print(json.dumps({"out": str(out), "estimator": estimator, "method": method, **tables.deblurred(summary)}))
+        return
+    for line in tables.deblurred_lines(summary, estimator, method):
+        stdout.print(line, markup=False)
+    stdout.print(f"written: {out}", markup=False)
+
+
+def _deblur_picture(
+    image: Path, psf: Path, out: Path, method: str, noise_sd: float | None, *, overwrite: bool, as_json: bool
+) -> None:
+    from aolink.pictures import read_picture, read_psf, write_picture
+    from aolink.restoration import checked_method, restore
+
+    if out.exists() and not overwrite:
+        raise RestorationError(f"{out} exists: give --overwrite to replace it")
+    restored = restore(read_picture(image), read_psf(psf), method=checked_method(method), noise_sd=noise_sd)
+    write_picture(out, restored.image)
+    if as_json:
+        found = None if math.isnan(restored.noise_sd) else restored.noise_sd
+        print(json.dumps({"out": str(out), "method": method, "noise_sd": found, "direction": restored.direction}))
+    else:
+        noise = "" if math.isnan(restored.noise_sd) else f", noise sd {restored.noise_sd:.3g}"
+        stdout.print(f"{out}: {method}{noise}", markup=False)

@@ -1,0 +1,89 @@
+"""Single pictures and PSFs as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RestorationError
+
+
+def read_picture(path: Path) -> NDArray[Any]:
+    """A picture as numbers, (rows, columns) or (rows, columns, 3 or 4), of its own type.
+
+    ``.npy`` as it is; anything else that Pillow opens: 8 bits grey or colour, 16 bits grey, floats.
+
+    Raises
+    ------
+    RestorationError
+        It cannot be read.
+    """
+    if path.suffix == ".npy":
+        return _load(path, "picture")
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            if image.mode in ("1", "LA"):
+                return np.asarray(image.convert("L"))
+            if image.mode not in ("L", "F", "I", "RGB", "RGBA") and not image.mode.startswith("I;16"):
+                return np.asarray(image.convert("RGB"))
+            return np.asarray(image)
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise RestorationError(
+            f"{path} cannot be read as a picture ({error}): give a .png, .tif, .jpg or .npy"
+        ) from error
+
+
+def write_picture(path: Path, picture: NDArray[Any]) -> None:
+    """Write what `read_picture` reads back.
+
+    Raises
+    ------
+    RestorationError
+        It cannot be written, or not in this format.
+    """
+    from PIL import Image
+
+    try:
+        if path.suffix == ".npy":
+            np.save(path, picture)
+        else:
+            Image.fromarray(picture).save(path)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise RestorationError(
+            f"{path} cannot be written ({error}): a picture of type {picture.dtype} fits in a .npy file"
+        ) from error
+
+
+def read_psf(path: Path) -> NDArray[np.float64]:
+    """A PSF as numbers, from ``.npy`` or from text with commas or spaces; one row or column is one along the rows.
+
+    Raises
+    ------
+    RestorationError
+        It cannot be read.
+    """
+    if path.suffix == ".npy":
+        values = _load(path, "PSF")
+        if values.dtype.kind not in "uif":
+            raise RestorationError(f"{path} holds {values.dtype}, expected the PSF's numbers")
+        return values.astype(np.float64)
+    try:
+        rows = [line.replace(",", " ").split() for line in path.read_text(encoding="utf-8").splitlines()]
+        found = np.array([[float(cell) for cell in row] for row in rows if row])
+    except (OSError, ValueError) as error:
+        raise RestorationError(
+            f"{path} cannot be read as a PSF ({error}): give a .npy file, or rows of numbers with commas or spaces"
+        ) from error
+    return found.ravel() if 1 in found.shape else found
+
+
+def _load(path: Path, what: str) -> NDArray[Any]:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise RestorationError(f"{path} cannot be read as a {what} ({error})") from error

@@ -1,0 +1,286 @@
+"""The pictures of a recording without their blur: each restored with the path that its exposure's estimate gives.
+
+Neither the truth nor the true scene is read for it; the latter tells afterwards how good it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from google.protobuf.message import Message
+from numpy.typing import NDArray
+
+from aolink.errors import RecordingError, RestorationError
+from aolink.estimation import Estimate
+from aolink.exposure import Exposure
+from aolink.optics.camera import is_saturated, to_density
+from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.editing import RecordingCopy
+from aolink.recording.reader import RawMessage, Recording, RestoredPictures
+from aolink.recording.reestimate import recorded_estimates, reestimated
+from aolink.restoration import Method, Psf, Restored, motion_psf, restore
+from aolink.rig import Rig
+from aolink.scene import SceneSensor, scene_motion
+from aolink.sensor import Kernel, SpotSensor
+from aolink.workers import processes
+
+FloatArray = NDArray[np.float64]
+
+_MOST_SPOTS = 64
+"""More of them are not restored: each is a restoration of its own."""
+_AHEAD = 4
+"""Exposures for each worker that are handed out before the first of them is written."""
+
+
+@dataclass(kw_only=True)
+class Summary:
+    """What came of a recording, and how good it is where the true scene is known."""
+
+    exposures: int = 0
+    scenes: int = 0
+    """Scenes restored."""
+    reasons: Counter[str] = field(default_factory=Counter)
+    """Why pictures are missing, each with how often."""
+    psnr_blurred: list[float] = field(default_factory=list)
+    """Peak signal-to-noise ratio of each scene as it came, moved back by its mean displacement, dB."""
+    psnr_restored: list[float] = field(default_factory=list)
+
+
+def motion(estimate: Estimate, mix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A sum of an estimate's outputs at each fast step, and its covariance.
+
+    Parameters
+    ----------
+    mix:
+        Weights of the outputs, (k, n_outputs).
+
+    Returns
+    -------
+    (k, n_steps) and (k n_steps, k n_steps), slope units; the covariance without the path's share that the exposure's
+    basis leaves out.
+    """
+    covariance = estimate.coefficient_covariance
+    axes, count = covariance.shape[:2]
+    weights = mix.reshape(len(mix), axes, -1)
+    basis = estimate.model.state_rows if count == estimate.model.plant.n_states else estimate.model.basis
+    total = np.zeros((len(mix) * basis.shape[1],) * 2)
+    for axis in range(axes):
+        if weights[:, axis].any():
+            rows = np.tensordot(weights[:, axis], basis[:, :, :count], axes=1).reshape(-1, count)
+            total += rows @ covariance[axis] @ rows.T
+    return mix @ estimate.path, total
+
+
+def scene_psf(rig: Rig, estimate: Estimate) -> Psf:
+    """The PSF of a rig's picture sensor by an estimate, with its uncertainty."""
+    assert rig.scene is not None
+    return _psf(estimate, scene_motion(rig.n_outputs), rig.scene.kernel, rig.scene.pixel_scale)
+
+
+def _psf(estimate: Estimate, mix: FloatArray, kernel: Kernel, pixel_scale: float) -> Psf:
+    path, covariance = motion(estimate, mix)
+    return motion_psf(path, covariance, kernel, pixel_scale)
+
+
+def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method = "tv") -> RestoredPictures:
+    """Restore what an exposure's sensors saw, with the path of its estimate; intensities are cut at 0 and 1."""
+    scene = spots = None
+    noise, added, reasons = math.nan, math.nan, list[str]()
+    if rig.scene is not None:
+        try:
+            done = _restored_scene(rig, exposure, estimate, method)
+            scene, noise, added = _unit(done.image), done.noise_sd, done.psf_noise_sd
+        except RestorationError as error:
+            reasons.append(f"scene: {error}")
+    try:
+        spots = _unit(_restored_spots(rig, exposure, estimate, method))
+    except RestorationError as error:
+        reasons.append(f"spot: {error}")
+    info = schemas_pb2.Restoration(
+        frame_id=exposure.frame_id, estimator=estimate.estimator, method=method, scene_noise_sd=noise,
+        path_noise_sd=added, reason="; ".join(reasons),
+    )  # fmt: skip
+    return RestoredPictures(info, scene, spots)
+
+
+def _restored_scene(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method) -> Restored:
+    assert rig.scene is not None
+    if exposure.scene is None:
+        raise RestorationError("the picture never came")
+    counts = exposure.scene.pixels
+    good = exposure.scene.mask & ~rig.scene.is_saturated(counts)
+    return restore(rig.scene.to_intensity(counts), scene_psf(rig, estimate), method=method, mask=good)
+
+
+def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method) -> FloatArray:
+    sensor = rig.sensor
+    share = to_density(sensor, exposure.pixels) * sensor.pixel_size
+    good = exposure.mask & ~is_saturated(sensor, exposure.pixels)
+    if not isinstance(sensor, SpotSensor):
+        psf = _psf(estimate, np.eye(1), sensor.kernel, sensor.pixel_width)
+        return np.asarray(restore(share, psf, method=method, mask=good).image)
+    if sensor.spots > _MOST_SPOTS:
+        raise RestorationError(f"{sensor.spots} spots are not restored, {_MOST_SPOTS} would be")
+    out, (height, width) = np.empty_like(share), sensor.window
+    for spot in range(sensor.spots):
+        row, column = divmod(spot, sensor.grid[1])
+        window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+        psf = _psf(estimate, np.eye(rig.n_outputs)[2 * spot : 2 * spot + 2], sensor.kernel, sensor.pixel_width)
+        out[window] = restore(share[window], psf, method=method, mask=good[window]).image
+    return out
+
+
+def _unit(image: FloatArray) -> NDArray[np.float32]:
+    return np.clip(image, 0.0, 1.0).astype(np.float32)
+
+
+def psnr(picture: FloatArray, scene: FloatArray, mask: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio, dB, for a peak of one."""
+    error = (picture - scene)[... if mask is None else mask]
+    return float(-10 * np.log10(np.mean(error**2))) if error.size else math.nan
+
+
+def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: NDArray[np.intp], scene: FloatArray) -> float:
+    """`psnr` of a scene as it came, against the true one moved as it is in the mean: no blur is mistaken for a shift.
+
+    Parameters
+    ----------
+    shift_px:
+        Mean displacement along x, or x and y, whole pixels.
+    """
+    assert exposure.scene is not None
+    x, y = int(shift_px[0]), int(shift_px[1]) if len(shift_px) > 1 else 0
+    rows, columns = sensor.shape
+    kept = np.zeros(sensor.shape, dtype=bool)
+    kept[max(y, 0) : rows + min(y, 0), max(x, 0) : columns + min(x, 0)] = True
+    moved = np.roll(scene, (y, x), axis=(0, 1))
+    return psnr(sensor.to_intensity(exposure.scene.pixels), moved, kept & exposure.scene.mask)
+
+
+def write_deblurred(
+    recording: Recording, path: Path, *, estimator: str, method: Method = "tv", overwrite: bool = False,
+    workers: int = 0, progress: Callable[[int], None] = lambda exposures: None,
+) -> Summary:  # fmt: skip
+    """Copy a recording with its pictures restored.
+
+    Everything else stays, byte for byte; restored pictures that it has are replaced, and estimates of ``estimator``
+    are added if it has none. With ``workers`` so many processes do it, one thread each; without, this one.
+
+    Raises
+    ------
+    RecordingError
+        ``path`` exists and not ``overwrite``, or cannot be written.
+    EstimatorError
+        There is no such estimator, or it cannot work on this rig.
+    """
+    made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
+    held = next(made, None)  # whether the estimator can work shows before the file is made
+    true_scene = recording.true_scene
+    notes = {
+        "aolink_version": version("aolink"),
+        "deblurred_from": recording.path.name,
+        "deblurred_with": f"{estimator} {method}",
+        "recorded_with": recording.metadata.get("aolink_version", "unknown"),
+    }
+    copy = RecordingCopy(recording, path, notes, overwrite=overwrite)
+    summary, log_times = Summary(), dict[int, int]()
+
+    def add(topic: str, message: Message, log_time_ns: int) -> None:
+        data = message.SerializeToString(deterministic=True)
+        copy.add(RawMessage(topic, message.DESCRIPTOR.full_name, log_time_ns, 0, data))
+
+    def emit(exposure: Exposure, estimate: Estimate, done: RestoredPictures) -> None:
+        log_time_ns = log_times.pop(exposure.frame_id, recording.end_ns)
+        if estimator not in recording.estimators:
+            add(topics.estimate_topic(estimator), convert.estimate_message(estimate), log_time_ns)
+        for topic, message in _messages(done, exposure.host_start_ns):
+            add(topic, message, log_time_ns)
+        _score(summary, recording.rig, true_scene, exposure, estimate, done)
+        progress(summary.exposures)
+
+    try:
+        for raw in recording.raw_messages():
+            if raw.topic == topics.EXPOSURE:
+                frame_id = schemas_pb2.ExposureInfo.FromString(raw.data).frame_id
+                # What belongs to the exposures before this one has all gone by.
+                while held is not None and held[0].frame_id < frame_id:
+                    emit(*held)
+                    held = next(made, None)
+                log_times[frame_id] = raw.log_time_ns
+            if not raw.topic.startswith(topics.RESTORED):
+                copy.add(raw)
+        while held is not None:
+            emit(*held)
+            held = next(made, None)
+        copy.finish(recording.losses)
+    except OSError as error:
+        copy.give_up()
+        raise RecordingError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
+    except BaseException:
+        copy.give_up()
+        raise
+    return summary
+
+
+def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Estimate]]:
+    """Exposures with their recorded estimates, or with new ones where the recording has none of that name."""
+    if name not in recording.estimators:
+        for exposure, (estimate,) in reestimated(recording, [name]):
+            yield replace(exposure, truth=None), estimate
+        return
+    recorded = recorded_estimates(recording, name)
+    ahead = next(recorded, None)
+    for exposure in recording.exposures():
+        while ahead is not None and ahead.frame_id < exposure.frame_id:
+            ahead = next(recorded, None)
+        if ahead is not None and ahead.frame_id == exposure.frame_id:
+            yield replace(exposure, truth=None), ahead
+
+
+def _deblurred(
+    rig: Rig, series: Iterator[tuple[Exposure, Estimate]], method: Method, workers: int
+) -> Iterator[tuple[Exposure, Estimate, RestoredPictures]]:
+    if not workers:
+        for exposure, estimate in series:
+            yield exposure, estimate, deblur(rig, exposure, estimate, method)
+        return
+    with processes(workers) as pool:
+        waiting: deque[tuple[Exposure, Estimate, Future[RestoredPictures]]] = deque()
+        for exposure, estimate in series:
+            waiting.append((exposure, estimate, pool.submit(deblur, rig, exposure, estimate, method)))
+            if len(waiting) > _AHEAD * workers:
+                first, its, done = waiting.popleft()
+                yield first, its, done.result()
+        for exposure, estimate, done in waiting:
+            yield exposure, estimate, done.result()
+
+
+def _messages(done: RestoredPictures, time_ns: int) -> Iterator[tuple[str, Message]]:
+    yield topics.RESTORATION, done.info
+    for topic, picture in ((topics.RESTORED_SCENE, done.scene), (topics.RESTORED_SPOTS, done.spots)):
+        if picture is not None:
+            yield topic, convert.float_image(picture, time_ns)
+
+
+def _score(
+    summary: Summary, rig: Rig, true_scene: NDArray[np.uint16] | None, exposure: Exposure, estimate: Estimate,
+    done: RestoredPictures,
+) -> None:  # fmt: skip
+    summary.exposures += 1
+    summary.scenes += done.scene is not None
+    if done.info.reason:
+        summary.reasons[done.info.reason] += 1
+    if true_scene is None or rig.scene is None or exposure.scene is None or done.scene is None:
+        return
+    scene = rig.scene.to_intensity(true_scene)
+    displacement = (scene_motion(rig.n_outputs) @ estimate.path).mean(axis=1) / rig.scene.pixel_scale
+    shift = np.rint(displacement).astype(np.intp)
+    summary.psnr_blurred.append(blurred_psnr(rig.scene, exposure, shift, scene))
+    summary.psnr_restored.append(psnr(done.scene.astype(np.float64), scene))

@@ -1,0 +1,229 @@
+"""The two-dimensional Gauss-Markov scene: differences along rows and columns are white.
+
+A solver holds (H'WH + kappa L) for one PSF: H blurs a scene that goes beyond the frame into the frame, W masks pixels
+that were not measured, L = Dx'Dx + Dy'Dy, and kappa is lambda times the noise's variance. Nothing is periodic, and
+nothing is assumed of what lies outside. Scenes are (batch, rows, columns), larger than the frame by the PSF's reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, linalg
+
+from aolink.restoration.psf import Psf, line_matrix
+
+FloatArray = NDArray[np.floating[Any]]
+BoolArray = NDArray[np.bool_]
+
+_THREADS = 2
+_MOST_STEPS = 400
+_TOLERANCE = 1e-4
+
+
+class Solver(Protocol):
+    """What the methods need of (H'WH + kappa L)."""
+
+    @property
+    def frame(self) -> tuple[slice, slice]:
+        """Where the frame lies in the scene."""
+        ...
+
+    def project(self, images: FloatArray) -> FloatArray:
+        """H'W applied to images, the size of the scene."""
+        ...
+
+    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
+        """The scene x with (H'WH + kappa L) x = right; an error is measured against the root of kappa x'L x."""
+        ...
+
+    def gauss_markov(self, images: FloatArray, tolerance: float = _TOLERANCE) -> FloatArray:
+        """The scene of images, which hold something likely where they were not measured."""
+        ...
+
+
+def difference_spectrum(n: int) -> NDArray[np.float64]:
+    """Eigenvalues of D'D for n pixels in a row, whose vectors are the cosines of the DCT-II, (n,)."""
+    return 2 - 2 * np.cos(np.pi * np.arange(n) / n)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LineSolver:
+    """Blur along the rows, all pixels measured: exact. Cosines down the columns, one eigenbasis along the rows."""
+
+    C: FloatArray
+    """Blurs a line, (columns, columns + m)."""
+    vectors: FloatArray
+    """Of C'C + kappa Dx'Dx, (columns + m, columns + m)."""
+    inverse: FloatArray
+    """One over their values plus kappa times those of Dy'Dy, (rows, columns + m)."""
+    first: int
+    """Element of a line at which the frame starts."""
+
+    @property
+    def frame(self) -> tuple[slice, slice]:
+        return slice(None), slice(self.first, self.first + len(self.C))
+
+    def project(self, images: FloatArray) -> FloatArray:
+        return np.asarray(images.astype(self.C.dtype, copy=False) @ self.C)
+
+    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
+        z = fft.dct(right, axis=-2, norm="ortho", workers=_THREADS) @ self.vectors
+        z *= self.inverse
+        return np.asarray(fft.idct(z @ self.vectors.T, axis=-2, norm="ortho", workers=_THREADS, overwrite_x=True))
+
+    def gauss_markov(self, images: FloatArray, tolerance: float = 0.0) -> FloatArray:
+        return self.solve(self.project(images))
+
+
+def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, dtype: type = np.float64) -> LineSolver:
+    """The exact solver of a PSF along the rows, which may differ from pixel to pixel."""
+    C = line_matrix(psf.values, shape[1])
+    normal = C.T @ C
+    size = len(normal)
+    i = np.arange(size)
+    normal[i, i] += 2 * kappa
+    normal[[0, -1], [0, -1]] -= kappa
+    normal[i[1:], i[:-1]] -= kappa
+    normal[i[:-1], i[1:]] -= kappa
+    values, vectors = linalg.eigh(normal, driver="evd", overwrite_a=True, check_finite=False)
+    return LineSolver(
+        C=C.astype(dtype), vectors=vectors.astype(dtype),
+        inverse=(1 / (values + kappa * difference_spectrum(shape[0])[:, None])).astype(dtype),
+        first=psf.values.shape[-1] - 1 - psf.origin[0],
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class IterativeSolver:
+    """Any blur on the plane and any mask, by conjugate gradients from a solver that is nearly right."""
+
+    kappa: float
+    blur: Callable[[FloatArray], FloatArray]
+    blur_transposed: Callable[[FloatArray], FloatArray]
+    nearly: Callable[[FloatArray], FloatArray]
+    """A symmetric positive definite operator near the inverse."""
+    guess: Callable[[FloatArray], FloatArray]
+    """A scene to start from, of images without holes."""
+    seen: BoolArray | None
+    frame: tuple[slice, slice]
+    white: bool = False
+    """I in the place of L: the scene's pixels are white, not its differences."""
+
+    def project(self, images: FloatArray) -> FloatArray:
+        return self.blur_transposed(images if self.seen is None else np.where(self.seen, images, 0.0))
+
+    def gauss_markov(self, images: FloatArray, tolerance: float = _TOLERANCE) -> FloatArray:
+        return self.solve(self.project(images), self.guess(images), tolerance)
+
+    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
+        x = self.nearly(right) if start is None else start.copy()
+        prior = self.kappa * _dot(x, x if self.white else roughness(x))
+        r = right - self._apply(x)
+        z = self.nearly(r)
+        p, rz = z, _dot(r, z)
+        # Rounding leaves the second one of a picture that is even.
+        goal = np.maximum(tolerance**2 * prior, 1e-28 * _dot(right, self.nearly(right)))
+        for _ in range(_MOST_STEPS):
+            if (rz <= goal).all():
+                break
+            q = self._apply(p)
+            step = rz / np.maximum(_dot(p, q), 1e-300)
+            x += step * p
+            r = r - step * q
+            z = self.nearly(r)
+            rz, before = _dot(r, z), rz
+            p = z + rz / np.maximum(before, 1e-300) * p
+        return x
+
+    def _apply(self, x: FloatArray) -> FloatArray:
+        return self.project(self.blur(x)) + self.kappa * (x if self.white else roughness(x))
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray((a * b).sum(axis=(-2, -1), keepdims=True))
+
+
+def roughness(x: FloatArray) -> FloatArray:
+    """L x = (Dx'Dx + Dy'Dy) x."""
+    return differences_transposed(np.diff(x, axis=-1), np.diff(x, axis=-2))
+
+
+def differences_transposed(along: FloatArray, down: FloatArray) -> FloatArray:
+    """Dx' along + Dy' down, from differences (.., rows, columns - 1) and (.., rows - 1, columns)."""
+    out = np.empty((*along.shape[:-1], down.shape[-1]), along.dtype)
+    out[..., 0], out[..., -1] = -along[..., 0], along[..., -1]
+    np.subtract(along[..., :-1], along[..., 1:], out=out[..., 1:-1])
+    out[..., 1:, :] += down
+    out[..., :-1, :] -= down
+    return out
+
+
+def plane_solver(
+    psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, white: bool = False
+) -> IterativeSolver:
+    """The solver of a PSF on the plane (or along all rows alike), starting from its periodic one."""
+    taps, origin = np.atleast_2d(psf.values), (0, *psf.origin)[-2:]
+    reach = (taps.shape[0] - 1, taps.shape[1] - 1)
+    rows, columns = size = (shape[0] + reach[0], shape[1] + reach[1])
+    transfer = fft.rfft2(taps, size)
+    fraction = 1.0 if seen is None else float(seen.mean())
+    y, x = fft.fftfreq(rows)[:, None], fft.rfftfreq(columns)[None]
+    rough = 4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2
+    # The frame's share of the scene, and a floor for the mean, which the differences do not hold.
+    share = fraction * shape[0] * shape[1] / (rows * columns)
+    prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
+    inverse = 1 / (share * np.abs(transfer) ** 2 + kappa * prior)
+
+    def through(images: FloatArray, factor: NDArray[np.inexact[Any]]) -> FloatArray:
+        spectrum = fft.rfft2(images, size, workers=_THREADS)
+        return np.asarray(fft.irfft2(spectrum * factor, size, workers=_THREADS))
+
+    def blur(scene: FloatArray) -> FloatArray:
+        return through(scene, transfer)[..., reach[0] :, reach[1] :]
+
+    def blur_transposed(images: FloatArray) -> FloatArray:
+        padded = np.zeros((*images.shape[:-2], *size))
+        padded[..., reach[0] :, reach[1] :] = images
+        return through(padded, transfer.conj())
+
+    def guess(images: FloatArray) -> FloatArray:
+        """The periodic scene of images that go over from their last pixel to their first where nothing is known."""
+        padded = np.zeros((*images.shape[:-2], *size))
+        padded[..., reach[0] :, reach[1] :] = images
+        down = (np.arange(1, reach[0] + 1) / (reach[0] + 1))[:, None]
+        padded[..., : reach[0], :] = (1 - down) * padded[..., -1:, :] + down * padded[..., reach[0], None, :]
+        right = np.arange(1, reach[1] + 1) / (reach[1] + 1)
+        padded[..., : reach[1]] = (1 - right) * padded[..., -1:] + right * padded[..., reach[1], None]
+        return through(padded, transfer.conj() * inverse)
+
+    first = [m - o for m, o in zip(reach, origin, strict=True)]
+    return IterativeSolver(
+        kappa=kappa, blur=blur, blur_transposed=blur_transposed, nearly=lambda r: through(r, inverse), guess=guess,
+        seen=seen, white=white,
+        frame=(slice(first[0], first[0] + shape[0]), slice(first[1], first[1] + shape[1])),
+    )  # fmt: skip
+
+
+def masked_line_solver(psf: Psf, seen: BoolArray, kappa: float) -> IterativeSolver:
+    """Blur along the rows with pixels missing: conjugate gradients from the exact solver of the whole frame."""
+    exact = line_solver(psf, (seen.shape[0], seen.shape[1]), kappa)
+    return IterativeSolver(
+        kappa=kappa, blur=lambda x: np.asarray(x @ exact.C.T), blur_transposed=lambda y: np.asarray(y @ exact.C),
+        nearly=exact.solve, guess=exact.gauss_markov, seen=seen, frame=exact.frame,
+    )  # fmt: skip
+
+
+def make_solver(
+    psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, dtype: type = np.float64
+) -> Solver:
+    """The solver for a PSF, a frame's shape, kappa, and a mask (rows, columns), False where nothing was measured."""
+    if not psf.on_line:
+        return plane_solver(psf, shape, kappa, seen)
+    if seen is None:
+        return line_solver(psf, shape, kappa, dtype)
+    return masked_line_solver(psf, seen, kappa)

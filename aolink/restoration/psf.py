@@ -1,0 +1,261 @@
+"""The point spread function of a motion: where it comes from, what it may be, how uncertain it is.
+
+Convention of the centre: a scene point at pixel p, moved by d pixels, lands on pixel p + d. Tap j of a PSF stands
+for a displacement of j - origin, so that
+
+    image[k] = sum_j values[j] scene[k + origin - j]
+
+and what is restored with it lies where the scene lies when the displacement is zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erf
+
+from aolink.errors import RestorationError
+from aolink.plant import psd_root
+from aolink.sensor import Kernel
+
+FloatArray = NDArray[np.float64]
+
+# Light beyond so many standard deviations of the kernel is left out, as are taps below this share of the largest.
+_REACH = 5.0
+_NEGLIGIBLE = 1e-5
+# Modes of the PSF's error that together hold less than this share of its variance are left out.
+_MODES_LEFT_OUT = 1e-4
+# A path is straight for the line methods if its light strays from the line by less than this, rms, pixels.
+STRAIGHT_PX = 0.35
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Psf:
+    """A point spread function on whole pixels. Its taps are not negative."""
+
+    values: FloatArray
+    """(taps,) along the rows of an image; (rows, columns) on the plane; (columns of the image, taps) along rows
+    where every pixel of a line has its own: row k makes image pixel k."""
+    origin: tuple[int, ...]
+    """Tap that stands for no displacement: (column,) along the rows, (row, column) on the plane."""
+    modes: FloatArray = field(default_factory=lambda: np.zeros((0,)))
+    """Error of the values as independent modes, each at one standard deviation, (modes, *values.shape)."""
+
+    def __post_init__(self) -> None:
+        values = np.asarray(self.values, dtype=np.float64)
+        modes = np.asarray(self.modes, dtype=np.float64)
+        if not modes.size:
+            modes = np.zeros((0, *values.shape))
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "modes", modes)
+        _check(values, self.origin)
+        if modes.shape[1:] != values.shape or not np.isfinite(modes).all():
+            raise RestorationError(
+                f"the PSF's modes have shape {modes.shape}, expected finite numbers of shape (modes, *{values.shape})"
+            )
+
+    @property
+    def varies(self) -> bool:
+        """Whether each pixel of a line has a PSF of its own."""
+        return len(self.origin) == 1 and self.values.ndim == 2
+
+    @property
+    def on_line(self) -> bool:
+        """Whether it moves along the rows only."""
+        return len(self.origin) == 1
+
+    @property
+    def sd(self) -> FloatArray:
+        """Standard deviation of each value, shape of ``values``."""
+        return np.asarray(np.sqrt((self.modes**2).sum(axis=0)))
+
+
+def _check(values: FloatArray, origin: tuple[int, ...]) -> None:
+    if values.ndim not in (1, 2) or not values.size:
+        raise RestorationError(
+            f"the PSF has shape {values.shape}: expected at least one tap, (taps,) along the rows or (rows, columns)"
+        )
+    if not np.isfinite(values).all():
+        bad = int((~np.isfinite(values)).sum())
+        raise RestorationError(f"{bad} of the PSF's {values.size} values are not finite: repair them")
+    if values.min() < 0:
+        raise RestorationError(
+            f"the PSF's smallest value is {values.min():.3g}: light cannot be negative; clip the PSF, or check its sign"
+        )
+    axes = values.shape[1:] if values.ndim == 2 and len(origin) == 1 else values.shape
+    if not (values.reshape(-1, *axes).sum(axis=tuple(range(1, len(axes) + 1))) > 0).all():
+        raise RestorationError("the PSF is zero everywhere: expected some light")
+    if len(origin) != len(axes) or any(not 0 <= o < n for o, n in zip(origin, axes, strict=True)):
+        raise RestorationError(
+            f"the PSF's origin is {origin}, expected a tap inside {axes}: pad the PSF with zeros up to no displacement"
+        )
+
+
+def as_psf(psf: Psf | ArrayLike) -> Psf:
+    """A PSF from plain numbers: divided by their sum, with the origin at tap ``n // 2`` of each axis."""
+    if isinstance(psf, Psf):
+        return psf
+    values = np.asarray(psf, dtype=np.float64)
+    origin = tuple(n // 2 for n in values.shape)
+    if values.ndim in (1, 2) and values.size and np.isfinite(values).all() and values.min() >= 0 and values.sum() > 0:
+        values = values / values.sum()
+    return Psf(values=values, origin=origin)
+
+
+def motion_psf(path: ArrayLike, path_covariance: ArrayLike | None, kernel: Kernel, pixel_scale: float) -> Psf:
+    """The PSF that a path gives: its histogram convolved with the image kernel, integrated over pixels.
+
+    Parameters
+    ----------
+    path:
+        Displacement at each fast step, slope units, (n_steps,) along the rows of the picture, or (2, n_steps): x along
+        its columns' numbers, y along its rows' numbers.
+    path_covariance:
+        Of the path, slope units squared, (n_steps, n_steps) or (2 n_steps, 2 n_steps) with all of x first; None
+        where the path is known.
+    kernel:
+        The picture's image kernel.
+    pixel_scale:
+        Width of one pixel of the picture, slope units.
+
+    Returns
+    -------
+    The expected PSF (a kernel widened by each step's own variance, exact for Gaussian errors; on the plane the
+    correlation of x with y in one step goes into the modes only), and its error to first order in the path's.
+
+    Raises
+    ------
+    RestorationError
+        Numbers that are not finite, or shapes that do not fit together.
+
+    References
+    ----------
+    Mishra & Wen (2), (3); Shahin (5).
+    """
+    steps = np.asarray(path, dtype=np.float64)
+    on_line = steps.ndim == 1 or (steps.ndim == 2 and len(steps) == 1)
+    steps = np.atleast_2d(steps)
+    if steps.ndim != 2 or len(steps) not in (1, 2) or not steps.shape[1] or not np.isfinite(steps).all():
+        raise RestorationError(
+            f"the path has shape {np.shape(path)}: expected finite positions, (n_steps,) or (2, n_steps)"
+        )
+    if not (math.isfinite(pixel_scale) and pixel_scale > 0):
+        raise RestorationError(f"the pixel scale is {pixel_scale}: expected the width of a pixel, above zero")
+    steps = steps / pixel_scale
+    root = _path_root(path_covariance, steps.size) / pixel_scale
+    variance = (root**2).sum(axis=1).reshape(steps.shape)
+    width = np.sqrt((kernel.sigma / pixel_scale) ** 2 + 2 * variance)
+    masses, slopes, origin = zip(*(_axis(p, w) for p, w in zip(steps, width, strict=True)), strict=True)
+    n = steps.shape[1]
+    if on_line:
+        values = masses[0].mean(axis=0)
+        modes = (root.T @ slopes[0]) / n
+    else:
+        values = masses[1].T @ masses[0] / n
+        modes = np.einsum("mi,ir,ic->mrc", root[:n].T, masses[1], slopes[0], optimize=True)
+        modes += np.einsum("mi,ir,ic->mrc", root[n:].T, slopes[1], masses[0], optimize=True)
+        modes /= n
+        origin = origin[::-1]
+    return _trimmed(values, modes, origin)
+
+
+def _path_root(covariance: ArrayLike | None, size: int) -> FloatArray:
+    if covariance is None:
+        return np.zeros((size, 1))
+    matrix = np.asarray(covariance, dtype=np.float64)
+    if matrix.shape != (size, size) or not np.isfinite(matrix).all():
+        raise RestorationError(
+            f"the path's covariance has shape {matrix.shape}, expected finite numbers, {size} x {size}"
+        )
+    return psd_root(matrix)
+
+
+def _axis(positions: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray, int]:
+    """Masses in pixels and their slopes by the position, (n_steps, pixels), and the pixel of no displacement."""
+    reach = _REACH * float(width.max()) / math.sqrt(2)
+    low = min(0, math.floor(positions.min() - reach))
+    high = max(0, math.ceil(positions.max() + reach))
+    u = (np.arange(low, high + 2) - 0.5 - positions[:, None]) / width[:, None]
+    mass = np.diff(erf(u) / 2, axis=1)
+    slope = -np.diff(np.exp(-u * u), axis=1) / (width[:, None] * math.sqrt(math.pi))
+    return mass, slope, -low
+
+
+def _trimmed(values: FloatArray, modes: FloatArray, origin: tuple[int, ...]) -> Psf:
+    """Without negligible edges (the origin stays inside), of unit sum, with the modes that matter."""
+    keep = []
+    for axis, centre in enumerate(origin):
+        others = tuple(a for a in range(values.ndim) if a != axis)
+        lit = np.flatnonzero(values.max(axis=others) > _NEGLIGIBLE * values.max())
+        keep.append(slice(min(centre, int(lit[0])), max(centre, int(lit[-1])) + 1))
+    values, modes = values[tuple(keep)], modes[(slice(None), *keep)]
+    total = values.sum()
+    _, size, rows = np.linalg.svd(modes.reshape(len(modes), -1) / total, full_matrices=False)
+    left = (size**2)[::-1].cumsum()[::-1]
+    rank = int((left > _MODES_LEFT_OUT * left[0]).sum())
+    return Psf(
+        values=values / total,
+        origin=tuple(c - k.start for c, k in zip(origin, keep, strict=True)),
+        modes=(size[:rank, None] * rows[:rank]).reshape(rank, *values.shape),
+    )
+
+
+def line_matrix(values: FloatArray, columns: int) -> FloatArray:
+    """The matrix that blurs a line, (columns, columns + taps - 1), Shahin (4): image = C scene.
+
+    The scene goes beyond the frame by as much as the PSF reaches; pixel 0 of the frame is element taps - 1 - origin.
+
+    Parameters
+    ----------
+    values:
+        (taps,), or (columns, taps).
+    """
+    m = values.shape[-1] - 1
+    taps = np.broadcast_to(values, (columns, m + 1))
+    C = np.zeros((columns, columns + m))
+    k = np.arange(columns)
+    for j in range(m + 1):
+        C[k, k + m - j] = taps[:, j]
+    return C
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Line:
+    """What of a PSF on the plane lies along one line."""
+
+    angle_rad: float
+    """Of the line, from the direction of growing columns towards growing rows."""
+    psf: Psf
+    deviation_px: float
+    """Root mean square distance of the light from the line, without the width of the pixels."""
+
+
+def along_line(psf: Psf) -> Line:
+    """Project a PSF on the plane onto its principal axis; each pixel's light goes to the two nearest taps."""
+    values, total = psf.values, psf.values.sum()
+    y, x = (np.indices(values.shape) - np.array(psf.origin)[:, None, None]).astype(np.float64)
+    mean = np.array([(values * x).sum(), (values * y).sum()]) / total
+    away = np.stack([x - mean[0], y - mean[1]])
+    spread = np.einsum("irc,jrc,rc->ij", away, away, values) / total
+    sizes, axes = np.linalg.eigh(spread)
+    direction = axes[:, 1] * (1 if axes[np.argmax(abs(axes[:, 1])), 1] > 0 else -1)
+    place = direction[0] * x + direction[1] * y
+    low = min(0, math.floor(place.min()))
+    size = max(0, math.ceil(place.max())) - low + 2
+    tap = np.floor(place - low).astype(int)
+    part = place - low - tap
+
+    def project(light: FloatArray) -> FloatArray:
+        near = np.bincount(tap.ravel(), (light * (1 - part)).ravel(), size)
+        return np.asarray(near + np.bincount(tap.ravel() + 1, (light * part).ravel(), size))
+
+    modes = np.array([project(mode) for mode in psf.modes]).reshape(len(psf.modes), size)
+    return Line(
+        angle_rad=math.atan2(direction[1], direction[0]),
+        psf=_trimmed(project(values), modes if len(modes) else np.zeros((1, size)), (-low,)),
+        # A line that is drawn on pixels strays by what a pixel's own width is, 1/12 of its square.
+        deviation_px=math.sqrt(max(float(sizes[0]) - 1 / 12, 0.0)),
+    )

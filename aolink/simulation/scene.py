@@ -1,0 +1,63 @@
+"""The simulated picture sensor: a picture that moves during the exposure."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.rig import Rig
+from aolink.scene import framed, read_scene_picture, scene_motion
+
+FloatArray = NDArray[np.float64]
+
+_FLAT = 0.5
+"""Intensity of even light."""
+
+
+class SceneCamera:
+    """Integrates a picture along a path, blurred by the sensor's kernel, noisy and in counts.
+
+    Shifts are exact for the picture's own, finer pixels, by its Fourier transform; what moves out on one side
+    comes in on the other, so the picture should reach beyond the frame by as much as the scene moves.
+    """
+
+    def __init__(self, rig: Rig, rng: np.random.Generator) -> None:
+        assert rig.scene is not None
+        self._sensor, self._rng = rig.scene, rng
+        picture = read_scene_picture(rig.scene, rig.folder)
+        self._shape = picture.shape
+        self._scale = rig.scene.picture_pixels / rig.scene.pixel_scale
+        self._fy, self._fx = np.fft.fftfreq(picture.shape[0])[:, None], np.fft.rfftfreq(picture.shape[1])[:, None]
+        width = math.pi * rig.scene.kernel.sigma * self._scale
+        kernel = np.exp(-((width * self._fy) ** 2)) * np.exp(-((width * self._fx.T) ** 2))
+        self._spectrum = np.fft.rfft2(picture) * kernel
+
+    def frame(self, path: FloatArray, weights: FloatArray, light: str) -> NDArray[np.uint16]:
+        """Counts of one exposure, (rows, columns).
+
+        Parameters
+        ----------
+        path:
+            Of all spots, slope units, (n_outputs, n_steps).
+        weights:
+            Share of the exposure in each step, (n_steps,).
+        light:
+            As in `aolink.rig.Light`.
+        """
+        sensor = self._sensor
+        if light in ("dark", "flat"):
+            intensity = np.full(sensor.shape, _FLAT if light == "flat" else 0.0)
+        else:
+            spectrum = self._spectrum * self._motion(scene_motion(len(path)) @ path * self._scale, weights)
+            intensity = framed(sensor, np.fft.irfft2(spectrum, self._shape))
+        return sensor.to_counts(intensity + sensor.noise_sd * self._rng.standard_normal(sensor.shape))
+
+    def _motion(self, path: FloatArray, weights: FloatArray) -> NDArray[np.complex128]:
+        """Transform of the path's histogram, (rows or 1, columns // 2 + 1); the path in the picture's pixels."""
+        along_x = np.exp(-2j * math.pi * self._fx * path[0])
+        if len(path) == 1:
+            return np.asarray(along_x @ weights)[None]
+        along_y = np.exp(-2j * math.pi * self._fy * path[1])
+        return np.asarray((along_y * weights) @ along_x.T)

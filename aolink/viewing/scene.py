@@ -1,0 +1,84 @@
+"""What the picture sensor saw, without its blur, and at rest; and the spots' frames without theirs.
+
+All scenes are drawn alike: black is dark, white an intensity of one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from aolink.exposure import Exposure
+from aolink.recording.reader import RestoredPictures
+from aolink.scene import SceneSensor
+from aolink.viewing.palette import MISSING
+from aolink.viewing.timebase import Timebase
+
+FloatArray = NDArray[np.float64]
+
+SCENE = "scene/image"
+TRUE_SCENE = "scene/true"
+RESTORED_SCENE = "restored/image"
+RESTORED_SPOTS = "restored/spot"
+
+
+def log_scenes(
+    stream: rr.RecordingStream, sensor: SceneSensor, timebase: Timebase, exposures: Sequence[Exposure]
+) -> bool:
+    """Scenes as they came, lost pixels in a colour of their own: ``/scene/image``; gives whether there is one."""
+    known = [(e, e.scene) for e in exposures if e.scene is not None]
+    pictures = []
+    for _, scene in known:
+        grey = np.repeat(_grey(sensor.to_intensity(scene.pixels))[..., None], 3, axis=2)
+        grey[~scene.mask] = MISSING
+        pictures.append(grey)
+    _send(stream, SCENE, timebase, [e.first_step for e, _ in known], [e.frame_id for e, _ in known], pictures)
+    return bool(known)
+
+
+def log_true_scene(stream: rr.RecordingStream, sensor: SceneSensor, counts: NDArray[np.uint16]) -> None:
+    """The scene at rest: ``/scene/true``."""
+    stream.log(TRUE_SCENE, rr.Image(_grey(sensor.to_intensity(counts)), color_model="L"), static=True)
+
+
+def log_restored(
+    stream: rr.RecordingStream, timebase: Timebase, exposures: Sequence[Exposure], restored: Sequence[RestoredPictures]
+) -> bool:
+    """Pictures without their blur: ``/restored/image``, ``/restored/spot`` (the most light in it is white).
+
+    Gives whether there was a scene.
+    """
+    starts = {e.frame_id: e.first_step for e in exposures}
+    known = [each for each in restored if each.info.frame_id in starts]
+    scenes = [(each.info.frame_id, _grey(each.scene)) for each in known if each.scene is not None]
+    spots = [
+        (each.info.frame_id, _grey(each.spots / max(float(each.spots.max()), 1e-6)))
+        for each in known
+        if each.spots is not None
+    ]
+    for path, pictures in ((RESTORED_SCENE, scenes), (RESTORED_SPOTS, spots)):
+        frames = [frame_id for frame_id, _ in pictures]
+        _send(stream, path, timebase, [starts[k] for k in frames], frames, [picture for _, picture in pictures])
+    return bool(scenes)
+
+
+def _grey(intensity: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.asarray(np.rint(255 * np.clip(intensity, 0.0, 1.0)), dtype=np.uint8)
+
+
+def _send(
+    stream: rr.RecordingStream, path: str, timebase: Timebase, steps: Sequence[int], frames: Sequence[int],
+    pictures: Sequence[NDArray[np.uint8]],
+) -> None:  # fmt: skip
+    """Send pictures of one shape, (rows, columns) or (rows, columns, 3), a row of the columns each."""
+    if not pictures:
+        return
+    height, width = pictures[0].shape[:2]
+    model = rr.ColorModel.RGB if pictures[0].ndim == 3 else rr.ColorModel.L
+    layout = rr.components.ImageFormat(width=width, height=height, color_model=model, channel_datatype="U8")
+    stream.log(path, rr.Image.from_fields(format=layout), static=True)
+    buffers = np.stack([picture.ravel() for picture in pictures])
+    stream.send_columns(path, timebase.at_steps(steps, frames), rr.Image.columns(buffer=buffers))

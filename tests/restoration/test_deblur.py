@@ -1,0 +1,96 @@
+"""`aolink deblur`: a picture and a PSF as files to a picture as a file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from aolink.errors import RestorationError
+from aolink.pictures import read_picture, read_psf, write_picture
+from aolink.restoration import restore
+from tests.restoration.scenes import UNIFORM, blocks, blurred
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> np.ndarray:
+    image, _ = blurred(blocks(40, 66, seed=2), UNIFORM, (3,))
+    image = image + 0.005 * np.random.default_rng(1).standard_normal(image.shape)
+    counts = np.clip(np.rint(10_000 + 20_000 * image), 0, 65535).astype(np.uint16)
+    Image.fromarray(counts).save(tmp_path / "in.png")
+    (tmp_path / "psf.csv").write_text(",".join(["2"] * 7) + "\n")
+    return counts
+
+
+def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
+    done = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png", "--json")
+    assert done.returncode == 0, done.stderr
+    told, expected = json.loads(done.stdout), restore(picture, UNIFORM)
+    assert told["noise_sd"] == pytest.approx(expected.noise_sd)
+    assert (read_picture(tmp_path / "out.png") == expected.image).all()
+    again = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png")
+    assert again.returncode == 10
+    assert again.stderr == "aolink: out.png exists: give --overwrite to replace it\n"
+
+
+def test_bad_files_are_one_line(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
+    (tmp_path / "bad.csv").write_text("1, two, 3\n")
+    done = aolink("deblur", "--image", "in.png", "--psf", "bad.csv", "-o", "out.png")
+    assert done.returncode == 10
+    assert done.stderr.count("\n") == 1
+    assert "cannot be read as a PSF" in done.stderr
+    assert not (tmp_path / "out.png").exists()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])
+def test_what_is_written_is_read_back(tmp_path: Path, dtype: type, suffix: str) -> None:
+    image = np.random.default_rng(1).integers(0, 250, (9, 11)).astype(dtype)
+    path = tmp_path / f"a{suffix}"
+    if dtype is np.float32 and suffix == ".png":
+        with pytest.raises(RestorationError, match=r"type float32 fits in a \.npy"):
+            write_picture(path, image)
+        return
+    write_picture(path, image)
+    assert read_picture(path).dtype == dtype
+    assert (read_picture(path) == image).all()
+
+
+def test_colours_and_palettes(tmp_path: Path) -> None:
+    colours = np.random.default_rng(1).integers(0, 255, (6, 7, 3), dtype=np.uint8)
+    write_picture(tmp_path / "a.png", colours)
+    assert (read_picture(tmp_path / "a.png") == colours).all()
+    Image.fromarray(colours).convert("P").save(tmp_path / "p.png")
+    assert read_picture(tmp_path / "p.png").shape == (6, 7, 3)
+
+
+def test_psfs_as_text_and_numbers(tmp_path: Path) -> None:
+    for text in ("1,2,3", "1\n2\n3\n", " 1 2  3\n"):
+        (tmp_path / "a.csv").write_text(text)
+        assert read_psf(tmp_path / "a.csv").tolist() == [1, 2, 3]
+    (tmp_path / "a.csv").write_text("0 1\n2 3\n")
+    assert read_psf(tmp_path / "a.csv").tolist() == [[0, 1], [2, 3]]
+    np.save(tmp_path / "a.npy", np.arange(3))
+    assert read_psf(tmp_path / "a.npy").tolist() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.csv", "1 2\n3\n"), ("a.npy", "junk"), ("a.csv", None)])
+def test_what_is_no_psf_file(tmp_path: Path, name: str, content: str | None) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    with pytest.raises(RestorationError, match="cannot be read as a PSF"):
+        read_psf(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.npy"])
+def test_what_is_no_picture_file(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("junk")
+    with pytest.raises(RestorationError, match="cannot be read as a picture"):
+        read_picture(tmp_path / name)

@@ -1,0 +1,152 @@
+"""Gauss-Markov and total variation on the plane, against dense least squares and duality."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from aolink.restoration import Psf, non_local_means
+from aolink.restoration.markov import differences_transposed, line_solver, make_solver, plane_solver, roughness
+from aolink.restoration.tv import WEIGHT, total_variation
+from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, psnr, roughness_matrix
+
+FloatArray = NDArray[np.float64]
+
+SHAPE = (11, 14)
+CORNER = np.array([[0.0, 0.1, 0.2], [0.1, 0.3, 0.0], [0.25, 0.0, 0.05]])
+
+
+def dense(psf: Psf, images: FloatArray, kappa: float, seen: NDArray[np.bool_] | None = None) -> FloatArray:
+    H = blur_matrix(SHAPE, psf.values)
+    taps = np.atleast_2d(psf.values).shape
+    wide = (SHAPE[0] + taps[0] - 1, SHAPE[1] + taps[1] - 1)
+    W = np.ones(H.shape[0]) if seen is None else seen.ravel().astype(float)
+    A = H.T @ (W[:, None] * H) + kappa * roughness_matrix(wide)
+    return np.array([np.linalg.solve(A, H.T @ (W * y.ravel())).reshape(wide) for y in images])
+
+
+@pytest.mark.parametrize("values", [UNIFORM, LOPSIDED, np.ones(1)], ids=len)
+@pytest.mark.parametrize("kappa", [1e-4, 0.3])
+def test_along_lines_it_is_dense_least_squares(values: FloatArray, kappa: float) -> None:
+    psf = Psf(values=values, origin=(0,))
+    images = np.random.default_rng(1).standard_normal((2, *SHAPE))
+    solver = line_solver(psf, SHAPE, kappa)
+    assert abs(solver.solve(solver.project(images)) - dense(psf, images, kappa)).max() < 1e-10
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("line", [False, True])
+def test_on_the_plane_and_masked_it_is_dense_least_squares(line: bool, masked: bool) -> None:
+    rng = np.random.default_rng(2)
+    psf = Psf(values=UNIFORM, origin=(3,)) if line else Psf(values=CORNER, origin=(1, 1))
+    images = rng.standard_normal((2, *SHAPE))
+    seen = rng.random(SHAPE) > 0.15 if masked else None
+    solver = make_solver(psf, SHAPE, 0.01, seen)
+    found = solver.solve(solver.project(images), None, 1e-12)
+    assert abs(found - dense(psf, images, 0.01, seen)).max() < 1e-8
+    expected = (slice(None), slice(3, 17)) if line else (slice(1, 12), slice(1, 15))
+    assert np.empty(found.shape[1:])[solver.frame].shape == np.empty(found.shape[1:])[expected].shape == SHAPE
+
+
+def test_white_pixels_in_the_place_of_white_differences() -> None:
+    images = np.random.default_rng(3).standard_normal((1, *SHAPE))
+    H = blur_matrix(SHAPE, CORNER)
+    expected = np.linalg.solve(H.T @ H + 0.05 * np.eye(H.shape[1]), H.T @ images.ravel())
+    solver = plane_solver(Psf(values=CORNER, origin=(1, 1)), SHAPE, 0.05, white=True)
+    found = solver.solve(solver.project(images), None, 1e-12)
+    assert abs(found.ravel() - expected).max() < 1e-8
+
+
+def test_differences_and_their_transpose() -> None:
+    rng = np.random.default_rng(4)
+    x, along, down = rng.standard_normal((5, 6)), rng.standard_normal((5, 5)), rng.standard_normal((4, 6))
+    one = (np.diff(x, axis=1) * along).sum() + (np.diff(x, axis=0) * down).sum()
+    assert one == pytest.approx((x * differences_transposed(along, down)).sum())
+    assert roughness(x).ravel() == pytest.approx(roughness_matrix((5, 6)) @ x.ravel())
+
+
+def variation(x: FloatArray) -> float:
+    size = np.zeros(x.shape)
+    size[..., :-1] += np.diff(x, axis=-1) ** 2
+    size[..., :-1, :] += np.diff(x, axis=-2) ** 2
+    return float(np.sqrt(size).sum())
+
+
+def test_total_variation_meets_its_dual() -> None:
+    """Without blur the dual problem is plain: a gradient field p, |p| <= w, whose divergence makes the picture."""
+    rng = np.random.default_rng(5)
+    scene = blocks(24, 30)
+    noisy = scene + 0.05 * rng.standard_normal(scene.shape)
+    point, s2, weight = Psf(values=np.ones(1), origin=(0,)), 0.05**2, 40.0
+    x, _ = total_variation(lambda kappa: make_solver(point, scene.shape, kappa), noisy[None], s2, weight, 400)
+    w = WEIGHT * np.sqrt(weight)
+    primal = ((noisy - x[0]) ** 2).sum() / (2 * s2) + w * variation(x[0])
+    # The dual by projected gradients, a different way altogether.
+    along, down = np.zeros((24, 29)), np.zeros((23, 30))
+    for _ in range(3000):
+        residual = noisy - s2 * differences_transposed(along, down)
+        along, down = along + np.diff(residual, axis=1) / (8 * s2), down + np.diff(residual, axis=0) / (8 * s2)
+        size = np.zeros(scene.shape)
+        size[:, :-1] += along**2
+        size[:-1] += down**2
+        factor = np.maximum(np.sqrt(size) / w, 1)
+        along, down = along / factor[:, :-1], down / factor[:-1]
+    flow = differences_transposed(along, down)
+    bound = (noisy * flow).sum() - s2 / 2 * (flow**2).sum()
+    assert bound <= primal <= bound * 1.002
+
+
+@pytest.mark.parametrize("values", [UNIFORM, CORNER], ids=["line", "plane"])
+def test_ten_iterations_are_enough(values: FloatArray) -> None:
+    origin = tuple(n // 2 for n in values.shape)
+    image, inside = blurred(blocks(60, 90), values, origin)
+    image = image + 0.01 * np.random.default_rng(6).standard_normal(image.shape)
+    psf = Psf(values=values, origin=origin)
+    found = []
+    for iterations in (10, 200):
+        x, solver = total_variation(
+            lambda kappa: make_solver(psf, image.shape, kappa), image[None], 1e-4, 60.0, iterations
+        )
+        found.append(x[0][solver.frame])
+    assert abs(psnr(found[0], inside) - psnr(found[1], inside)) < 0.35
+    assert psnr(found[0], inside) > psnr(image, inside) + 4
+
+
+def test_single_precision_is_enough_for_total_variation() -> None:
+    image, _ = blurred(blocks(40, 80), UNIFORM, (3,))
+    psf = Psf(values=UNIFORM, origin=(3,))
+    one, two = (
+        total_variation(lambda kappa, t=t: make_solver(psf, image.shape, kappa, dtype=t), image[None], 1e-4, 60.0)[0]
+        for t in (np.float32, np.float64)
+    )
+    assert one.dtype == np.float32
+    assert abs(one - two).max() < 1e-3
+
+
+def test_one_plane_solver_is_the_other() -> None:
+    images = np.random.default_rng(7).standard_normal((1, *SHAPE))
+    line, plane = Psf(values=LOPSIDED, origin=(1,)), Psf(values=LOPSIDED[None], origin=(0, 1))
+    exact, iterative = line_solver(line, SHAPE, 0.02), plane_solver(plane, SHAPE, 0.02)
+    a, b = exact.solve(exact.project(images)), iterative.solve(iterative.project(images), None, 1e-12)
+    assert abs(a - b).max() < 1e-8
+    assert exact.frame[1] == iterative.frame[1]
+
+
+def test_non_local_means_as_its_definition() -> None:
+    rng = np.random.default_rng(8)
+    image = blocks(20, 22) + 0.05 * rng.standard_normal((20, 22))
+    found = non_local_means(image, 0.05)
+    wide = np.pad(image, 7, mode="reflect")
+    y, x, total, weights = 10, 9, 0.0, 0.0
+    own = wide[y + 5 : y + 10, x + 5 : x + 10]
+    for dy in range(-7, 8):
+        for dx in range(-7, 8):
+            other = wide[y + dy + 5 : y + dy + 10, x + dx + 5 : x + dx + 10]
+            distance = ((own - other) ** 2).mean()
+            weight = np.exp(-max(distance - 2 * 0.05**2, 0) / (0.8 * 0.05) ** 2)
+            total, weights = total + weight * wide[y + dy + 7, x + dx + 7], weights + weight
+    assert found[y, x] == pytest.approx(total / weights, rel=1e-6)
+    scene = blocks(90, 90)
+    noisy = scene + 0.05 * rng.standard_normal(scene.shape)
+    assert psnr(non_local_means(noisy, 0.05), scene) > psnr(noisy, scene) + 4

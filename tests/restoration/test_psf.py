@@ -1,0 +1,140 @@
+"""The PSF of a motion and its uncertainty; what is no PSF."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aolink.errors import RestorationError
+from aolink.optics.kernel import pixel_mass
+from aolink.optics.plane import pixel_mass_2d
+from aolink.restoration import Psf, motion_psf
+from aolink.restoration.psf import along_line, as_psf
+from aolink.sensor import Kernel
+
+KERNEL = Kernel(shape="gaussian", sigma=0.05)
+SCALE = 0.04
+STEPS = np.linspace(0, 1, 60)
+PATH = 0.3 * np.exp(-1.5 * STEPS) * np.sin(3 * math.pi * STEPS) + 0.02
+
+
+def on_grid(psf: Psf, low: int, high: int) -> np.ndarray:
+    """Values of a PSF along the rows at displacements low .. high."""
+    out = np.zeros(high - low + 1)
+    first = -psf.origin[0] - low
+    out[first : first + len(psf.values)] = psf.values
+    return out
+
+
+def test_a_known_path_gives_the_sensors_own_light() -> None:
+    psf = motion_psf(PATH, None, KERNEL, SCALE)
+    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    expected = pixel_mass(KERNEL, edges, PATH).mean(axis=0)
+    assert abs(on_grid(psf, -30, 30) - expected).max() < 1e-5
+    assert psf.values.sum() == pytest.approx(1, abs=1e-12)
+    assert psf.modes.shape == (0, *psf.values.shape)
+
+
+def test_a_path_on_the_plane_gives_the_sensors_own_light() -> None:
+    path = np.stack([PATH, 0.1 * np.cos(4 * STEPS)])
+    psf = motion_psf(path, None, KERNEL, SCALE)
+    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    expected = pixel_mass_2d(np.eye(2) * KERNEL.variance, edges, edges, path.T).mean(axis=0)
+    (row, column), (rows, columns) = psf.origin, psf.values.shape
+    inside = expected[30 - row : 30 - row + rows, 30 - column : 30 - column + columns]
+    assert abs(psf.values - inside).max() < 1e-5
+    assert inside.sum() > 0.9999
+
+
+@pytest.mark.parametrize("plane", [False, True])
+def test_expected_psf_and_its_sd_are_those_of_drawn_paths(plane: bool) -> None:
+    rng = np.random.default_rng(1)
+    path = np.stack([PATH, 0.5 * PATH[::-1]]) if plane else PATH
+    # The range is uncertain, and so is each step a little.
+    flat = path.ravel()
+    covariance = 0.05**2 * np.outer(flat, flat) + 0.004**2 * np.eye(flat.size)
+    psf = motion_psf(path, covariance, KERNEL, SCALE)
+    draws = rng.multivariate_normal(flat, covariance, 1500).reshape(1500, *path.shape)
+    values = []
+    for draw in draws:
+        one = motion_psf(draw, None, KERNEL, SCALE)
+        room = np.zeros(tuple(2 * 25 + 1 for _ in one.origin))
+        room[tuple(slice(25 - o, 25 - o + n) for o, n in zip(one.origin, one.values.shape, strict=True))] = one.values
+        values.append(room[tuple(slice(25 - o, 25 - o + n) for o, n in zip(psf.origin, psf.values.shape, strict=True))])
+    mean, sd = np.mean(values, axis=0), np.std(values, axis=0)
+    error = sd / math.sqrt(len(draws))
+    # On the plane x and y of one step are taken as independent in the mean.
+    assert (abs(psf.values - mean) < 5 * error + (6e-4 if plane else 1e-5)).all()
+    assert abs(psf.sd - sd).max() < 0.25 * sd.max()
+    assert np.linalg.norm(psf.sd - sd) < 0.15 * np.linalg.norm(sd)
+
+
+def test_no_displacement_stays_in_reach_of_a_path_far_away() -> None:
+    psf = motion_psf(np.full(10, 20 * SCALE), None, Kernel(shape="gaussian", sigma=0.001), SCALE)
+    assert psf.origin == (0,)
+    assert np.flatnonzero(psf.values > 0.5).tolist() == [20]
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-math.pi / 2 + 0.01, math.pi / 2 - 0.01), st.floats(6, 25))
+def test_a_straight_line_is_found_at_any_angle(angle: float, length: float) -> None:
+    path = np.linspace(0, length, 150) * np.array([[math.cos(angle)], [math.sin(angle)]])
+    line = along_line(motion_psf(path, None, Kernel(shape="gaussian", sigma=0.3), 1.0))
+    away = (line.angle_rad - angle + math.pi / 2) % math.pi - math.pi / 2
+    assert abs(away) < 0.06
+    assert line.deviation_px < 0.3
+    taps = np.arange(len(line.psf.values)) - line.psf.origin[0]
+    assert abs(abs(taps @ line.psf.values) - length / 2) < 0.1
+
+
+def test_a_bent_path_is_no_line() -> None:
+    turn = np.linspace(0, math.pi, 100)
+    line = along_line(motion_psf(np.stack([8 * np.cos(turn), 8 * np.sin(turn)]), None, KERNEL, 1.0))
+    assert line.deviation_px > 2
+
+
+def test_plain_numbers_are_normalised_and_centred() -> None:
+    psf = as_psf([1.0, 2.0, 1.0, 0.0])
+    assert psf.values.tolist() == [0.25, 0.5, 0.25, 0.0]
+    assert psf.origin == (2,)
+    assert as_psf(np.ones((3, 5))).origin == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ([], "at least one tap"),
+        (np.zeros((2, 2, 2)), "at least one tap"),
+        ([0.5, math.nan, 0.5], "1 of the PSF's 3 values are not finite"),
+        ([0.5, math.inf], "not finite"),
+        ([0.7, -0.2, 0.5], "smallest value is -0.2"),
+        ([0.0, 0.0], "zero everywhere"),
+    ],
+)
+def test_what_is_no_psf(values: list[float], says: str) -> None:
+    with pytest.raises(RestorationError, match=says):
+        as_psf(values)
+
+
+def test_an_origin_outside_the_taps() -> None:
+    with pytest.raises(RestorationError, match="pad the PSF with zeros"):
+        Psf(values=np.ones(3) / 3, origin=(3,))
+
+
+@pytest.mark.parametrize(
+    ("path", "covariance", "scale", "says"),
+    [
+        (np.zeros((3, 10)), None, 1.0, "shape \\(3, 10\\)"),
+        ([], None, 1.0, "expected finite positions"),
+        ([0.0, math.nan], None, 1.0, "expected finite positions"),
+        (np.zeros(10), np.eye(9), 1.0, "10 x 10"),
+        (np.zeros(10), None, 0.0, "above zero"),
+    ],
+)
+def test_what_is_no_path(path: np.ndarray, covariance: np.ndarray | None, scale: float, says: str) -> None:
+    with pytest.raises(RestorationError, match=says):
+        motion_psf(path, covariance, KERNEL, scale)

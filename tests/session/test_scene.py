@@ -1,0 +1,394 @@
+"""A session with two sensors: the picture sensor's frames over the wire, in the recording, restored, and shown."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import aolink
+from aolink.cli import app
+from aolink.demo import simulated_rig
+from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
+from aolink.exposure import Exposure
+from aolink.recording import topics
+from aolink.recording.compare import compare
+from aolink.recording.deblur import blurred_psnr, deblur, motion, psnr, write_deblurred
+from aolink.recording.editing import cut, merge
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
+from aolink.recording.writer import RecordingWriter
+from aolink.restoration import motion_psf, restore
+from aolink.rig import load_rig
+from aolink.scene import framed, read_scene_picture
+from aolink.session import Report, record
+from aolink.viewing import LiveView, save_rrd
+from tests.session.test_session import FAULTY
+from tests.viewing.rrd import read_rrd
+from tests.viewing.test_save import absent_from_views
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+RIG = load_rig("moving-scene")
+assert RIG.scene is not None
+EXPOSURES = 8
+
+
+def take(path: Path, rig: str | Path = "moving-scene", exposures: int = EXPOSURES, **options: object) -> Report:
+    with simulated_rig(rig) as (camera, mirror):
+        return record(load_rig(rig), camera, mirror, path, estimators=["o1"], exposures=exposures, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "session.mcap"
+    report = take(path)
+    assert (report.scenes_received, report.scenes_incomplete, report.scenes_lost) == (EXPOSURES, 0, 0)
+    return path
+
+
+@pytest.fixture(scope="module")
+def sharp(session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sharp") / "sharp.mcap"
+    write_deblurred(Recording(session), path, estimator="moments")
+    return path
+
+
+def without(source: Path, target: Path, *dropped: str) -> Recording:
+    """A copy without some topics and without the true scene."""
+    recording = Recording(source)
+    with RecordingWriter(target, recording.rig, recording.metadata, recording.start_ns, deterministic=True) as writer:
+        for each in recording.messages():
+            if each.topic not in dropped:
+                writer.write(each.topic, each.message, each.log_time_ns)
+    return Recording(target)
+
+
+def data(recording: Recording, *wanted: str) -> list[tuple[str, int, bytes]]:
+    return [(raw.topic, raw.log_time_ns, raw.data) for raw in recording.raw_messages(*wanted)]
+
+
+def test_the_wire_gives_what_the_model_gives_in_memory(session: Path) -> None:
+    exposures, expected = list(Recording(session).exposures()), aolink.simulate("moving-scene", EXPOSURES)
+    for mine, other in zip(exposures, expected, strict=True):
+        assert mine.scene is not None
+        assert other.scene is not None
+        np.testing.assert_array_equal(mine.scene.pixels, other.scene.pixels)
+        assert mine.scene.mask.all()
+        np.testing.assert_array_equal(mine.pixels, other.pixels)
+
+
+def test_the_true_scene_is_in_the_recording_of_a_simulated_rig(session: Path) -> None:
+    true = Recording(session).true_scene
+    assert true is not None
+    expected = RIG.scene.to_counts(framed(RIG.scene, read_scene_picture(RIG.scene, RIG.folder)))  # type: ignore[union-attr,arg-type]
+    np.testing.assert_array_equal(true, expected)
+
+
+def test_the_scene_delays_no_spot(session: Path) -> None:
+    """The estimate of an exposure is made before its scene has come."""
+    order = [each.topic for each in Recording(session).messages("/estimate/o1", topics.SCENE, topics.IMAGE)]
+    assert order == [topics.IMAGE, "/estimate/o1", topics.SCENE] * EXPOSURES
+
+
+def test_who_watches_gets_each_exposure_with_its_scene(tmp_path: Path) -> None:
+    seen: list[Exposure] = []
+    take(tmp_path / "a.mcap", exposures=3, watch=lambda exposure, estimates: seen.append(exposure))
+    recorded = list(Recording(tmp_path / "a.mcap").exposures())
+    assert [e.frame_id for e in seen] == [e.frame_id for e in recorded] == [1, 2, 3]
+    for mine, other in zip(seen, recorded, strict=True):
+        assert mine.scene is not None
+        assert other.scene is not None
+        np.testing.assert_array_equal(mine.scene.pixels, other.scene.pixels)
+
+
+def test_a_bad_link_costs_scenes_their_own_pixels_and_is_reproducible(tmp_path: Path) -> None:
+    rig = tmp_path / "faulty.toml"
+    rig.write_text(RIG.toml + FAULTY)  # its picture comes with aolink
+    reports = [take(tmp_path / name, rig, exposures=12) for name in ("a.mcap", "b.mcap")]
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+    report, exposures = reports[0], list(Recording(tmp_path / "a.mcap").exposures())
+    known = [e for e in exposures if e.scene is not None]
+    assert report.scenes_incomplete > 0
+    assert report.scenes_lost == 12 - report.scenes_received
+    assert len(known) <= report.scenes_received
+    assert sum(not e.scene.mask.all() for e in known) in range(1, report.scenes_incomplete + 1)
+    truth = aolink.simulate(rig, 12)
+    for e in known:
+        mask, expected = e.scene.mask, truth[e.first_step // 200].scene
+        np.testing.assert_array_equal(e.scene.pixels[mask], expected.pixels[mask])
+        assert not e.scene.pixels[~mask].any()
+        assert np.count_nonzero(~mask) % 2048 == 0  # whole chunks
+    # The spots of exposures whose scene was damaged are whole, and the other way round.
+    assert any(e.complete and not e.scene.mask.all() for e in known)
+    summary = write_deblurred(Recording(tmp_path / "a.mcap"), tmp_path / "sharp.mcap", estimator="o1")
+    assert summary.exposures == len(exposures)
+    assert summary.scenes == len(known)
+    missing = sum(count for reason, count in summary.reasons.items() if "the picture never came" in reason)
+    assert missing == len(exposures) - len(known)
+
+
+def test_a_camera_with_another_scene_is_refused(tmp_path: Path) -> None:
+    other = replace(RIG, scene=replace(RIG.scene, shape=(128, 64)))  # type: ignore[type-var]
+    with simulated_rig("moving-scene") as (camera, mirror):
+        scene_less = replace(RIG, scene=None)
+        for rig, found in ((other, r"\(128, 64\) in the file, \(128, 128\)"), (scene_less, r"\(0, 0\) in the")):
+            with pytest.raises(DeviceError, match=r"scene\.pixels \(rows, columns\) is " + found):
+                record(rig, camera, mirror, tmp_path / "a.mcap", exposures=1)
+
+
+def test_older_recordings_have_no_scene() -> None:
+    path = Path(__file__).parents[1] / "data" / "first-version.mcap"
+    recording = Recording(path)
+    assert recording.true_scene is None
+    assert list(recording.restored()) == []
+    assert all(exposure.scene is None for exposure in recording.exposures())
+
+
+def test_cut_and_merged_again_scenes_stay_with_their_exposures(sharp: Path, tmp_path: Path) -> None:
+    whole = list(Recording(sharp).exposures())
+    middle = (Recording(sharp).end_ns - Recording(sharp).start_ns) / 2e9
+    cut(sharp, tmp_path / "a.mcap", 0, middle)
+    cut(sharp, tmp_path / "b.mcap", middle, 1e3)
+    parts = [Recording(tmp_path / name) for name in ("a.mcap", "b.mcap")]
+    assert all(0 < part.counts[topics.SCENE] < EXPOSURES for part in parts)
+    for part in parts:
+        own = list(part.exposures())
+        assert [each.info.frame_id for each in part.restored()] == [e.frame_id for e in own]
+        assert all(each.scene is not None for each in part.restored())
+        assert part.true_scene is not None
+    merge([part.path for part in parts], tmp_path / "c.mcap")
+    merged = list(Recording(tmp_path / "c.mcap").exposures())
+    assert [e.frame_id for e in merged] == [e.frame_id for e in whole]
+    for one, two in zip(merged, whole, strict=True):
+        np.testing.assert_array_equal(one.scene.pixels, two.scene.pixels)
+
+
+def test_compare_names_the_exposure_of_a_scene(session: Path, tmp_path: Path) -> None:
+    one = Recording(session)
+    third = [each.sequence for each in one.messages(topics.SCENE)][2]
+    with RecordingWriter(tmp_path / "b.mcap", one.rig, {}, one.start_ns, deterministic=True) as writer:
+        for each in one.messages():
+            if each.topic == topics.SCENE and each.sequence >= third:
+                each.message.data = bytes(len(each.message.data))  # type: ignore[attr-defined]
+            writer.write(each.topic, each.message, each.log_time_ns)
+    found = compare(one, Recording(tmp_path / "b.mcap"))
+    assert {topic for topic, each in found.items() if not each.same} == {topics.SCENE}
+    differing = found[topics.SCENE].fields["data"]
+    assert (differing.first.frame_id, differing.messages) == (3, EXPOSURES - 2)
+
+
+def test_restored_pictures_come_close_to_the_true_scene(session: Path, sharp: Path) -> None:
+    """With the estimated path they gain most of what the true path would give."""
+    recording, sensor = Recording(sharp), RIG.scene
+    assert sensor is not None
+    true = sensor.to_intensity(recording.true_scene)  # type: ignore[arg-type]
+    gains, possible = [], []
+    for exposure, restored in zip(recording.exposures(), recording.restored(), strict=True):
+        assert restored.scene is not None
+        assert (restored.scene.dtype, restored.scene.min() >= 0, restored.scene.max() <= 1) == (np.float32, True, True)
+        path = exposure.truth.path  # type: ignore[union-attr]
+        shift = np.rint(path.mean(axis=1) / sensor.pixel_scale).astype(np.intp)
+        blurred = blurred_psnr(sensor, exposure, shift, true)
+        best = restore(
+            sensor.to_intensity(exposure.scene.pixels),  # type: ignore[union-attr]
+            motion_psf(path, None, sensor.kernel, sensor.pixel_scale),
+        )
+        gains.append(psnr(restored.scene.astype(float), true) - blurred)
+        possible.append(psnr(best.image, true) - blurred)
+    assert np.mean(possible) > 9
+    assert np.mean(gains) > 0.6 * np.mean(possible)
+
+
+def test_a_restored_spot_is_light_in_one_place(sharp: Path) -> None:
+    """Blurred over a third of the pixels, restored to about slope zero."""
+    recording = Recording(sharp)
+    shares = np.array([each.spots[0] for each in recording.restored() if each.spots is not None])
+    assert len(shares) == EXPOSURES
+    assert np.mean(shares[:, 18:22].sum(axis=1)) > 0.9
+
+
+def test_everything_else_stays_as_it_was(session: Path, sharp: Path) -> None:
+    source, target = Recording(session), Recording(sharp)
+    new = set(target.counts) - set(source.counts)
+    assert new == {"/estimate/moments", topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS}
+    assert data(target, *source.counts) == data(source)
+    assert {k: v for k, v in target.attachments.items() if k in source.attachments} == source.attachments
+    made = reestimate(source, ["moments"])["moments"]
+    assert first_difference(target.estimates("moments"), made) is None
+    for each, estimate in zip(target.restored(), made, strict=True):
+        info = each.info
+        assert (info.frame_id, info.estimator, info.method) == (estimate.frame_id, "moments", "tv")
+        assert 0 < info.scene_noise_sd < 0.05
+        assert info.reason == ""
+
+
+def test_the_truth_is_not_read(session: Path, sharp: Path, tmp_path: Path) -> None:
+    bare = without(session, tmp_path / "bare.mcap", topics.TRUTH)
+    assert bare.true_scene is None
+    summary = write_deblurred(bare, tmp_path / "again.mcap", estimator="moments")
+    assert summary.psnr_restored == []
+    wanted = (topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS)
+    again = data(Recording(tmp_path / "again.mcap"), *wanted)
+    assert again == data(Recording(sharp), *wanted)
+    assert len(again) == 3 * EXPOSURES
+
+
+def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sharp: Path, tmp_path: Path) -> None:
+    again, direct = tmp_path / "again.mcap", tmp_path / "direct.mcap"
+    write_deblurred(Recording(sharp), again, estimator="o1")
+    write_deblurred(Recording(session), direct, estimator="o1", workers=2)
+    wanted = (topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS)
+    one, two = (list(Recording(path).restored()) for path in (again, direct))
+    assert [r.info for r in one] == [r.info for r in two] or all(
+        np.isclose(a.info.scene_noise_sd, b.info.scene_noise_sd, rtol=1e-9) for a, b in zip(one, two, strict=True)
+    )
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(a.scene, b.scene, atol=1e-5)
+    assert Recording(again).counts[wanted[0]] == EXPOSURES
+    write_reestimated(Recording(sharp), ["o3"], tmp_path / "new.mcap")  # restored with what is no longer in it
+    assert not set(wanted) & set(Recording(tmp_path / "new.mcap").counts)
+    assert Recording(tmp_path / "new.mcap").true_scene is not None
+
+
+def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:
+    """Of one output the estimate's own; of a mean of spots what all of its coefficients say together."""
+    estimate = reestimate(Recording(session), ["moments"])["moments"][-1]
+    path, covariance = motion(estimate, np.eye(1))
+    np.testing.assert_array_equal(path, estimate.path)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(covariance)), estimate.path_sd[0], rtol=1e-9)
+    exposures = aolink.simulate("sh-4x4", 2)
+    estimate = aolink.estimate(exposures, "o3")[-1]
+    mix = np.tile(np.eye(2), (1, 16)) / 16
+    path, covariance = motion(estimate, mix)
+    np.testing.assert_allclose(path, estimate.path.reshape(16, 2, -1).mean(axis=0))
+    n_steps, rng = path.shape[1], np.random.default_rng(1)
+    root = [np.linalg.cholesky(each + 1e-15 * np.eye(len(each))) for each in estimate.coefficient_covariance]
+    basis = estimate.model.basis[:, :, : root[0].shape[1]]
+    drawn = []
+    for _ in range(4000):
+        moved = np.stack([basis @ (each @ rng.standard_normal(each.shape[1])) for each in root])
+        drawn.append((mix @ moved.reshape(len(estimate.path), n_steps))[:, [0, n_steps - 1]].ravel())
+    some = [0, n_steps - 1, n_steps, 2 * n_steps - 1]
+    expected = covariance[np.ix_(some, some)]
+    np.testing.assert_allclose(np.cov(np.array(drawn).T), expected, atol=0.1 * expected.max())
+
+
+def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None:
+    recording = Recording(session)
+    exposure = next(recording.exposures())
+    estimate = recording.estimates("o1")[0]
+    dark: Exposure = replace(exposure, mask=np.zeros_like(exposure.mask), scene=None)
+    done = deblur(RIG, dark, estimate)
+    assert done.scene is None
+    assert done.spots is None
+    assert done.info.reason.startswith("scene: the picture never came; spot: the mask has shape")
+    with pytest.raises(EstimatorError, match="nonsense"):
+        write_deblurred(recording, tmp_path / "x.mcap", estimator="nonsense")
+    assert not (tmp_path / "x.mcap").exists()
+    with pytest.raises(RecordingError, match="is the recording itself"):
+        write_deblurred(recording, session, estimator="o1", overwrite=True)
+    broken = tmp_path / "broken.mcap"
+    with RecordingWriter(
+        broken, RIG, {}, recording.start_ns, attachments={topics.TRUE_SCENE_ATTACHMENT: b"nonsense"}
+    ) as writer:
+        for each in recording.messages():
+            writer.write(each.topic, each.message, each.log_time_ns)
+    with pytest.raises(RecordingError, match=r"the attachment true_scene\.npy is not the rig's scene"):
+        _ = Recording(broken).true_scene
+
+
+def test_the_command(aolink: Run, session: Path, tmp_path: Path) -> None:
+    shutil.copy(session, tmp_path / "a.mcap")
+    done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap", "--json")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert (told["exposures"], told["scenes_restored"], told["missing"]) == (EXPOSURES, EXPOSURES, {})
+    assert told["psnr_restored_db"] >= told["psnr_restored_least_db"]
+    again = aolink("deblur", "a.mcap", "-e", "o1", "-o", "b.mcap")
+    assert again.returncode == 5
+    assert "b.mcap exists and is not overwritten" in again.stderr
+
+
+@pytest.mark.parametrize("wrong", [[], ["a.mcap", "--image", "x.png"], ["--image", "x.png"], ["a.mcap", "--psf", "p"]])
+def test_the_command_takes_a_recording_or_a_picture(wrong: list[str]) -> None:
+    refused = CliRunner().invoke(app, ["deblur", *wrong, "-o", "c.mcap"])
+    assert refused.exit_code == 2
+    assert "give a recording, or --image and --psf" in " ".join(refused.stderr.replace("│", " ").split())
+
+
+def test_a_method_that_does_not_exist(session: Path, tmp_path: Path) -> None:
+    refused = CliRunner().invoke(app, ["deblur", str(session), "-o", str(tmp_path / "c.mcap"), "--method", "best"])
+    assert isinstance(refused.exception, RestorationError)
+    assert "method is 'best', expected one of inverse, predictor" in str(refused.exception)
+
+
+def test_the_demo_from_a_rig_file_with_a_picture_and_slopes_beside_it(aolink: Run, tmp_path: Path) -> None:
+    """What a rig file names is relative to it, wherever the demo's folder is."""
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    rows = np.random.default_rng(2).random((300, 300))
+    np.save(folder / "mine.npy", rows)
+    np.save(folder / "slopes.npy", 0.3 * np.sin(np.arange(400) / 30)[:, None])
+    text = RIG.toml.replace("moving-scene.png", "mine.npy").replace("picture_pixels = 4", "picture_pixels = 2")
+    (folder / "my.toml").write_text(text + '\n[disturbance]\nrecorded = "slopes.npy"\n')
+    done = aolink("demo", "--rig", "mine/my.toml", "--exposures", "4", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    (made,) = (tmp_path / "out").glob("demo-*")
+    assert "4 scenes of 4 exposures restored with the path of moments, tv" in done.stdout
+    assert "PSNR of the scene:" in done.stdout
+    assert (made / "rig.toml").read_text() == (folder / "my.toml").read_text()
+    shutil.rmtree(folder)  # the recording needs nothing but itself
+    recording = Recording(made / "deblurred.mcap")
+    assert [e.frame_id for e in recording.exposures()] == [each.info.frame_id for each in recording.restored()]
+    assert {"/scene/image", "/restored/image", "/restored/spot", "/scene/true"} <= set(read_rrd(made / "session.rrd"))
+
+
+def test_rerun_shows_blurred_restored_and_true(sharp: Path, tmp_path: Path) -> None:
+    recording = Recording(sharp)
+    path = save_rrd(recording, tmp_path / "a.rrd")
+    entities = read_rrd(path)
+    assert absent_from_views(path) == []
+    sensor = recording.rig.scene
+    assert sensor is not None
+    for k, (exposure, restored) in enumerate(zip(recording.exposures(), recording.restored(), strict=True)):
+        assert exposure.scene is not None
+        assert restored.scene is not None
+        assert entities["/scene/image"]["frame"][k] == exposure.frame_id
+        seen = np.rint(255 * np.clip(sensor.to_intensity(exposure.scene.pixels), 0, 1)).astype(np.uint8)
+        shown = np.array(entities["/scene/image"]["Image:buffer"][-EXPOSURES:][k][0], dtype=np.uint8)
+        np.testing.assert_array_equal(shown.reshape(128, 128, 3), np.repeat(seen[..., None], 3, axis=2))
+        shown = np.array(entities["/restored/image"]["Image:buffer"][-EXPOSURES:][k][0], dtype=np.uint8)
+        np.testing.assert_array_equal(shown.reshape(128, 128), np.rint(255 * restored.scene).astype(np.uint8))
+    assert len(entities["/restored/spot"]["frame"]) == EXPOSURES
+
+
+def test_a_live_view_shows_the_same(sharp: Path, tmp_path: Path) -> None:
+    import rerun as rr
+
+    from aolink.session.replay import replay
+
+    recording = Recording(sharp)
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "live.rrd")
+    live = LiveView(stream, recording.rig, ["o1", "moments"], recording.true_scene)
+    for exposure, estimates in replay(recording, ["o1", "moments"]):
+        live.show(exposure, estimates)
+    stream.disconnect()
+    ours, theirs = read_rrd(tmp_path / "live.rrd"), read_rrd(save_rrd(recording, tmp_path / "file.rrd"))
+    for entity in ("/scene/image", "/restored/image", "/restored/spot", "/scene/true"):
+        shown = [[buffer for buffer in each[entity]["Image:buffer"] if buffer] for each in (ours, theirs)]
+        assert shown[0] == shown[1], entity
+        assert shown[0]
+
+
+def test_the_true_scene_is_numpy_s_own_format(session: Path) -> None:
+    counts = np.load(io.BytesIO(Recording(session).attachments["true_scene.npy"]), allow_pickle=False)
+    assert (counts.shape, counts.dtype) == ((128, 128), np.uint16)

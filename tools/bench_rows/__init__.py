@@ -1,0 +1,1 @@
+"""Rows of tools/bench that need more than a function each."""

@@ -1,0 +1,164 @@
+"""Figures of the estimators, beside filterpy and plain products."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from aolink.rig import Rig, load_rig, parse_rig
+from bench_rows.row import Row, median_s, timed
+
+
+def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
+    """The same step with filterpy, axis by axis: of a plant without inputs, from moments (axes, 2) and their noise."""
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    A, Q, row, M = model.transition, model.process_noise, model.mean_row, model.quadratic[0]
+    filters = []
+    for value in values:
+        ekf = ExtendedKalmanFilter(dim_x=2, dim_z=2)
+        ekf.x, ekf.P, ekf.F, ekf.Q, ekf.R = np.zeros((2, 1)), model.plant.initial_covariance.copy(), A, Q, R
+        filters.append((ekf, value[:, None]))
+
+    def loop() -> None:
+        for ekf, z in filters:
+            ekf.update(
+                z,
+                lambda x: np.vstack([row, 2 * (M @ x).T]),
+                lambda x: np.vstack([row @ x, x.T @ M @ x]),
+            )
+            ekf.predict()
+
+    return loop
+
+
+def o3_step() -> Row:
+    """One exposure of 1800 axes, given their moments: correction and prediction."""
+    from aolink.estimation.exposure_model import exposure_model
+    from aolink.estimation.filter import BlurFilter
+    from aolink.estimation.moments import Measurement
+    from aolink.estimation.observation import PathMoments
+
+    axes, sample = 1800, 100
+    rig = load_rig("section-vi-lively")
+    plant = replace(rig.plant, axes=axes)
+    model = exposure_model(plant, 200)
+    rng = np.random.default_rng(1)
+    R = np.diag([0.0067, 0.004])
+    measured = Measurement(value=rng.normal(0, 0.1, (axes, 2)), covariance=np.broadcast_to(R, (axes, 2, 2)))
+    response = model.response(np.zeros((200, axes)))
+    ours = BlurFilter(plant, PathMoments(1, (1, 2)))
+    peer = filterpy_loop(model, R, measured.value[:sample])
+
+    def steps() -> None:  # as long as the peer's turn, more or less: both find their own code in the caches
+        for _ in range(100):
+            ours.step(model, response, measured)
+
+    step, loop = median_s(steps, 15, peer)
+    step, loop = step / 100, loop * axes / sample
+    return Row(
+        "o3 step of 1800 axes, given the moments",
+        f"{step * 1e3:.2f} ms",
+        f"filterpy {loop * 1e3:.0f} ms",
+        loop / step,
+        200,
+    )
+
+
+def many_lenslets() -> Rig:
+    """30 x 30 lenslets with windows of 16 x 16 pixels."""
+    text = load_rig("sh-4x4").toml
+    for old, new in (
+        ("axes = 32", "axes = 1800"),
+        ("[4, 4]", "[30, 30]"),
+        ("[24, 24]", "[16, 16]"),
+        ("block_steps", "#"),
+    ):
+        text = text.replace(old, new)
+    return parse_rig(text)
+
+
+def frame_moments_and_o3() -> Row:
+    """Moments and o3 of a frame of 900 spots: against one matrix product for the moments and filterpy's loop."""
+    from aolink.estimation import make_estimator
+    from aolink.estimation.exposure_model import exposure_model
+    from aolink.estimation.spots import windows
+    from aolink.simulation.model import simulate
+
+    rig, sample = many_lenslets(), 100
+    (exposure,) = simulate(rig, 1)
+    model, o3 = exposure_model(rig.plant, 200), make_estimator(rig, "o3")
+    response = model.response(exposure.inputs)
+    found = o3.step(exposure, response)
+    loop = filterpy_loop(model, found.innovation_covariance[0], found.innovation[:sample])
+    centre = np.arange(-15.0, 16, 2)
+    weights = np.stack(
+        [np.tile(centre, 16), np.tile(centre**2, 16), np.repeat(centre, 16), np.repeat(centre**2, 16)], axis=1
+    )
+
+    def product() -> None:
+        windows(rig.sensor, exposure.pixels).reshape(900, 256).astype(np.float64) @ weights
+
+    times = sorted(timed(lambda: o3.step(exposure, response)) for _ in range(300))
+    ours, p99 = times[150], times[297]
+    moments, filtering = median_s(product, 15, loop)
+    theirs = moments + filtering * 1800 / sample
+    return Row(
+        "moments and o3 of 900 spots, 1800 axes",
+        f"{ours * 1e3:.2f} ms, p99 {p99 * 1e3:.2f}",
+        f"1 ms (p99 3); product {moments * 1e3:.2f}, filterpy {theirs * 1e3:.0f}",
+        min(1e-3 / ours, 3e-3 / p99, theirs / ours / 60),
+        1,
+    )
+
+
+def frame_from_last_byte() -> Row:
+    """A frame of 480 x 480 pixels from the bytes of its packets to o3's estimate, p99."""
+    from aolink.assembly import Assembler, FrameReassembly
+    from aolink.estimation import Driver
+    from aolink.simulation.devices import SimulatedDevices
+    from aolink.wire import messages_pb2 as pb
+    from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
+
+    rig = many_lenslets()
+    devices = SimulatedDevices(rig, virtual_time=True, step_zero_ns=0)
+    devices.handle("camera", pb.CameraControl(run=True, exposures=3), 0)
+    devices.advance_to(600)
+    lines: dict[int, list[bytes]] = {}
+    for out in devices.outbox:
+        if isinstance(out.message, pb.FrameChunk):
+            chunks = lines.setdefault(out.message.frame_id, [])
+            chunks.append(encode_message(out.message, len(chunks)))
+    assembler, driver, frames = (
+        Assembler(rig),
+        Driver(rig, ["o3"]),
+        FrameReassembly(rig.sensor.shape, rig.timing.fast_step_ns),
+    )
+    packets, messages, times = PacketDecoder(), MessageDecoder(), []
+    for number in range(100):
+        stream = b"".join(lines[1 + number % 3])
+        inputs = pb.Applied(first_step=200 * number, n_steps=200, u=np.full(360_000, 0.01))
+        assembler.add_applied(inputs)
+
+        def work(stream: bytes = stream, number: int = number) -> None:
+            for k in range(0, len(stream), 65_536):
+                for packet in packets.feed(stream[k : k + 65_536]):
+                    chunk = messages.take(packet)
+                    chunk.frame_id, chunk.first_step, chunk.last_step = number + 1, 200 * number, 200 * number + 199
+                    for frame in frames.add(chunk, 0):
+                        (exposure,) = assembler.add_frame(frame)
+                        driver.step(exposure)
+
+        times.append(timed(work))
+    times.sort()
+    p99 = times[98]
+    return Row(
+        "frame of 900 spots, from its bytes to o3's estimate",
+        f"{times[50] * 1e3:.1f} ms, p99 {p99 * 1e3:.1f}",
+        "p99 15 ms",
+        15e-3 / p99,
+        1,
+    )

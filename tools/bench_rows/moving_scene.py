@@ -1,0 +1,44 @@
+"""The rig moving-scene: its pictures restored with the path that each estimator found, and with the true one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import aolink
+from aolink.estimation import ESTIMATOR_NAMES
+from aolink.recording.deblur import blurred_psnr, psnr, scene_psf
+from aolink.restoration import Psf, motion_psf, restore
+from aolink.scene import framed, read_scene_picture
+from bench_rows.row import Row
+
+EXPOSURES = 100
+# What the estimated path is to give more than the blurred picture has.
+_GOALS = {"moments": 1.5, "profile": 1.5}
+
+
+def moving_scene() -> list[Row]:
+    """Mean PSNR over a session, by tv; the peer is the picture as it came, with its shift forgiven."""
+    exposures = aolink.simulate("moving-scene", EXPOSURES)
+    rig, sensor = exposures.rig, exposures.rig.scene
+    assert sensor is not None
+    scene = framed(sensor, read_scene_picture(sensor, rig.folder))
+    shifts = [np.rint(e.truth.path.mean(axis=1) / sensor.pixel_scale).astype(np.intp) for e in exposures]
+    blurred = np.mean([blurred_psnr(sensor, e, s, scene) for e, s in zip(exposures, shifts, strict=True)])
+
+    def found(psfs: list[Psf]) -> np.ndarray:
+        restored = [
+            restore(sensor.to_intensity(e.scene.pixels), psf, mask=~sensor.is_saturated(e.scene.pixels)).image
+            for e, psf in zip(exposures, psfs, strict=True)
+        ]
+        return np.array([psnr(np.clip(each, 0, 1), scene) for each in restored])
+
+    true = found([motion_psf(e.truth.path, None, sensor.kernel, sensor.pixel_scale) for e in exposures])
+    rows = []
+    for name in ("o1", "o3", "moments", "profile"):
+        if name not in ESTIMATOR_NAMES:
+            continue
+        each = found([scene_psf(rig, estimate) for estimate in aolink.estimate(exposures, name)])
+        rows.append(Row(f"moving-scene, tv, path of {name}: mean (least) PSNR",
+            f"{each.mean():.1f} ({each.min():.1f}) dB", f"blurred {blurred:.1f}; true path {true.mean():.1f}",
+            each.mean() / blurred, _GOALS.get(name, 0)))  # fmt: skip
+    return rows

@@ -1,0 +1,106 @@
+"""Restoration's rows: PSNR and time, beside scikit-image in the same run."""
+
+from __future__ import annotations
+
+import numpy as np
+from skimage import restoration as peer
+
+from aolink.restoration import METHODS, motion_psf, restore
+from aolink.restoration.banded import smooth_lines
+from aolink.restoration.markov import line_solver, make_solver
+from aolink.restoration.tv import total_variation
+from bench_rows import peers
+from bench_rows.pictures import FRESH, KERNEL, NOISE_SD, PICTURES, blurred, cases, paths, psfs, psnr, quality
+from bench_rows.row import Row, median_s
+
+# Mean PSNR that each method is to reach on the seven pictures, dB.
+_GOALS = {"smoother": 28.1, "gauss_markov": 28.8, "tv": 30.2, "pnp": 30.2}
+# Time that each is to take at 512 x 512 on two threads, ms.
+_LIMITS_MS = {"smoother": 15.0, "gauss_markov": 25.0, "tv": 200.0}
+
+
+def restoration_quality() -> list[Row]:
+    """All methods on the seven pictures with noise and weights found by themselves; three fresh pictures."""
+    rows = []
+    blur = quality([(c.image, c.scene) for c in cases(PICTURES)])
+    others = {name: quality([(f(c), c.scene) for c in cases(PICTURES)]) for name, f in peers.PADDED.items()}
+    filled = {name: quality([(f(c), c.scene) for c in cases(PICTURES)]) for name, f in peers.FILLED.items()}
+    for name, found in (others | filled).items():
+        rows.append(Row(f"{name}: mean PSNR", str(found), f"blurred {blur}", found.whole / blur.whole, 0))
+    best_name = max(others, key=lambda name: others[name].whole)
+    best = others[best_name].whole
+    for method in METHODS[1:]:
+        found = quality([(restore(c.image, c.psf, method=method).image, c.scene) for c in cases(PICTURES)])
+        goal = _GOALS.get(method, 0.0)
+        rows.append(Row(f"restore {method}: mean PSNR, 7 pictures x 5 motions", str(found),
+            f"{best_name} {best:.1f}; goal {goal:g}" if goal else f"{best_name} {best:.1f}",
+            found.whole / (goal or best), 1 if goal else 0))  # fmt: skip
+    fresh = {n: quality([(f(c), c.scene) for c in cases(FRESH)]).whole for n, f in peers.PADDED.items()}
+    top = max(fresh, key=lambda name: fresh[name])
+    for method in _GOALS:
+        found = quality([(restore(c.image, c.psf, method=method).image, c.scene) for c in cases(FRESH)])
+        rows.append(Row(f"restore {method}: {', '.join(FRESH)}, not tuned on", str(found), f"{top} {fresh[top]:.2f} dB",
+            found.whole / fresh[top], 1))  # fmt: skip
+    return rows
+
+
+def restoration_uncertainty() -> list[Row]:
+    """The motion's range is off by one standard deviation: told of it, against not told."""
+    rows, path = [], paths()["damped sinusoid"]
+    for share in (0.02, 0.05):
+        told = motion_psf(path, share**2 * np.outer(path, path), KERNEL, 1.0)
+        sure = motion_psf(path, None, KERNEL, 1.0)
+        for noise_sd in (0.002, NOISE_SD):
+            for method in ("smoother", "gauss_markov", "tv"):
+                found = np.empty((0, 3))
+                for sign in (-1, 1):
+                    true = motion_psf((1 + sign * share) * path, None, KERNEL, 1.0)
+                    for name in PICTURES:
+                        case = blurred(name, true, noise_sd=noise_sd)
+                        each = [
+                            psnr(restore(case.image, p, method=method, noise_sd=noise_sd).image, case.scene)
+                            for p in (told, sure, true)
+                        ]
+                        found = np.vstack([found, each])
+                knowing, believing, exact = found.mean(axis=0)
+                rows.append(Row(f"{method}, range off by {share:.0%}, noise {noise_sd:g}: told so", f"{knowing:.2f} dB",
+                    f"not told {believing:.2f}; no error {exact:.2f}", knowing / believing, 1))  # fmt: skip
+    return rows
+
+
+def restoration_time() -> list[Row]:
+    """With weights given; the Gauss-Markov solver of the PSF made before."""
+    case = blurred("camera", psfs()["uniform 15"], 512)
+    image, psf, variance, weight = case.image, case.psf, NOISE_SD**2, 80.0
+    solver = line_solver(psf, (512, 512), weight * variance)
+
+    def gauss_markov() -> None:
+        solver.solve(solver.project(image[None]))
+
+    def tv() -> None:
+        total_variation(
+            lambda kappa: make_solver(psf, (512, 512), kappa, dtype=np.float32), image[None].astype(np.float32),
+            variance, weight,
+        )  # fmt: skip
+
+    ours = {
+        "smoother": lambda: smooth_lines(image, psf.values, 0.9, 0.05, variance),
+        "gauss_markov": gauss_markov,
+        "tv": tv,
+    }
+    positive = np.maximum(image, 1e-6)
+    taps = psf.values[None]
+    theirs = {
+        "Wiener": lambda: peer.wiener(image, taps, 0.1, clip=False),
+        "Richardson-Lucy 25": lambda: peer.richardson_lucy(positive, taps, num_iter=25, clip=False),
+    }
+    rows = []
+    for method, work in ours.items():
+        work()
+        times = {name: median_s(work, 15, other) for name, other in theirs.items()}
+        mine = 1e3 * min(t[0] for t in times.values())
+        beside = ", ".join(f"{name} {1e3 * t[1]:.1f}" for name, t in times.items())
+        limit = _LIMITS_MS[method]
+        rows.append(Row(f"{method} at 512 x 512{', solver made before' if method == 'gauss_markov' else ''}",
+            f"{mine:.1f} ms", f"{limit:g} ms; {beside}", limit / mine, 1))  # fmt: skip
+    return rows
