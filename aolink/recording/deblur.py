@@ -17,12 +17,13 @@ import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from aolink.errors import RecordingError, RestorationError
+from aolink.errors import RestorationError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.optics.camera import is_saturated, to_density
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
+from aolink.recording.mcap_file import replacing
 from aolink.recording.reader import RawMessage, Recording, RestoredPictures
 from aolink.recording.reestimate import recorded_estimates, reestimated
 from aolink.restoration import Method, Psf, Restored, motion_psf, restore
@@ -33,8 +34,8 @@ from aolink.workers import processes
 
 FloatArray = NDArray[np.float64]
 
-_MOST_SPOTS = 64
-"""More of them are not restored: each is a restoration of its own."""
+_MOST_SPOTS = 16
+"""More of them are not restored: each is a restoration of its own, of some tenth of a second."""
 _AHEAD = 4
 """Exposures for each worker that are handed out before the first of them is written."""
 
@@ -69,11 +70,12 @@ def motion(estimate: Estimate, mix: FloatArray) -> tuple[FloatArray, FloatArray]
     covariance = estimate.coefficient_covariance
     axes, count = covariance.shape[:2]
     weights = mix.reshape(len(mix), axes, -1)
-    basis = estimate.model.state_rows if count == estimate.model.plant.n_states else estimate.model.basis
-    total = np.zeros((len(mix) * basis.shape[1],) * 2)
+    outputs, paths = estimate.model.factors
+    total = np.zeros((len(mix) * paths.shape[1],) * 2)
     for axis in range(axes):
         if weights[:, axis].any():
-            rows = np.tensordot(weights[:, axis], basis[:, :, :count], axes=1).reshape(-1, count)
+            mixed = weights[:, axis] if outputs is None else weights[:, axis] @ outputs
+            rows = np.tensordot(mixed, paths[:, :, :count], axes=1).reshape(-1, count)
             total += rows @ covariance[axis] @ rows.T
     return mix @ estimate.path, total
 
@@ -127,10 +129,10 @@ def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: Me
         psf = _psf(estimate, np.eye(1), sensor.kernel, sensor.pixel_width)
         return np.asarray(restore(share, psf, method=method, mask=good).image)
     if sensor.spots > _MOST_SPOTS:
-        raise RestorationError(f"{sensor.spots} spots are not restored, {_MOST_SPOTS} would be")
-    out, (height, width) = np.empty_like(share), sensor.window
-    for spot in range(sensor.spots):
-        row, column = divmod(spot, sensor.grid[1])
+        raise RestorationError(f"{sensor.spots} spots are not restored, at most {_MOST_SPOTS} are")
+    out, (height, width) = np.zeros_like(share), sensor.window
+    for spot, place in enumerate(sensor.lit):
+        row, column = divmod(int(place), sensor.grid[1])
         window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
         psf = _psf(estimate, np.eye(rig.n_outputs)[2 * spot : 2 * spot + 2], sensor.kernel, sensor.pixel_width)
         out[window] = restore(share[window], psf, method=method, mask=good[window]).image
@@ -182,14 +184,27 @@ def write_deblurred(
     """
     made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
     held = next(made, None)  # whether the estimator can work shows before the file is made
-    true_scene = recording.true_scene
     notes = {
         "aolink_version": version("aolink"),
         "deblurred_from": recording.path.name,
         "deblurred_with": f"{estimator} {method}",
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
-    copy = RecordingCopy(recording, path, notes, overwrite=overwrite)
+    with replacing(path, [recording.path], overwrite=overwrite) as partial:
+        return _written(recording, partial, made, held, estimator, notes, progress)
+
+
+def _written(
+    recording: Recording,
+    path: Path,
+    made: Iterator[tuple[Exposure, Estimate, RestoredPictures]],
+    held: tuple[Exposure, Estimate, RestoredPictures] | None,
+    estimator: str,
+    notes: dict[str, str],
+    progress: Callable[[int], None],
+) -> Summary:
+    true_scene = recording.true_scene
+    copy = RecordingCopy(recording, path, recording.metadata | notes)
     summary, log_times = Summary(), dict[int, int]()
 
     def add(topic: str, message: Message, log_time_ns: int) -> None:
@@ -220,9 +235,6 @@ def write_deblurred(
             emit(*held)
             held = next(made, None)
         copy.finish(recording.losses)
-    except OSError as error:
-        copy.give_up()
-        raise RecordingError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
     except BaseException:
         copy.give_up()
         raise
