@@ -264,7 +264,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
     if name in _OF_PIXELS and isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None:
         raise EstimatorError(
-            f"{name} takes each spot to have the whole light, but lenslets of {rig.name} are partly lit: use moments or o3"
+            f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets: use moments or o3"
         )
     if chosen.engine == "filterpy" and (name not in _PAPER_ORDERS or rig.plant.axes != 1):
         raise EstimatorError(
