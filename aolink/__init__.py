@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
 
 __version__ = version("aolink")
-__all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate"]
+__all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate", "smooth"]
 
 
 def read(path: str | Path) -> Recording:
@@ -85,3 +85,27 @@ def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> l
     series = exposures if isinstance(exposures, Exposures) else exposures.exposures()
     driver = Driver(exposures.rig, [estimator])
     return [result for exposure in series for result in driver.step(exposure)]
+
+
+def smooth(exposures: Exposures | Recording | str | Path, estimates: list[Estimate]) -> list[Estimate]:
+    """Estimates of `estimate` corrected by all that came later: offline, with the same fields.
+
+    Parameters
+    ----------
+    exposures:
+        What `estimate` was given.
+    estimates:
+        What it gave.
+
+    Raises
+    ------
+    EstimatorError
+        The estimates are not those of the exposures.
+    """
+    from aolink.estimation import smooth as smooth_estimates
+    from aolink.exposure import Exposures
+
+    if isinstance(exposures, str | Path):
+        exposures = read(exposures)
+    series = exposures if isinstance(exposures, Exposures) else list(exposures.exposures())
+    return smooth_estimates(exposures.rig.plant, series, estimates)

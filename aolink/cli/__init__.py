@@ -36,4 +36,5 @@ def main() -> None:
         stderr.print(f"aolink: {escape(str(error))}")
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
+        stderr.print("aolink: interrupted")
         sys.exit(130)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -21,7 +22,7 @@ from aolink.cli.common import (
     stderr,
     stdout,
 )
-from aolink.errors import AolinkError
+from aolink.errors import AolinkError, RecordingError
 from aolink.terminal import StopRequest, progress_bar
 
 if TYPE_CHECKING:
@@ -65,12 +66,12 @@ def info(
 def estimate(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="One recording or many.")],
     estimator: EstimatorOption = None,
-    output: Annotated[
-        Path | None,
+    target: Annotated[
+        str | None,
         typer.Option(
             "--output",
             "-o",
-            metavar="FILE|DIR",
+            metavar="FILE|DIR/",
             help="A copy with the new estimates; of many files or models, a folder for the copies and their table.",
         ),
     ] = None,
@@ -94,7 +95,8 @@ def estimate(
     With many files or models, what was done before and has not changed is not done again, and a file that
     fails does not stop the others (exit code 1 then).
     """
-    if len(files) == 1 and not rig and not settings and not (output and output.is_dir()):
+    output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
+    if len(files) == 1 and not rig and not settings and not is_folder:
         _estimate_one(files[0], estimator, output, engine, overwrite=overwrite, as_json=as_json)
         return
     from aolink import batch, tables
@@ -176,8 +178,10 @@ def _estimate_one(
         print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
         return
     stdout.print(tables.scores(scores))
+    begun_late = "cut" in recording.metadata or recording.metadata.get("part", "1") != "1"
+    why = " (the recording begins in the middle of its session, where the estimators begin anew)" if begun_late else ""
     for name, difference in differences.items():
-        stdout.print(f"{name}: {difference or 'the same as recorded, bit for bit'}")
+        stdout.print(f"{name}: {difference + why if difference else 'the same as recorded, bit for bit'}", markup=False)
     if output is not None:
         stdout.print(f"written: {output}", markup=False)
 
@@ -208,12 +212,16 @@ def compare(
 
     from aolink import tables
     from aolink.recording.compare import compare as compare_recordings
-    from aolink.recording.editing import replace_file
-    from aolink.recording.reader import Recording
+    from aolink.recording.mcap_file import replacing
     from aolink.recording.reestimate import write_reestimated
 
     one = open_recording(first)
-    with TemporaryDirectory(prefix="aolink-", dir=first.parent if accept else None) as folder:
+    if accept and (topic or one.foreign):
+        what = f"messages on {', '.join(one.foreign)} that aolink does not know" if one.foreign else "other topics"
+        raise typer.BadParameter(f"--accept would replace the whole of {first}, {what} too: it cannot be used here")
+    if second is None and not one.estimators:
+        raise RecordingError(f"{first} holds no estimates to make again: give a second recording")
+    with TemporaryDirectory(prefix="aolink-") as folder:
         if second is None:
             second = Path(folder) / first.name
             with progress_bar(stderr, one.counts.get("/camera/image", 0)) as tell:
@@ -232,11 +240,14 @@ def compare(
             stdout.print(tables.comparison(found))
             if not same_rig:
                 stdout.print("the rig files differ")
-        damaged = [f"{each.path}: {each.damage}" for each in (Recording(first), two) if each.damage]
-        for text in damaged:
+        damage = [f"{each.path}: {each.damage}" for each in (one, two) if each.damage]
+        for text in damage:
             stderr.print(f"aolink: warning: {text}", markup=False)
         if accept and not same:
-            replace_file(first, second)
+            if damage:
+                raise RecordingError(f"{damage[0]}: a damaged recording is not accepted; `aolink recover` it first")
+            with replacing(first, [second], overwrite=True) as partial:
+                shutil.copyfile(second, partial)
             stdout.print(f"accepted: {first} is replaced", markup=False)
             return
     if not as_json:

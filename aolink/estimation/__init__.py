@@ -8,6 +8,7 @@ from aolink.estimation.moments import Measurement, measure_moments
 from aolink.estimation.moments2d import measure_moments_2d
 from aolink.estimation.observation import PathMoments
 from aolink.estimation.score import Consistency, Score, Scorer, score
+from aolink.estimation.smoother import smooth
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 
@@ -37,4 +38,5 @@ __all__ = [
     "path_from_coefficients",
     "run",
     "score",
+    "smooth",
 ]

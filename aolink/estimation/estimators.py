@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -15,6 +15,8 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.exposure_model import InputResponse, exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
 from aolink.estimation.filterpy_engine import FilterpyMoments
+from aolink.estimation.hypothesis_filter import HypothesisFilter, Updates
+from aolink.estimation.mixture import MixtureUpdates
 from aolink.estimation.moments import (
     Flux,
     Measurement,
@@ -23,6 +25,8 @@ from aolink.estimation.moments import (
     spot_significance,
 )
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
+from aolink.estimation.profile import ProfileUpdates
+from aolink.estimation.sampled import SampledUpdates
 from aolink.estimation.spots import measure_spots
 from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
@@ -34,7 +38,12 @@ FloatArray = NDArray[np.float64]
 Engine = Literal["aolink", "filterpy"]
 
 _PAPER_ORDERS: dict[str, tuple[int, ...]] = {"o1": (1,), "o2": (2,), "o3": (1, 2)}
-ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments")
+_OF_PIXELS: dict[str, Callable[[Options], Updates]] = {
+    "profile": lambda options: ProfileUpdates(),
+    "mixture": lambda options: MixtureUpdates(),
+    "sampled": lambda options: SampledUpdates(options.particles, options.seed),
+}
+ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments", *_OF_PIXELS)
 """The names that `make_estimator` knows."""
 
 _HIGHEST_ORDER = 8
@@ -68,6 +77,10 @@ class Options:
     """Of `moments`: which functions of the basis; 0 is the light in the window."""
     basis: Basis = "monomial"
     """Of `moments`: "monomial", "legendre" or "fourier"."""
+    particles: int = 3000
+    """Of `sampled`."""
+    seed: int = 0
+    """Of `sampled`: the same one gives the same estimates, bit for bit."""
 
 
 class Estimator:
@@ -83,10 +96,14 @@ class Estimator:
         if options.gain == "steady-state" and name == "o1" and _steady_gain(rig, options) is None:
             self.options = options = replace(options, gain="time-varying")
         self._observation = _observation(rig, name, options)
-        predict = self._observation.predict if isinstance(self._observation, FilterpyMoments) else None
-        self._filter = BlurFilter(
-            rig.plant, self._observation, process_noise=options.process_noise, gate=options.gate, predict=predict
-        )
+        self._filter: BlurFilter | HypothesisFilter
+        if name in _OF_PIXELS:
+            self._filter = HypothesisFilter(rig.plant, rig.sensor, _OF_PIXELS[name](options), gate=options.gate)
+        else:
+            predict = self._observation.predict if isinstance(self._observation, FilterpyMoments) else None
+            self._filter = BlurFilter(
+                rig.plant, self._observation, process_noise=options.process_noise, gate=options.gate, predict=predict
+            )
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
 
@@ -101,7 +118,11 @@ class Estimator:
         reasons = self._bridge(exposure)
         response = response or model.response(exposure.inputs)
         taken, remark = measured or self.measure_all([exposure])[0]
-        posterior = self._filter.step(model, response, taken)
+        if isinstance(self._filter, HypothesisFilter):
+            assert not isinstance(taken, Measurement)
+            posterior = self._filter.step(model, response, taken)
+        else:
+            posterior = self._filter.step(model, response, taken)
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
         return Estimate(
@@ -352,4 +373,7 @@ def _told(posterior: Posterior) -> list[str]:
         if counts[status]:
             nis = f"NIS {posterior.nis[posterior.status == status].max():.3g}"
             told.append(f"{nis}, {text}" if axes == 1 else f"{counts[status]} of {axes} axes: {nis}, {text}")
+    if posterior.several is not None and posterior.several.any():
+        of = "" if axes == 1 else f"{int(posterior.several.sum())} of {axes} axes: "
+        told.append(f"{of}the blur has more than one reading")
     return told

@@ -45,6 +45,8 @@ class Posterior:
     """(axes, n_measurements, n_measurements), or of many measurements its diagonal, (axes, n_measurements)."""
     nis: FloatArray
     """(axes,)"""
+    several: NDArray[np.bool_] | None = None
+    """Whether the blur was seen to have more than one reading, (axes,); None where nobody looked for it."""
 
     @property
     def start(self) -> Belief:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 _WRITTEN_OUT = 4
+_SMALL_PRODUCT = 100_000
 
 
 def tile(matrix: FloatArray, axes: int) -> FloatArray:
@@ -100,3 +101,18 @@ def inverse(a: FloatArray) -> FloatArray:
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
     """A P A', (..., n, n)."""
     return matmul(matmul(a, p), transpose(a))
+
+
+def long_matmul(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(..., n, k) @ (k, m) or (..., k, m) for long n, in pieces so small that no library shares them among threads."""
+    n, k, m = a.shape[-2], a.shape[-1], b.shape[-1]
+    rows = max(1, _SMALL_PRODUCT // (k * m))
+    if n <= rows:
+        return matmul(a, b)
+    whole = n // rows * rows
+    b = np.ascontiguousarray(b)
+    pieces = np.ascontiguousarray(a[..., :whole, :]).reshape(*a.shape[:-2], -1, rows, k)
+    out = np.matmul(pieces, b[..., None, :, :]).reshape(*a.shape[:-2], whole, m)
+    if whole == n:
+        return np.asarray(out)
+    return np.concatenate([out, np.matmul(np.ascontiguousarray(a[..., whole:, :]), b)], axis=-2)

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
+from scipy import fft
 from scipy.special import sici
 
 from aolink.errors import FrameError
@@ -114,35 +114,68 @@ def _sinc2_below(x: FloatArray) -> FloatArray:
 
 
 def _image_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
+    """Some spots at a time, of which the paths are about as long."""
+    light = np.empty((len(path_px), side, side))
+    order = np.argsort(np.ptp(path_px, axis=2).max(axis=1))
+    for k in range(0, len(order), _AT_ONCE):
+        some = order[k : k + _AT_ONCE]
+        light[some] = _image_of_some(psi, side, path_px[some])
+    return light
+
+
+def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     """The image, and the path's own picture on the fine grid, convolved by their spectra.
 
-    A step's place between fine points goes to the four of them by its distances, so that its mean is exact.
+    A step's place between fine points goes to the four of them by its distances, so that its mean is exact. Spots
+    have squares just large enough for their paths; the squares' spectra, folded, are those of sums over pixels.
     """
     assert psi.image is not None
-    fine, n = psi.finer, side * psi.finer
+    fine, reach = psi.finer, max(psi.image.shape) // 2 + 1
     spots, _, steps = path_px.shape
     place = (path_px + 0.5) * fine - 0.5
-    margin = max(psi.image.shape) // 2 + 1
-    size = next_fast_len(n + 2 * margin, real=True)
-    low = np.floor(place).astype(np.int64)
+    low = np.floor(place)
     part = place - low
-    first = np.broadcast_to(np.arange(spots)[:, None] * size**2, (spots, steps))
-    pixels, weights = [], []
-    for dy in (0, 1):
-        for dx in (0, 1):
-            x, y = low[:, 0] + dx + margin, low[:, 1] + dy + margin
-            weight = np.where(dx, part[:, 0], 1 - part[:, 0]) * np.where(dy, part[:, 1], 1 - part[:, 1]) / steps
-            seen = (x >= 0) & (x < size) & (y >= 0) & (y < size)  # beyond, no light reaches the window
-            pixels.append((first + y * size + x)[seen])
-            weights.append(weight[seen])
-    trace = np.bincount(np.concatenate(pixels), np.concatenate(weights), spots * size**2)
+    # Beyond, no light reaches the window.
+    near = ((low >= -reach - 1) & (low <= side * fine + reach)).all(axis=1)
+    # Of the square, in pixels: its corner and its side.
+    some = near.any(axis=1)[:, None, None]
+    least = np.where(some, np.where(near[:, None], low, np.inf).min(axis=2, keepdims=True), 0.0)
+    most = np.where(some, np.where(near[:, None], low, -np.inf).max(axis=2, keepdims=True), 0.0)
+    corner = np.floor((least - reach) / fine)
+    pixels = fft.next_fast_len(int(((most + 2 + reach) // fine + 1 - corner).max()), real=True)
+    size = pixels * fine
+    x, y = (np.where(near[:, None], low - corner * fine, 0.0)).astype(np.int64).swapaxes(0, 1)
+    first = (np.arange(spots)[:, None] * size + y) * size + x
+    (right, down), steady = part.swapaxes(0, 1), near / steps
+    upper, lower = (1 - down) * steady, down * steady
+    places = np.stack([first, first + 1, first + size, first + size + 1])
+    weights = np.stack([upper * (1 - right), upper * right, lower * (1 - right), lower * right])
+    trace = np.bincount(places.ravel(), weights.ravel(), spots * size**2).reshape(spots, size, size)
+    spectrum = fft.rfft2(trace)
+    spectrum *= _image_spectrum(psi.image, fine, size)
+    # Of every fine-th row the spectrum is that of all of them, those so far apart that they look alike added up.
+    folded = spectrum.reshape(spots, fine, pixels, -1).sum(axis=1) / fine
+    light = fft.irfft2(folded, (pixels, size)).reshape(spots, pixels, pixels, fine).sum(axis=3)
+    return _cut(light, corner[..., 0].astype(np.int64), side)
+
+
+def _image_spectrum(image: FloatArray, fine: int, size: int) -> NDArray[np.complex128]:
+    """Of the image, with each row the sum over a pixel's rows from it on."""
+    rows, columns = image.shape
     kernel = np.zeros((size, size))
-    rows, columns = psi.image.shape
-    kernel[:rows, :columns] = psi.image / psi.image.sum()
+    kernel[:rows, :columns] = image / image.sum()
     kernel = np.roll(kernel, (-(rows // 2), -(columns // 2)), (0, 1))
-    spectrum = np.fft.rfft2(trace.reshape(spots, size, size)) * np.fft.rfft2(kernel)
-    whole = np.fft.irfft2(spectrum, (size, size))[:, margin : margin + n, margin : margin + n]
-    return np.asarray(whole.reshape(spots, side, fine, side, fine).sum(axis=(2, 4)))
+    over_pixel = np.sum([np.roll(kernel, -k, axis=0) for k in range(fine)], axis=0)
+    return np.asarray(fft.rfft2(over_pixel))
+
+
+def _cut(light: FloatArray, corner: NDArray[np.int64], side: int) -> FloatArray:
+    """Windows from squares (spots, pixels, pixels) whose corners (spots, 2), x and y, lie there in the windows."""
+    pixels = light.shape[1]
+    at = np.arange(side) - corner[..., None]
+    inside, at = (at >= 0) & (at < pixels), np.clip(at, 0, pixels - 1)
+    window = light[np.arange(len(light))[:, None, None], at[:, 1, :, None], at[:, 0, None, :]]
+    return np.asarray(np.where(inside[:, 1, :, None] & inside[:, 0, None, :], window, 0.0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

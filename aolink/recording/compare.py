@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.wrappers_pb2 import BytesValue
 
+from aolink.errors import RecordingError
 from aolink.recording import schemas_pb2, topics
-from aolink.recording.reader import RecordedMessage, Recording
+from aolink.recording.reader import Recording
 from aolink.wire import messages_pb2 as wire
 
 RELATIVE = 1e-9
@@ -79,12 +81,18 @@ def compare(
     ----------
     only:
         Topics to look at; all if none is given. One that ends with "/" means all that begin with it.
+
+    Raises
+    ------
+    RecordingError
+        Neither recording has any of the topics.
     """
     result: dict[str, TopicComparison] = {}
     waiting: dict[tuple[str, object], tuple[bool, Message, int | None]] = {}
     names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, only)}
     if not names:
-        return {}
+        asked = f" of {', '.join(only)}" if only else ""
+        raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")
     for number, (is_first, key, message, frame_id) in enumerate(_alternating(first, second, sorted(names)), 1):
         topic = key[0]
         found = result.setdefault(topic, TopicComparison())
@@ -118,7 +126,7 @@ def _alternating(
     first: Recording, second: Recording, names: Sequence[str]
 ) -> Iterator[tuple[bool, tuple[str, object], Message, int | None]]:
     """The messages of both, a little of each in turn, so that only what has no partner yet is kept."""
-    sides = [(True, _named(first.messages(*names))), (False, _named(second.messages(*names)))]
+    sides = [(True, _named(_messages(first, names))), (False, _named(_messages(second, names)))]
     while sides:
         for side in list(sides):
             is_first, messages = side
@@ -130,25 +138,35 @@ def _alternating(
                 yield is_first, *named
 
 
-def _named(messages: Iterator[RecordedMessage]) -> Iterator[tuple[tuple[str, object], Message, int | None]]:
+def _messages(recording: Recording, names: Sequence[str]) -> Iterator[tuple[str, Message]]:
+    """Topics and messages; those of kinds that aolink does not know as their bytes."""
+    for raw in recording.raw_messages(*names):
+        kind = topics.SCHEMAS.get(raw.schema)
+        try:
+            yield raw.topic, kind.FromString(raw.data) if kind else BytesValue(value=raw.data)
+        except DecodeError:
+            raise RecordingError(f"{recording.path}: a message on {raw.topic} is damaged") from None
+
+
+def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[tuple[str, object], Message, int | None]]:
     """Each message with a name that its counterpart has too, and the exposure that it belongs to."""
     places: dict[tuple[str, object], int] = {}
     exposures: dict[str, int] = {}
-    for recorded in messages:
-        message, frame_id = recorded.message, None
+    for topic, message in messages:
+        frame_id = None
         name: object = ""
         if isinstance(message, schemas_pb2.ExposureInfo | schemas_pb2.Restoration):
-            exposures |= dict.fromkeys(topics.PICTURES.get(recorded.topic, ()), message.frame_id)
-        if recorded.topic in exposures:
-            frame_id = name = exposures[recorded.topic]
+            exposures |= dict.fromkeys(topics.PICTURES.get(topic, ()), message.frame_id)
+        if topic in exposures:
+            frame_id = name = exposures[topic]
         elif isinstance(value := getattr(message, "frame_id", None), int):
             frame_id = name = value
         elif isinstance(message, wire.CommandBlock | wire.Applied):
             name = f"block {message.block_id} at fast step {message.first_step}"
-        place = places[recorded.topic, name] = places.get((recorded.topic, name), 0) + 1
+        place = places[topic, name] = places.get((topic, name), 0) + 1
         if place > 1 or name == "":
             name = f"{name or 'message'}, number {place}"
-        yield (recorded.topic, name), message, frame_id
+        yield (topic, name), message, frame_id
 
 
 def _compare_messages(

@@ -17,12 +17,13 @@ import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from aolink.errors import RecordingError, RestorationError
+from aolink.errors import RestorationError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.optics.camera import is_saturated, to_density
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
+from aolink.recording.mcap_file import replacing
 from aolink.recording.reader import RawMessage, Recording, RestoredPictures
 from aolink.recording.reestimate import recorded_estimates, reestimated
 from aolink.restoration import Method, Psf, Restored, motion_psf, restore
@@ -182,14 +183,27 @@ def write_deblurred(
     """
     made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
     held = next(made, None)  # whether the estimator can work shows before the file is made
-    true_scene = recording.true_scene
     notes = {
         "aolink_version": version("aolink"),
         "deblurred_from": recording.path.name,
         "deblurred_with": f"{estimator} {method}",
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
-    copy = RecordingCopy(recording, path, notes, overwrite=overwrite)
+    with replacing(path, [recording.path], overwrite=overwrite) as partial:
+        return _written(recording, partial, made, held, estimator, notes, progress)
+
+
+def _written(
+    recording: Recording,
+    path: Path,
+    made: Iterator[tuple[Exposure, Estimate, RestoredPictures]],
+    held: tuple[Exposure, Estimate, RestoredPictures] | None,
+    estimator: str,
+    notes: dict[str, str],
+    progress: Callable[[int], None],
+) -> Summary:
+    true_scene = recording.true_scene
+    copy = RecordingCopy(recording, path, recording.metadata | notes)
     summary, log_times = Summary(), dict[int, int]()
 
     def add(topic: str, message: Message, log_time_ns: int) -> None:
@@ -220,9 +234,6 @@ def write_deblurred(
             emit(*held)
             held = next(made, None)
         copy.finish(recording.losses)
-    except OSError as error:
-        copy.give_up()
-        raise RecordingError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
     except BaseException:
         copy.give_up()
         raise

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import heapq
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from google.protobuf.message import Message
+from google.protobuf.message import DecodeError, Message
 from mcap.records import Schema
 
 from aolink.errors import RecordingError
 from aolink.recording import topics
 from aolink.recording.lead import Lead
-from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.mcap_file import McapFile, WriteOptions, replacing, schema_of
 from aolink.recording.reader import RawMessage, Recording
 from aolink.recording.scan import Loss
 from aolink.recording.writer import begin_recording
@@ -37,16 +36,19 @@ class Edited:
 
 
 class RecordingCopy:
-    """A recording that is written message by message, with what the first source has besides its messages."""
+    """A recording that is written message by message, with what the first source has besides its messages.
 
-    def __init__(self, source: Recording, target: Path, notes: dict[str, str], *, overwrite: bool) -> None:
-        for same in (source.path, source.path.resolve()):
-            if target.resolve() == same:
-                raise RecordingError(f"{target} is the recording itself: give another name for the new one")
-        self.result = Edited(target)
+    Parameters
+    ----------
+    notes:
+        Facts about the session in the place of those that the source has.
+    """
+
+    def __init__(self, source: Recording, path: Path, notes: dict[str, str]) -> None:
+        self.result = Edited(path)
         self._schemas = source.schemas
-        self._file = McapFile(target, WriteOptions(), overwrite=overwrite)
-        begin_recording(self._file, source.rig, source.metadata | notes, source.start_ns, source.attachments)
+        self._file = McapFile(path, WriteOptions(), overwrite=True)
+        begin_recording(self._file, source.rig, notes, source.start_ns, source.attachments)
 
     def add(self, message: RawMessage) -> None:
         known = topics.SCHEMAS.get(message.schema)
@@ -58,14 +60,17 @@ class RecordingCopy:
         self.result.exposures += message.topic == topics.EXPOSURE
         self._file.add(message.topic, schema, message.data, message.log_time_ns, self.result.messages)
 
-    def finish(self, losses: list[Loss]) -> Edited:
+    def finish(self, losses: list[Loss], end: dict[str, str] | None = None) -> Edited:
+        """Write the index, and ``end`` as facts from the session's end."""
         self.result.losses = losses
-        if losses:
-            self._file.add_metadata(topics.END_METADATA, {"damage": "; ".join(loss.what for loss in losses[:20])})
+        damage = {"damage": "; ".join(loss.what for loss in losses[:20])} if losses else {}
+        if end or damage:
+            self._file.add_metadata(topics.END_METADATA, (end or {}) | damage)
         self._file.finish(sync=True)
         return self.result
 
     def give_up(self) -> None:
+        """Close the file as it is."""
         self._file.cut_back()
 
 
@@ -81,7 +86,13 @@ def recover(
         cannot be written.
     """
     recording = Recording(source, check=True)
-    return _copied(recording, target, recording.raw_messages(), {"recovered_from": source.name}, overwrite, progress)
+    if not recording.counts:
+        raise RecordingError(f"{source} holds no whole message: there is nothing to recover")
+    notes = recording.metadata | {"recovered_from": source.name}
+    with replacing(target, [source], overwrite=overwrite) as partial:
+        result = _copied(recording, partial, recording.raw_messages(), notes, None, progress)
+    result.path = target
+    return result
 
 
 def cut(
@@ -102,18 +113,19 @@ def cut(
     RecordingError
         As `recover`; or there is no exposure between the two times.
     """
-    if not start_s < end_s:
+    if not -1e9 < start_s < end_s:
         raise RecordingError(f"nothing is between {start_s:g} s and {end_s:g} s: the end must be after the start")
     recording = Recording(source)
-    low, high = (recording.start_ns + round(t * 1e9) for t in (start_s, min(end_s, 1e9)))
-    notes = {"cut_from": source.name, "cut": f"{start_s:g} s to {end_s:g} s"}
-    result = _copied(recording, target, _between(recording, low, high), notes, overwrite, progress)
-    if not result.exposures:
-        target.unlink()
-        duration_s = (recording.end_ns - recording.start_ns) / 1e9
-        raise RecordingError(
-            f"{source} has no exposure between {start_s:g} s and {end_s:g} s: it is {duration_s:.3g} s long"
-        )
+    low, high = (recording.start_ns + round(t * 1e9) for t in (min(start_s, 1e9), min(end_s, 1e9)))
+    notes = _begun(recording) | {"cut_from": source.name, "cut": f"{start_s:g} s to {end_s:g} s"}
+    with replacing(target, [source], overwrite=overwrite) as partial:
+        result = _copied(recording, partial, _between(recording, low, high), notes, None, progress)
+        if not result.exposures:
+            duration_s = (recording.end_ns - recording.start_ns) / 1e9
+            raise RecordingError(
+                f"{source} has no exposure between {start_s:g} s and {end_s:g} s: it is {duration_s:.3g} s long"
+            )
+    result.path = target
     return result
 
 
@@ -140,10 +152,18 @@ def merge(
             raise RecordingError(
                 f"{other.path} is not of the same session as {first.path}: only parts of one session can be merged"
             )
-    notes = {"merged_from": " ".join(each.path.name for each in recordings)}
-    result = _copied(first, target, _joined(recordings), notes, overwrite, progress)
+    notes = _begun(first) | {"merged_from": " ".join(each.path.name for each in recordings)}
+    with replacing(target, sources, overwrite=overwrite) as partial:
+        result = _copied(first, partial, _joined(recordings), notes, recordings[-1].end_metadata, progress)
     result.losses = [loss for each in recordings for loss in each.losses]
+    result.path = target
     return result
+
+
+def _begun(recording: Recording) -> dict[str, str]:
+    """What was known of the session at its start, without which part of it this is."""
+    later = recording.end_metadata.keys() | {"part"}
+    return {name: value for name, value in recording.metadata.items() if name not in later}
 
 
 def _identity(recording: Recording) -> tuple[str, str]:
@@ -152,21 +172,18 @@ def _identity(recording: Recording) -> tuple[str, str]:
 
 def _copied(
     recording: Recording,
-    target: Path,
+    path: Path,
     messages: Iterator[RawMessage],
     notes: dict[str, str],
-    overwrite: bool,
+    end: dict[str, str] | None,
     progress: Callable[[int], None],
 ) -> Edited:
-    copy = RecordingCopy(recording, target, notes, overwrite=overwrite)
+    copy = RecordingCopy(recording, path, notes)
     try:
         for message in messages:
             copy.add(message)
             progress(copy.result.exposures)
-        return copy.finish(recording.losses)
-    except OSError as error:
-        copy.give_up()
-        raise RecordingError(f"cannot write {target}: {(error.strerror or str(error)).lower()}") from None
+        return copy.finish(recording.losses, end)
     except BaseException:
         copy.give_up()
         raise
@@ -174,7 +191,10 @@ def _copied(
 
 def _decoded(message: RawMessage) -> Message | None:
     kind = topics.SCHEMAS.get(message.schema)
-    return kind.FromString(message.data) if kind else None
+    try:
+        return kind.FromString(message.data) if kind else None
+    except DecodeError:
+        raise RecordingError(f"a message on {message.topic} is damaged: `aolink recover` leaves it out") from None
 
 
 def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
@@ -243,20 +263,3 @@ def _timed(recording: Recording) -> Iterator[tuple[int, RawMessage]]:
     for raw in recording.raw_messages():
         latest = max(latest, raw.log_time_ns)
         yield latest, raw
-
-
-def replace_file(target: Path, source: Path) -> None:
-    """Put a file in the place of another, in one step: a reader sees the one or the other.
-
-    Raises
-    ------
-    RecordingError
-        The disk is full, or the folder cannot be written.
-    """
-    temporary = target.with_name(f".{target.name}.new")
-    try:
-        shutil.copyfile(source, temporary)
-        temporary.replace(target)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise RecordingError(f"cannot write {target}: {(error.strerror or str(error)).lower()}") from None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -87,6 +89,39 @@ class _File:
 
     def close(self) -> None:
         os.close(self.descriptor)
+
+
+@contextlib.contextmanager
+def replacing(target: Path, sources: Iterable[Path], *, overwrite: bool) -> Iterator[Path]:
+    """A file beside ``target`` to write, which takes its place when the block ends well, and goes when it does not.
+
+    Raises
+    ------
+    RecordingError
+        ``target`` is one of the ``sources``, by whatever name; it exists and not ``overwrite``; it cannot be written.
+    """
+    if any(target.exists() and source.exists() and target.samefile(source) for source in sources):
+        raise RecordingError(f"{target} is the recording itself: give another name for the new one")
+    if target.is_dir():
+        raise RecordingError(f"{target} is a folder: give the name of a file in it")
+    if target.exists() and not overwrite:
+        raise RecordingError(f"{target} exists and is not overwritten: give another name, or --overwrite to replace it")
+    partial = target.with_name(f".{target.name}.partial")
+    try:
+        yield partial
+        partial.replace(target)
+    except RecordingError as error:  # whoever wrote knew of the partial file only
+        text = str(error).replace(str(partial), str(target)).removesuffix(_KEPT)
+        raise RecordingError(text) from None
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        what = "the disk is full" if full else os.strerror(error.errno or 0).lower()
+        raise RecordingError(f"cannot write {target}: {what}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+_KEPT = "; what was recorded until then is in it and can be read"
 
 
 class McapFile:

@@ -87,6 +87,8 @@ class Recording:
         self.path = Path(path)
         self.metadata: dict[str, str] = {}
         """Facts about the session, from its start and its end."""
+        self.end_metadata: dict[str, str] = {}
+        """Those from its end alone."""
         self.attachments: dict[str, bytes] = {}
         """By name, among them the rig file and the exposure basis."""
         self.counts: dict[str, int] = {}
@@ -127,6 +129,12 @@ class Recording:
     def complete(self) -> bool:
         """Whether the file ends as a recording should."""
         return not self.damage
+
+    @property
+    def foreign(self) -> list[str]:
+        """Topics whose messages are of a kind that aolink does not know."""
+        known = {topic for topic, schema in self._channels.values() if schema in topics.SCHEMAS}
+        return [topic for topic in self.counts if topic not in known]
 
     @property
     def estimators(self) -> list[str]:
@@ -320,6 +328,8 @@ class Recording:
             values = record.metadata
             if record.name in (topics.SESSION_METADATA, topics.END_METADATA):
                 self.metadata.update(values)
+                if record.name == topics.END_METADATA:
+                    self.end_metadata.update(values)
             elif record.name == topics.RIG_METADATA and "toml" in values:
                 rig_texts[record.name] = values["toml"]
             elif record.name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():

@@ -13,6 +13,7 @@ from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.mcap_file import replacing
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 
@@ -110,10 +111,13 @@ def write_reestimated(
     }
     if engine != "aolink":
         metadata["engine"] = engine
-    with RecordingWriter(
-        path, recording.rig, metadata, recording.start_ns, overwrite=overwrite, deterministic=True,
-        attachments=recording.attachments,
-    ) as writer:  # fmt: skip
+    with (
+        replacing(Path(path), [recording.path], overwrite=overwrite) as partial,
+        RecordingWriter(
+            partial, recording.rig, metadata, recording.start_ns, overwrite=True, deterministic=True,
+            attachments=recording.attachments,
+        ) as writer,
+    ):  # fmt: skip
         last_ns = recording.start_ns
         for recorded, exposures in recording.assembled():
             if recorded is not None and not recorded.topic.startswith((topics.ESTIMATE, topics.RESTORED)):

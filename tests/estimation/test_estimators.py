@@ -25,6 +25,8 @@ from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 PAPER = ("o1", "o2", "o3")
+# `sampled` takes a second for an exposure: it has tests of its own.
+NAMES = tuple(name for name in ESTIMATOR_NAMES if name != "sampled")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,7 @@ def exposures(rig):
 
 @pytest.fixture(scope="module")
 def estimates(rig, exposures):
-    return run(rig, exposures, ESTIMATOR_NAMES)
+    return run(rig, exposures, NAMES)
 
 
 def arrays(estimate):
@@ -64,7 +66,7 @@ def test_there_is_no_other_estimator(rig):
         make_estimator(rig, "o1", flux="some")
 
 
-@pytest.mark.parametrize("name", ESTIMATOR_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_estimates_are_sound_and_complete(rig, estimates, exposures, name):
     for exposure, estimate in zip(exposures, estimates[name], strict=True):
         assert_sound(estimate)
@@ -74,7 +76,7 @@ def test_estimates_are_sound_and_complete(rig, estimates, exposures, name):
             exposure.first_step,
         )
         assert estimate.status == (Status.PREDICTED if name == "open-loop" else Status.OK)
-        assert estimate.reason == ""
+        assert estimate.reason in ("", "the blur has more than one reading")
         assert estimate.path.shape == estimate.path_sd.shape == (1, 200)
         np.testing.assert_array_equal(estimate.coefficients[:, :2], estimate.start_state)
 
@@ -89,7 +91,7 @@ def test_the_path_starts_at_the_start_state_and_goes_with_the_inputs(rig, estima
     np.testing.assert_allclose(estimate.end_state[0], x, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ESTIMATOR_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_recorded_estimate_unfolds_to_the_same_bits(rig, estimates, exposures, name):
     estimate, model = estimates[name][9], exposure_model(rig.plant, 200)
     path, sd = path_from_coefficients(
@@ -138,7 +140,7 @@ def test_off_centre_the_second_moment_reads_the_position_again(rig, exposures, e
 def test_looking_adds_nothing_at_the_printed_noise():
     rig = load_rig("section-vi")
     series = simulate(rig, 120, seed=4)
-    scores = {name: score(series, e, skip=10) for name, e in run(rig, series, ESTIMATOR_NAMES).items()}
+    scores = {name: score(series, e, skip=10) for name, e in run(rig, series, NAMES).items()}
     for name in ("open-loop", *PAPER):
         assert scores[name].path_rmse == pytest.approx(scores["open-loop"].path_rmse, rel=0.06)
         assert scores[name].start_rmse == pytest.approx(0.067, rel=0.1)
@@ -237,7 +239,7 @@ def test_an_input_that_is_not_a_number_does_not_poison_the_filter(rig, exposures
     inputs = exposures[1].inputs.copy()
     inputs[5] = np.nan
     series = [exposures[0], dataclasses.replace(exposures[1], inputs=inputs), exposures[2]]
-    for name in ESTIMATOR_NAMES:
+    for name in NAMES:
         given = run(rig, series, [name])[name]
         assert "not a number" in given[1].reason
         for estimate in given:
@@ -303,7 +305,7 @@ def test_o1_without_a_steady_gain_says_that_its_gain_varies(rig):
     assert make_estimator(undamped, "o1").options.gain == "time-varying"
     assert make_estimator(rig, "o1").options.gain == "steady-state"
     series = simulate(undamped, 20)
-    for estimates in run(undamped, series, ESTIMATOR_NAMES).values():
+    for estimates in run(undamped, series, NAMES).values():
         for estimate in estimates:
             assert_sound(estimate)
 

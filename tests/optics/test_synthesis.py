@@ -60,6 +60,27 @@ def test_an_image_keeps_its_moments_and_its_orientation():
     assert (window * y).sum() == pytest.approx(6.2 - 2 / 4)
 
 
+@pytest.mark.parametrize("finer", [1, 3])
+def test_an_image_lands_where_each_step_puts_it(finer):
+    """Against the image laid down step by step, with paths that leave the window and spots that are never in it."""
+    rng = np.random.default_rng(5)
+    image, side, steps = rng.random((7, 5)), 6, 20
+    paths = rng.uniform(-4, 10, (4, 2, steps))
+    paths[3] += 100
+    light = spot_windows(Psi(shape="image", image=image, finer=finer), side, paths)
+    n, edge = side * finer, 200
+    for spot in range(4):
+        fine = np.zeros((n + 2 * edge, n + 2 * edge))
+        for x, y in (paths[spot].T + 0.5) * finer - 0.5:
+            i, j = int(np.floor(y)), int(np.floor(x))
+            for di, dj in np.ndindex(2, 2):
+                weight = abs(1 - di - (y - i)) * abs(1 - dj - (x - j)) / steps / image.sum()
+                if i < n + 20 and j < n + 20:
+                    fine[i + di - 3 + edge : i + di + 4 + edge, j + dj - 2 + edge : j + dj + 3 + edge] += weight * image
+        expected = fine[edge : edge + n, edge : edge + n].reshape(side, finer, side, finer).sum(axis=(1, 3))
+        np.testing.assert_allclose(light[spot], expected, atol=1e-14)
+
+
 def test_light_that_leaves_the_window_is_gone():
     for psi in (Psi(shape="delta"), Psi(shape="image", image=np.ones((3, 3)))):
         assert spot_windows(psi, 8, np.full((1, 2, 1), 50.0)).sum() == 0

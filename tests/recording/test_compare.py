@@ -118,3 +118,40 @@ def test_the_command_accepts_a_change_when_told_to(aolink: Run, recorded: Sessio
     assert "accepted: wrong.mcap is replaced" in accepted.stdout
     assert aolink("compare", "wrong.mcap").returncode == 0
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith((".", "aolink-"))] == []
+
+
+def test_a_topic_that_nobody_has_is_an_error_not_the_same(aolink: Run, recorded: Session) -> None:
+    result = aolink("compare", recorded.path, recorded.path, "--topic", "/estimat/")
+    assert result.returncode == 5
+    assert "there is nothing of /estimat/ to compare" in result.stderr
+
+
+def test_messages_of_unknown_kinds_are_compared_as_bytes(recorded: Session, tmp_path: Path) -> None:
+    from mcap.records import Schema
+
+    from aolink.recording.mcap_file import McapFile, WriteOptions
+    from aolink.recording.writer import begin_recording
+
+    for name, data in (("a", b"one"), ("b", b"two")):
+        recording = Recording(recorded.path)
+        file = McapFile(tmp_path / f"{name}.mcap", WriteOptions())
+        begin_recording(file, recording.rig, {}, 0, {})
+        file.add("/mine", Schema(id=0, name="mine.Own", encoding="protobuf", data=b""), data, 1, 1)
+        file.finish()
+    one, two = Recording(tmp_path / "a.mcap"), Recording(tmp_path / "b.mcap")
+    assert one.foreign == ["/mine"]
+    assert compare(one, one)["/mine"].same
+    assert compare(one, two)["/mine"].fields["value"].messages == 1
+
+
+def test_accept_is_refused_where_it_would_replace_more(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    shutil.copy(recorded.path, tmp_path / "a.mcap")
+    part = aolink("compare", "a.mcap", recorded.path, "--topic", "/log", "--accept")
+    assert part.returncode == 2
+    data = bytearray((tmp_path / "a.mcap").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "a.mcap").write_bytes(data)
+    damaged = aolink("compare", "a.mcap", recorded.path, "--accept")
+    assert damaged.returncode == 5
+    assert "a damaged recording is not accepted" in damaged.stderr
+    assert (tmp_path / "a.mcap").read_bytes() == data

@@ -126,3 +126,62 @@ def test_the_commands(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     assert aolink("cut", "copy.mcap", "--start", "1", "--end", "2", "-o", "c1.mcap").returncode == 0
     assert aolink("cut", "copy.mcap", "--start", "1.5", "-o", "c2.mcap").returncode == 0
     assert aolink("merge", "c1.mcap", "c2.mcap", "-o", "m.mcap").returncode == 0
+
+
+def test_no_command_writes_over_what_it_reads(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    """By whatever name: a second source, a hard link, with --overwrite."""
+    data = recorded.path.read_bytes()
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "link.mcap").hardlink_to(tmp_path / "a.mcap")
+    for arguments in (
+        ("estimate", "a.mcap", "-e", "o1", "-o", "a.mcap"),
+        ("recover", "a.mcap", "-o", "link.mcap"),
+        ("cut", "a.mcap", "--end", "1", "-o", "a.mcap"),
+        ("merge", "a.mcap", "b.mcap", "-o", "b.mcap"),
+        ("deblur", "a.mcap", "-e", "o1", "-o", "a.mcap"),
+    ):
+        result = aolink(*arguments, "--overwrite")
+        assert "is the recording itself" in result.stderr, arguments
+        assert result.returncode == 5
+    assert {(tmp_path / name).read_bytes() for name in ("a.mcap", "b.mcap", "link.mcap")} == {data}
+
+
+def test_a_command_that_fails_leaves_the_target_as_it_was(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    import resource
+
+    (tmp_path / "kept.mcap").write_bytes(b"something of mine")
+    failed = aolink("cut", recorded.path, "--start", "100", "-o", "kept.mcap", "--overwrite")
+    assert failed.returncode == 5
+
+    def small_files() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+
+    for command in (("recover",), ("cut", "--end", "99"), ("estimate", "-e", "o1")):
+        full = aolink(command[0], recorded.path, *command[1:], "-o", "kept.mcap", "--overwrite", preexec_fn=small_files)
+        assert full.returncode == 5
+        assert full.stderr == "aolink: cannot write kept.mcap: the disk is full\n"
+    assert [each.name for each in tmp_path.iterdir()] == ["kept.mcap"]
+    assert (tmp_path / "kept.mcap").read_bytes() == b"something of mine"
+
+
+def test_parts_and_merged_files_say_what_they_are(recorded: Session, tmp_path: Path) -> None:
+    parts = in_parts(recorded.path, tmp_path / "s.mcap", WriteOptions(split_s=0.9))
+    whole = Recording(recorded.path)
+    part = Recording(cut(recorded.path, tmp_path / "cut.mcap", 0.0, 1.0).path)
+    assert "exposures" in whole.metadata
+    assert not {"exposures", "ended"} & part.metadata.keys()
+    assert part.metadata["session"] == whole.metadata["session"]
+    merged = Recording(merge(parts, tmp_path / "m.mcap").path)
+    assert "part" not in merged.metadata
+    assert merged.end_metadata == Recording(parts[-1]).end_metadata
+
+
+def test_nothing_is_recovered_from_nothing(recorded: Session, tmp_path: Path) -> None:
+    (path := tmp_path / "a.mcap").write_bytes(recorded.path.read_bytes()[:30_000])
+    if not Recording(path).counts:
+        with pytest.raises(RecordingError, match="holds no whole message"):
+            recover(path, tmp_path / "b.mcap")
+        assert not (tmp_path / "b.mcap").exists()
+    else:
+        pytest.fail("the first chunk is in the first 30 kB: cut earlier")

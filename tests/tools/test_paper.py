@@ -30,6 +30,7 @@ SECTIONS = (
     "Remarks 1 and 2",
     "The map o3/o1",
     "A shake faster than the frames",
+    "How near to the limit",
 )
 NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
 
@@ -308,3 +309,12 @@ def test_intervals_of_a_ratio_use_the_pairs() -> None:
     found = ratio(0.81 * common * (1 + 0.01 * rng.standard_normal(common.shape)), common)
     assert found.value == pytest.approx(0.9, abs=0.01)
     assert found.high - found.low < 0.01
+
+
+def test_the_limit_is_below_o1_and_the_estimators_of_pixels_are_near_it(page: str) -> None:
+    tables = page.partition("## How near to the limit")[2].split("RMSE of the path:")[1]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in tables.splitlines() if line[:1] == "|"]
+    head, first = rows[0], next(row for row in rows if row[0].startswith("12 Hz shake"))
+    path = dict(zip(head[1:], map(float, first[1:]), strict=True))
+    assert path["sampled"] < path["o1"] < 2 * path["open-loop"]
+    assert max(path["profile"], path["mixture"]) < path["o1"]

@@ -162,3 +162,31 @@ def frame_from_last_byte() -> Row:
         15e-3 / p99,
         1,
     )
+
+
+def _of_many_axes(name: str, limit_ms: float) -> Row:
+    """One exposure of 1800 line sensors of 16 pixels, against what is wanted at 5 Hz."""
+    from paper_report.ensemble import side_by_side
+
+    from aolink.estimation import make_estimator
+    from aolink.simulation.model import simulate
+
+    axes, rig = 1800, load_rig("section-vi-lively")
+    kernel = replace(rig.sensor.kernel, sigma=0.1)
+    many = side_by_side(replace(rig, sensor=replace(rig.sensor, pixels=16, kernel=kernel)), axes)
+    exposures = iter(simulate(many, 6, inputs=np.zeros((1200, axes))))
+    estimator = make_estimator(many, name)
+    estimator.step(next(exposures))
+    step, _ = median_s(lambda: estimator.step(next(exposures)), 5)
+    figure = f"{name} of 1800 axes, 16 pixels each"
+    return Row(figure, f"{step * 1e3:.0f} ms", f"limit {limit_ms:.0f} ms", limit_ms / step / 1e3, 1)
+
+
+def profile_of_many_axes() -> Row:
+    """The modes of 1800 posteriors."""
+    return _of_many_axes("profile", 100)
+
+
+def mixture_of_many_axes() -> Row:
+    """1800 mixtures."""
+    return _of_many_axes("mixture", 400)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from aolink.rig import load_rig, parse_rig
 from bench_rows.row import Row, median_s
 
 
@@ -33,6 +34,64 @@ def diffraction_synthesis() -> Row:
     spot_windows(psi, 16, path)
     ours = 1 / median_s(lambda: spot_windows(psi, 16, path), 5)[0]
     return Row("frames of 900 diffraction spots", f"{ours:.0f}/s", "20/s", ours / 20, 1)
+
+
+def picture_synthesis() -> Row:
+    """Frames of 900 spots whose kernel is a picture of 33 x 33 points, four of them a pixel."""
+    from aolink.optics.synthesis import Psi, spot_windows
+
+    path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
+    psi = Psi(shape="image", image=np.random.default_rng(1).random((33, 33)), finer=4)
+    ours = 1 / median_s(lambda: spot_windows(psi, 16, path), 5)[0]
+    return Row("frames of 900 spots that are a picture", f"{ours:.0f}/s", "20/s", ours / 20, 1)
+
+
+def coupled_exposure() -> Row:
+    """An exposure of sh-30x30, one plant with 1800 slopes, with o1 and o3: measured, corrected, predicted."""
+    from aolink.estimation import make_estimator
+    from aolink.simulation.model import simulate
+
+    rig = load_rig("sh-30x30")
+    exposures = iter(simulate(rig, 12))
+    estimators = [make_estimator(rig, name) for name in ("o1", "o3")]
+
+    def step() -> None:
+        exposure = next(exposures)
+        for estimator in estimators:
+            estimator.step(exposure)
+
+    step()  # the exposure model is made once
+    ours = median_s(step, 11)[0]
+    return Row("o1 and o3 of one plant with 1800 slopes", f"{ours * 1e3:.0f} ms", "5 Hz: 200 ms", 0.2 / ours, 1)
+
+
+def cost_against_lenslets() -> Row:
+    """Frames and o3 of 100 to 2500 spots: the cost of a spot among the fewest over that among the most."""
+    from aolink.estimation import make_estimator
+    from aolink.simulation.model import simulate
+
+    def cost(side: int) -> float:
+        text = load_rig("sh-30x30").toml.replace("grid = [30, 30]", f"grid = [{side}, {side}]")
+        rig = parse_rig(text)
+        series = iter(simulate(rig, 8))
+        estimator = make_estimator(rig, "o3")
+
+        def step() -> None:
+            exposure = next(series)
+            estimator.step(exposure)
+
+        step()
+        simulated = median_s(lambda: simulate(rig, 1), 3)[0]
+        return (median_s(step, 7)[0] + simulated) / side**2
+
+    few, many = cost(10), cost(50)
+    return Row(
+        "cost against lenslets, 100 to 2500",
+        f"{many * 1e6:.0f} us a spot",
+        f"{few * 1e6:.0f} us of 100",
+        few / many,
+        0.7,
+    )
 
 
 def turbulence() -> Row:

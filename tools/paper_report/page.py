@@ -13,6 +13,7 @@ from aolink.rig import Rig
 from paper_report import figures
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
 from paper_report.ensemble import Cell, Measured
+from paper_report.limit import Scene, limit_section
 from paper_report.numbers import (
     Effort,
     ErrorRow,
@@ -46,6 +47,7 @@ class Results:
     remark_2: Remark2
     mechanism: Mechanism
     shake: list[ShakeRow]
+    limit: list[Scene]
     cells: list[Cell]
 
 
@@ -78,6 +80,7 @@ def build(results: Results) -> list[Block]:
         *_remarks(results),
         *_map(results),
         *shake_section(results.shake, results.effort),
+        *limit_section(results.limit, results.effort),
     ]
 
 

@@ -1,0 +1,139 @@
+"""Mixtures of Gaussians, many at once: the batch axis first, the components second."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation import stacked
+from aolink.estimation.observation import Belief
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Relative to each variance; what a prior knows for certain stays certain to this.
+_JITTER = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """A mixture of Gaussians for each axis."""
+
+    log_weight: FloatArray
+    """(axes, components), normalised; minus infinity for a component that is not there."""
+    mean: FloatArray
+    """(axes, components, n)"""
+    covariance: FloatArray
+    """(axes, components, n, n)"""
+
+    def part(self, axes: slice | NDArray[np.intp]) -> Hypotheses:
+        """Of these axes alone."""
+        return Hypotheses(self.log_weight[axes], self.mean[axes], self.covariance[axes])
+
+    @property
+    def belief(self) -> Belief:
+        """Mean and covariance of the mixture."""
+        w = np.exp(self.log_weight)
+        mean = np.add.reduce(w[..., None] * self.mean, axis=1)
+        away = self.mean - mean[:, None]
+        spread = self.covariance + away[..., :, None] * away[..., None, :]
+        return Belief(mean, stacked.symmetric(np.add.reduce(w[..., None, None] * spread, axis=1)))
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """At points (axes, points, n), (axes, points)."""
+        return log_sum(self.component_log_densities(points), axis=1)
+
+    def component_log_densities(self, points: FloatArray) -> FloatArray:
+        """Of each component times its weight, (axes, components, points)."""
+        n = points.shape[-1]
+        root = cholesky(self.covariance)
+        away = points[:, None] - self.mean[:, :, None]
+        white = stacked.long_matmul(away, stacked.transpose(lower_inverse(root)))
+        log_root = np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1)
+        constant = self.log_weight - log_root - 0.5 * n * math.log(2 * math.pi)
+        return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1))
+
+    def reduced(self, most: int) -> Hypotheses:
+        """The same with ``most`` components: those two are merged, again and again, whose merger costs least.
+
+        The cost is Runnalls' bound on the Kullback-Leibler divergence; a merger keeps mean and covariance. Runnalls,
+        Kullback-Leibler approach to Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
+        """
+        mixture = self
+        while mixture.mean.shape[1] > most:
+            mixture = _merged_once(mixture)
+        return mixture
+
+
+def single(belief: Belief) -> Hypotheses:
+    """A mixture of one component."""
+    return Hypotheses(np.zeros((len(belief.mean), 1)), belief.mean[:, None], belief.covariance[:, None])
+
+
+def joined(*mixtures: Hypotheses) -> Hypotheses:
+    """All components of several mixtures, their weights normalised together."""
+    log_weight = np.concatenate([each.log_weight for each in mixtures], axis=1)
+    return Hypotheses(
+        log_weight - log_sum(log_weight, axis=1)[:, None],
+        np.concatenate([each.mean for each in mixtures], axis=1),
+        np.concatenate([each.covariance for each in mixtures], axis=1),
+    )
+
+
+def _merged_once(m: Hypotheses) -> Hypotheses:
+    """The two components whose merger costs least are one, in each axis."""
+    axes, count = m.log_weight.shape
+    first, second = np.triu_indices(count, 1)
+    w = np.exp(m.log_weight)
+    total = w[:, first] + w[:, second]
+    share = w[:, second] / np.where(total > 0, total, 1.0)
+    away = m.mean[:, second] - m.mean[:, first]
+    P, Q = m.covariance[:, first], m.covariance[:, second]
+    outer = away[..., :, None] * away[..., None, :]
+    a, b = share[..., None, None], (share * (1 - share))[..., None, None]
+    merged = (1 - a) * P + a * Q + b * outer
+    logs = log_determinant(m.covariance)
+    cost = 0.5 * (total * log_determinant(merged) - w[:, first] * logs[:, first] - w[:, second] * logs[:, second])
+    chosen = np.argmin(cost, axis=1)
+    rows, i, j = np.arange(axes), first[chosen], second[chosen]
+    mean, covariance, log_weight = m.mean.copy(), m.covariance.copy(), m.log_weight.copy()
+    mean[rows, i] += share[rows, chosen][:, None] * away[rows, chosen]
+    covariance[rows, i] = merged[rows, chosen]
+    log_weight[rows, i] = np.logaddexp(log_weight[rows, i], log_weight[rows, j])
+    keep = np.ones((axes, count), dtype=bool)
+    keep[rows, j] = False
+
+    def kept(values: FloatArray) -> FloatArray:
+        return values[keep].reshape(axes, count - 1, *values.shape[2:])
+
+    return Hypotheses(kept(log_weight), kept(mean), kept(covariance))
+
+
+def log_sum(values: FloatArray, axis: int) -> FloatArray:
+    """log sum exp along an axis; minus infinity where all are."""
+    top = np.maximum.reduce(values, axis=axis, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.add.reduce(np.exp(values - top), axis=axis)) + np.squeeze(top, axis=axis))
+
+
+def cholesky(covariance: FloatArray) -> FloatArray:
+    """A root, lower triangular, of what may be singular."""
+    diagonal = np.einsum("...ii->...i", covariance)
+    largest = np.maximum.reduce(diagonal, axis=-1, keepdims=True)
+    lifted = covariance + (_JITTER * diagonal + 1e-14 * largest + 1e-300)[..., None] * np.eye(covariance.shape[-1])
+    return np.asarray(np.linalg.cholesky(lifted))
+
+
+def lower_inverse(root: FloatArray) -> FloatArray:
+    """Inverse of lower triangular matrices."""
+    return np.asarray(np.linalg.solve(root, np.broadcast_to(np.eye(root.shape[-1]), root.shape)))
+
+
+def log_determinant(covariance: FloatArray) -> FloatArray:
+    """log |P|"""
+    root = cholesky(covariance)
+    return np.asarray(2 * np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1))

@@ -1,0 +1,191 @@
+"""The recursion from exposure to exposure for posteriors that are not Gaussian: a mixture is carried, not one Gaussian.
+
+Timing, trust and words are those of `BlurFilter`: an exposure corrects the state at its start, a measurement that
+cannot be believed leaves the prediction, after several of them the filter starts again from what the plant would be
+without a camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation import stacked
+from aolink.estimation.estimate import Status
+from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
+from aolink.estimation.filter import Posterior, predicted
+from aolink.estimation.hypotheses import Hypotheses, single
+from aolink.estimation.observation import Belief
+from aolink.estimation.pixels import PixelView, Reduction
+from aolink.estimation.windowed import Profile
+from aolink.estimation.windowed_spots import SpotWindows
+from aolink.plant import input_response, lift
+from aolink.rig import Plant
+from aolink.sensor import BaseSensor
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_PATIENCE = 3
+# Chunks of axes: what is computed for them together fits into the cache.
+_AT_ONCE = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What is new in the pixels, in the directions in which the prior lets them move most."""
+
+    value: FloatArray
+    """(axes, k)"""
+    covariance: FloatArray
+    """(axes, k, k)"""
+    nis: FloatArray
+    """(axes,)"""
+    believed: BoolArray
+    """Whether pixels and prior together have a chi-square that can be, (axes,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What a frame made of a prior."""
+
+    coefficients: Belief
+    """Of the reduced coefficients t."""
+    end: Hypotheses
+    """Of the state at the exposure's end, without what inputs do."""
+    innovation: Innovation
+    several: BoolArray
+    """Whether it saw more than one reading of the blur, (axes,)."""
+
+
+class Updates(Protocol):
+    """A way to update a mixture with the pixels of an exposure."""
+
+    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
+        """The coefficients that it works with."""
+
+    def update(self, view: PixelView, prior: Hypotheses, number: int) -> Update:
+        """The posterior of axes with a prior of their start states, in the exposure of this number."""
+
+
+class HypothesisFilter:
+    """A mixture for each axis, carried from exposure to exposure.
+
+    Parameters
+    ----------
+    updates:
+        How a frame corrects it.
+    gate:
+        Whether frames that cannot be believed are left out.
+    """
+
+    def __init__(self, plant: Plant, sensor: BaseSensor, updates: Updates, *, gate: bool = True) -> None:
+        self.plant, self.sensor, self._updates, self._gate = plant, sensor, updates, gate
+        n, axes = plant.n_states, plant.axes
+        self.belief = single(
+            Belief(
+                np.broadcast_to(plant.initial_mean, (axes, n)).copy(),
+                np.broadcast_to(plant.initial_covariance, (axes, n, n)).copy(),
+            )
+        )
+        # The same without what the camera said.
+        self._unseen = self.belief.belief
+        self._missed = np.zeros(axes, dtype=np.int64)
+        self._number = 0
+
+    def bridge(self, inputs: FloatArray) -> None:
+        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
+        if len(inputs):
+            transition, noise = lift(self.plant, len(inputs))
+            _, kick = input_response(self.plant, by_axis(self.plant, inputs))
+            self.belief = _moved(self.belief, transition, noise, kick)
+            self._unseen = predicted(self._unseen, transition, noise, kick)
+
+    def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
+        """One exposure, with its pixels or without."""
+        axes = self.plant.axes
+        reduced = self._updates.reduction(model, self.sensor)
+        lost = self._missed >= _PATIENCE
+        prior = _chosen(lost, single(self._unseen), self.belief)
+        status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
+        coefficients = reduced.prior(prior.belief)
+        end = _moved(prior, model.transition, model.process_noise, response.end)
+        new = Innovation(np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes), np.ones(axes, dtype=bool))
+        several = np.zeros(axes, dtype=bool)
+        if measured is not None:
+            view = PixelView(self.sensor, model, response, measured, reduced)
+            seen = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
+            parts = [seen[k : k + _AT_ONCE] for k in range(0, axes, _AT_ONCE)]
+            done = [self._updates.update(view.part(p), prior.part(p), self._number) for p in parts if len(p)]
+            new = _spread([each.innovation for each in done], seen, axes)
+            trusted = new.believed[seen] | (not self._gate)
+            took = seen[trusted]
+            if len(took):
+                after = [np.concatenate(each)[trusted] for each in zip(*(_arrays(d) for d in done), strict=True)]
+                coefficients.mean[took], coefficients.covariance[took], several[took] = after[3], after[4], after[5]
+                kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
+                end = _replaced(end, took, kicked)
+            self._missed[seen] = np.where(trusted, 0, np.where(lost[seen], 1, self._missed[seen] + 1))
+            status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
+            status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
+        self.belief = end
+        self._unseen = predicted(self._unseen, model.transition, model.process_noise, response.end)
+        self._number += 1
+        return Posterior(
+            coefficients=reduced.coefficients(coefficients), end=end.belief, status=status, innovation=new.value,
+            innovation_covariance=new.covariance, nis=new.nis, several=several,
+        )  # fmt: skip
+
+
+def _arrays(done: Update) -> tuple[NDArray[Any], ...]:
+    e, c = done.end, done.coefficients
+    return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several)
+
+
+def _spread(parts: Sequence[Innovation], seen: NDArray[np.intp], axes: int) -> Innovation:
+    """Innovations of these axes in their places; zero, with a covariance of zero, for the others."""
+    k = parts[0].value.shape[1] if parts else 0
+    out = Innovation(np.zeros((axes, k)), np.zeros((axes, k, k)), np.zeros(axes), np.zeros(axes, dtype=bool))
+    if parts:
+        out.value[seen] = np.concatenate([each.value for each in parts])
+        out.covariance[seen] = np.concatenate([each.covariance for each in parts])
+        out.nis[seen] = np.concatenate([each.nis for each in parts])
+        out.believed[seen] = np.concatenate([each.believed for each in parts])
+    return out
+
+
+def _moved(h: Hypotheses, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Hypotheses:
+    """x -> A x + d, P -> A P A' + Q for each component."""
+    return Hypotheses(
+        h.log_weight,
+        stacked.matvec(transition, h.mean) + kick[:, None],
+        stacked.symmetric(stacked.congruence(transition, h.covariance) + noise),
+    )
+
+
+def _with_components(h: Hypotheses, count: int) -> Hypotheses:
+    """The same with components that are not there after its own."""
+    more = count - h.mean.shape[1]
+    if more <= 0:
+        return h
+    log_weight = np.concatenate([h.log_weight, np.full((len(h.mean), more), -np.inf)], axis=1)
+    repeat = [np.concatenate([each, np.repeat(each[:, :1], more, axis=1)], axis=1) for each in (h.mean, h.covariance)]
+    return Hypotheses(log_weight, repeat[0], repeat[1])
+
+
+def _replaced(h: Hypotheses, axes: NDArray[np.intp], by: Hypotheses) -> Hypotheses:
+    """The same with these axes' mixtures replaced."""
+    count = max(h.mean.shape[1], by.mean.shape[1])
+    h, by = _with_components(h, count), _with_components(by, count)
+    out = Hypotheses(h.log_weight.copy(), h.mean.copy(), h.covariance.copy())
+    out.log_weight[axes], out.mean[axes], out.covariance[axes] = by.log_weight, by.mean, by.covariance
+    return out
+
+
+def _chosen(which: BoolArray, first: Hypotheses, second: Hypotheses) -> Hypotheses:
+    rows = np.flatnonzero(which)
+    return _replaced(second, rows, first.part(rows)) if len(rows) else second

@@ -1,0 +1,253 @@
+"""The pixels themselves: the modes of the posterior by Levenberg and Marquardt's method, from several starts.
+
+The objective is -log p(t | pixels) with t whitened by its prior, s = L^-1 (t - m): |s|^2 / 2 minus the pixels'
+log-likelihood, Fisher's information in the place of the Hessian. At a mode its inverse is the covariance, and
+(Laplace) the log-evidence is log p(y | s) - |s|^2 / 2 - log |H| / 2.
+
+It starts where windowed moments have it, and from there along the directions in which they leave the path most
+uncertain: a path and its reversal in time give the same blur.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.estimation import stacked
+from aolink.estimation.exposure_model import ExposureModel
+from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, lower_inverse, single
+from aolink.estimation.hypothesis_filter import Innovation, Update
+from aolink.estimation.observation import Belief, corrected
+from aolink.estimation.pixels import PixelView, Reduction, reduction
+from aolink.sensor import BaseSensor
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_PASSES = 16
+_FIRST_DAMPING = 0.01
+_LARGEST_DAMPING = 1e6
+_FREE_DAMPING = 0.1
+_NO_NOISE = 1e-14
+# The objective changes by less than this at a mode.
+_CONVERGED = 1e-4
+# Modes that are nearer to each other than so many standard deviations are one.
+_APART = 0.7
+_START_DIRECTIONS = 2
+_START_REACH = 1.3
+# A reversed path is met to so many standard deviations of the kernel, if the prior allows.
+_REVERSED_TO = 0.2
+# Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
+_DIRECTIONS = 4
+_GATE_PROBABILITY = 1e-9
+# A second mode is one if the posterior gives it this much.
+LEAST_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Modes of the posterior, (axes, starts, ...)."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    log_evidence: FloatArray
+    """Laplace's, without the prior weight; minus infinity where a start led to a mode that was there already."""
+    distance: FloatArray
+    """|s|^2, squared distance from the prior, (axes, starts)."""
+    objective: FloatArray
+    """-log p(s, y) up to a constant, (axes, starts)."""
+
+    @property
+    def best(self) -> NDArray[np.intp]:
+        """The one of least objective, (axes,)."""
+        return np.asarray(np.argmin(self.objective, axis=1))
+
+
+def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES) -> Modes:
+    """Where each start leads.
+
+    Parameters
+    ----------
+    prior:
+        Of each axis.
+    starts:
+        In whitened coordinates, (axes, starts, n).
+    """
+    axes, count, n = starts.shape
+    if prior.mean.ndim == 2:
+        prior = Belief(
+            np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
+        )
+    rows = view.part(np.repeat(np.arange(axes), count))
+    m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
+    s = starts.reshape(-1, n)
+    at = _at(rows, m, L, s)
+    damping = np.full(len(s), _FIRST_DAMPING)
+    active = np.arange(len(s))
+    for _ in range(passes):
+        if not len(active):
+            break
+        H, g, now = at.H[active], at.g[active], at.objective[active]
+        scale = np.einsum("rii->ri", H)
+        damped = H + (damping[active][:, None] * scale)[..., None] * np.eye(n)
+        step = np.linalg.solve(damped, g[..., None])[..., 0]
+        there = _at(rows.part(active), m[active], L[active], s[active] + step)
+        gain = now - there.objective
+        better = gain > 0
+        took = active[better]
+        s[took] += step[better]
+        for mine, theirs in ((at.H, there.H), (at.g, there.g), (at.objective, there.objective)):
+            mine[took] = theirs[better]
+        before = damping[active]
+        damping[active] = np.where(better, damping[active] / 8, np.maximum(damping[active], 1e-3) * 8)
+        # A short step says nothing where it is the damping that made it short.
+        free = before <= _FREE_DAMPING
+        settled = (free & better & (gain < _CONVERGED)) | (free & (stacked.dot(step, g) < _CONVERGED))
+        settled |= damping[active] > _LARGEST_DAMPING
+        active = active[~settled]
+    covariance = stacked.congruence(L, stacked.symmetric(np.asarray(np.linalg.inv(at.H), dtype=np.float64)))
+    _, log_H = np.linalg.slogdet(at.H)
+    evidence = -at.objective - 0.5 * log_H
+    mean = m[:, 0] + stacked.matvec(L, s)
+    shape = (axes, count)
+    return Modes(
+        mean.reshape(*shape, n), stacked.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
+        stacked.dot(s, s).reshape(shape), at.objective.reshape(shape),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    H: FloatArray
+    g: FloatArray
+    objective: FloatArray
+
+
+def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
+    """Information, gradient and objective at whitened coordinates, one hypothesis a row."""
+    f, J = rows.linearised(m + stacked.matvec(L, s)[:, None])
+    score, information = rows.information(f)
+    J = stacked.long_matmul(J[:, 0], L)
+    H = stacked.long_matmul(stacked.transpose(J) * information, J) + np.eye(s.shape[1])
+    g = stacked.matvec(stacked.transpose(J), score[:, 0]) - s
+    return _Point(stacked.symmetric(H), g, 0.5 * stacked.dot(s, s) - rows.log_likelihood(f)[:, 0])
+
+
+def without_repeats(modes: Modes) -> Modes:
+    """The same, log-evidence minus infinity for modes that a better start, or an earlier one, led to as well."""
+    count = modes.mean.shape[1]
+    evidence = modes.log_evidence.copy()
+    for j in range(1, count):
+        away = modes.mean[:, :j] - modes.mean[:, j, None]
+        inverse = lower_inverse(cholesky(modes.covariance[:, j]))
+        white = stacked.matmul(away, stacked.transpose(inverse))
+        same = (np.add.reduce(white * white, axis=-1) < _APART**2) & np.isfinite(evidence[:, :j])
+        evidence[:, j] = np.where(same.any(axis=1), -np.inf, evidence[:, j])
+    return replace(modes, log_evidence=evidence)
+
+
+def broad(view: PixelView, prior: Belief) -> Belief:
+    """What windowed moments make of the prior of t: wide where the blur has several readings."""
+    about = prior
+    for _ in range(3):
+        y, noise, fit = view.moments(about)
+        innovation = y - fit.expected - stacked.matvec(fit.slope, prior.mean - about.mean)
+        # A window without a pixel that can be used has neither moments nor noise.
+        spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
+        about = corrected(prior, innovation, fit.slope, spread).posterior
+    return about
+
+
+def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float) -> FloatArray:
+    """The mean of a belief and points beside it along the path's most uncertain directions, (axes, 1 + 2d, n)."""
+    B = view.rows
+    L = cholesky(belief.covariance)
+    _, _, V = np.linalg.svd(stacked.matmul(np.broadcast_to(B, (len(L), *B.shape)), L), full_matrices=False)
+    along = stacked.matmul(V[:, :directions], stacked.transpose(L)) * reach
+    mean = belief.mean[:, None]
+    return np.concatenate([mean, mean + along, mean - along], axis=1)
+
+
+def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> FloatArray:
+    """Whitened coordinates whose paths are nearest to those of points (axes, k, n), run backwards: the same blur."""
+    L, m = cholesky(prior.covariance), prior.mean
+    count = view.outputs * view.whole_nodes
+    rows = view.rows.reshape(view.outputs, -1, view.reduced.size)[:, : view.whole_nodes].reshape(count, -1)
+    precision = 1 / (_REVERSED_TO**2 * view.kernel_variance * view.whole_nodes)
+    B = stacked.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
+    back = view.paths(points)[..., view.whole_nodes - 1 :: -1].reshape(*points.shape[:2], count)
+    away = back - view.paths(m[:, None])[..., : view.whole_nodes].reshape(-1, 1, count)
+    H = precision * stacked.matmul(stacked.transpose(B), B) + np.eye(B.shape[-1])
+    right = precision * stacked.matmul(away, B)
+    return np.asarray(np.linalg.solve(H, stacked.transpose(right)).swapaxes(-1, -2))
+
+
+def with_reversals(view: PixelView, prior: Belief, modes: Modes) -> Modes:
+    """The same modes, and the one that the reversal of the best one leads to."""
+    back = reversed_starts(view, prior, modes.mean[np.arange(len(modes.mean)), modes.best][:, None])
+    more = find_modes(view, prior, back)
+    each = [(getattr(modes, f.name), getattr(more, f.name)) for f in fields(Modes)]
+    return Modes(*(np.concatenate(pair, axis=1) for pair in each))
+
+
+def whitened(prior: Belief, points: FloatArray) -> FloatArray:
+    """Points (axes, k, n) in coordinates in which the prior is N(0, I)."""
+    inverse = lower_inverse(cholesky(prior.covariance))
+    return stacked.matmul(points - prior.mean[:, None], stacked.transpose(inverse))
+
+
+def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
+    """Innovation of the pixels linearised at the best mode, in units of their noise.
+
+    With A = R^(-1/2) J L = U S V', the pixels' innovation has variance 1 + S^2 along U's columns, and 1 elsewhere.
+    """
+    rows = np.arange(len(modes.mean)), modes.best
+    t, distance = modes.mean[rows], modes.distance[rows]
+    n, L = t.shape[1], cholesky(prior.covariance)
+    s = whitened(prior, t[:, None])[:, 0]
+    f, J = view.linearised(t[:, None])
+    score, information = (each[:, 0] for each in view.information(f))
+    root = np.sqrt(information)
+    A = stacked.matmul(J[:, 0] * root[..., None], L)
+    e = score / np.where(root > 0, root, 1.0)
+    values, V = np.linalg.eigh(stacked.matmul(stacked.transpose(A), A))
+    outputs = view.outputs
+    k = min(_DIRECTIONS * outputs, n)
+    values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
+    S = np.sqrt(values)
+    along = stacked.matvec(stacked.transpose(stacked.matmul(A, V)), e) / np.where(S > 0, S, 1.0)
+    u = along + S * stacked.matvec(stacked.transpose(V), s)
+    nis = np.add.reduce(u * u / (1 + values), axis=1)
+    # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
+    total = stacked.dot(e, e) + distance
+    degrees = np.add.reduce(view.mask, axis=1) + n
+    believed = total <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
+    covariance = (1 + values)[..., None] * np.eye(k)
+    return Innovation(u, covariance, nis, believed & np.isfinite(nis))
+
+
+class ProfileUpdates:
+    """One Gaussian in, one Gaussian out: the modes that were found, weighted with their evidence."""
+
+    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
+        """The coefficients that it works with."""
+        return reduction(model, sensor)
+
+    def update(self, view: PixelView, prior: Hypotheses, number: int) -> Update:
+        """The posterior of axes with a prior of their start states."""
+        before = view.reduced.prior(prior.belief)
+        wide = broad(view, before)
+        starts = np.concatenate(
+            [spread_starts(view, wide, _START_DIRECTIONS, _START_REACH), before.mean[:, None]], axis=1
+        )
+        found = find_modes(view, before, whitened(before, starts))
+        modes = without_repeats(with_reversals(view, before, found))
+        log_weight = modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None]
+        after = Hypotheses(log_weight, modes.mean, modes.covariance).belief
+        new = innovation(view, before, modes)
+        end = single(view.reduced.end(after))
+        several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
+        return Update(after, end, new, several)

@@ -1,0 +1,110 @@
+"""A whole recording looked at together: what later exposures say of earlier ones.
+
+An exposure's coefficients and its end state are jointly Gaussian, cov(z, end) = P E', E the rows of the end state, and
+between exposures the state goes on by the plant's transition A_g over the gap. So Rauch, Tung and Striebel's
+recursion runs from start state to start state and unfolds into paths: with x the next start, its prediction N(x-, P-)
+and all that is known of it N(x+, P+),
+
+    G = P E' A_g' P-^-1,    z <- z + G (x+ - x-),    P <- P + G (P+ - P-) G'.
+
+Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA J. 3 (1965), (3.30) to (3.32).
+The posteriors are taken as the estimator gave them: where it approximated, this does as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import EstimatorError
+from aolink.estimation import stacked
+from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.exposure_model import by_axis
+from aolink.exposure import Exposure
+from aolink.plant import input_response, lift
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+
+
+def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
+    """Estimates of one estimator corrected by all that came later.
+
+    Parameters
+    ----------
+    exposures, estimates:
+        One estimate for each exposure, in the order of time.
+
+    Returns
+    -------
+    The same with other states, coefficients, paths and covariances; status, innovation and NIS stay the filter's.
+    Where a filter started again, what came later says nothing of what was before.
+
+    Raises
+    ------
+    EstimatorError
+        The estimates are not those of the exposures.
+    """
+    if [e.frame_id for e in estimates] != [e.frame_id for e in exposures]:
+        raise EstimatorError(
+            f"{len(estimates)} estimates for {len(exposures)} exposures, or for other frames of the same number:"
+            " give one for each, in their order"
+        )
+    smoothed: list[Estimate] = []
+    for k in reversed(range(len(estimates))):
+        estimate = estimates[k]
+        if smoothed and smoothed[-1].status != Status.REINITIALISED:
+            estimate = _corrected(plant, exposures[k], estimate, exposures[k + 1], smoothed[-1])
+        smoothed.append(estimate)
+    return smoothed[::-1]
+
+
+def _corrected(
+    plant: Plant, exposure: Exposure, estimate: Estimate, next_exposure: Exposure, later: Estimate
+) -> Estimate:
+    """An estimate of the filter with what is known of the next exposure's start from all that came later."""
+    model = estimate.model
+    z, P = estimate.coefficients, estimate.coefficient_covariance
+    end, P_end = estimate.end_state, estimate.end_covariance
+    E = model.transition if z.shape[1] == plant.n_states else model.end_rows
+    transition, noise, kick = _gap(plant, exposure, next_exposure)
+    predicted = stacked.matvec(transition, end) + kick
+    spread = stacked.symmetric(stacked.congruence(transition, P_end) + noise)
+    innovation, change = later.start_state - predicted, later.start_covariance - spread
+    # A state that is known for certain has no inverse, and needs none.
+    inverse: FloatArray = np.linalg.pinv(spread, hermitian=True).astype(np.float64)
+
+    def corrected(mean: FloatArray, covariance: FloatArray, with_next: FloatArray) -> tuple[FloatArray, FloatArray]:
+        gain = stacked.matmul(with_next, inverse)
+        after = stacked.symmetric(covariance + stacked.congruence(gain, change))
+        return mean + stacked.matvec(gain, innovation), _without_negative(after)
+
+    to_next = stacked.transpose(transition @ E)
+    z, P = corrected(z, P, stacked.matmul(P, np.broadcast_to(to_next, (len(P), *to_next.shape))))
+    end, P_end = corrected(end, P_end, stacked.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)))
+    n = plant.n_states
+    return replace(
+        estimate, start_state=z[:, :n], start_covariance=P[:, :n, :n], end_state=end, end_covariance=P_end,
+        coefficients=z, coefficient_covariance=P,
+    )  # fmt: skip
+
+
+def _gap(plant: Plant, before: Exposure, after: Exposure) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Transition, noise and response to the inputs of the fast steps between two exposures."""
+    steps = max(0, after.first_step - before.first_step - before.n_steps)
+    transition, noise = lift(plant, steps)
+    if not steps:
+        return transition, noise, np.zeros((plant.axes, plant.n_states))
+    known = after.lead_inputs[-steps:]
+    held = np.tile(before.inputs[-1], (steps - len(known), 1))
+    _, kick = input_response(plant, by_axis(plant, np.concatenate([held, known])))
+    return transition, noise, kick
+
+
+def _without_negative(covariance: FloatArray) -> FloatArray:
+    """The same without the negative variances that rounding makes where much was known before."""
+    values, vectors = np.linalg.eigh(covariance)
+    return stacked.symmetric(stacked.matmul(vectors * np.maximum(values, 0.0)[:, None], stacked.transpose(vectors)))

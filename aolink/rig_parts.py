@@ -1,0 +1,166 @@
+"""The parts of a rig as frozen dataclasses: plant, timing, mirror driver, drive, and what only a simulated one has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.optics.mirror import VoltageLaw
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plant:
+    """The fast-rate plant, x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x(k)  (Mishra & Wen (1)).
+
+    ``axes`` independent copies of it make the rig; each has its own state, output and inputs.
+    """
+
+    A: FloatArray
+    """State transition over one fast step, (n_states, n_states)."""
+    B: FloatArray
+    """Input matrix, (n_states, n_inputs)."""
+    B_w: FloatArray
+    """Process-noise input matrix, (n_states, n_noises)."""
+    C: FloatArray
+    """Output matrix, (n_outputs, n_states); the outputs are spot positions in slope units."""
+    process_noise: FloatArray
+    """W_f, covariance of w(k) per fast step, (n_noises, n_noises)."""
+    initial_mean: FloatArray
+    """Mean of x(0), (n_states,)."""
+    initial_covariance: FloatArray
+    """Covariance of x(0), (n_states, n_states)."""
+    axes: int
+    """Number of independent copies."""
+
+    @property
+    def n_states(self) -> int:
+        return int(self.A.shape[0])
+
+    @property
+    def n_inputs(self) -> int:
+        """Inputs of one copy."""
+        return int(self.B.shape[1])
+
+    @property
+    def n_outputs(self) -> int:
+        """Outputs of one copy."""
+        return int(self.C.shape[0])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timing:
+    """Fast steps and exposures. Exposure j covers ``exposure_steps`` steps from j * ``frame_period_steps`` on."""
+
+    fast_step_s: float
+    """T_f, s."""
+    exposure_steps: int
+    """N, fast steps in one exposure."""
+    frame_period_steps: int
+    """Fast steps from the start of one exposure to the start of the next; at least N."""
+    exposure_offset: float = 0.0
+    """How far into its first fast step an exposure starts, in fast steps, below one; it ends as far into a step."""
+
+    @property
+    def fast_step_ns(self) -> int:
+        return round(self.fast_step_s * 1e9)
+
+    @property
+    def exposure_offset_ns(self) -> int:
+        return round(self.exposure_offset * self.fast_step_ns)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MirrorDriver:
+    """The mirror driver: limits, resolution, queue."""
+
+    input_min: FloatArray
+    """(axes * n_inputs,)"""
+    input_max: FloatArray
+    """(axes * n_inputs,)"""
+    park: FloatArray
+    """Declared safe input, (axes * n_inputs,)."""
+    dac_bits: int
+    """Commands are rounded to 2^dac_bits levels between the limits; 0 means not rounded."""
+    block_steps: int
+    """Fast steps in one command block."""
+    queue_steps: int
+    """Fast steps that the device can hold."""
+    watchdog_s: float
+    """The mirror parks itself when no valid packet has come for so long, s."""
+    voltage: VoltageLaw | None = None
+    """Where the driver makes voltages whose square pulls: they, not the inputs, are in equal steps."""
+
+    def quantise(self, u: FloatArray) -> FloatArray:
+        """The input that the converter puts out for ``u``, (..., axes * n_inputs)."""
+        if not self.dac_bits:
+            return u.copy()
+        if self.voltage is not None:
+            volt = self.voltage.max_v / ((1 << self.dac_bits) - 1)
+            return self.voltage.force(np.round(self.voltage.volts(u) / volt) * volt)
+        step = (self.input_max - self.input_min) / ((1 << self.dac_bits) - 1)
+        return self.input_min + np.round((u - self.input_min) / step) * step
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drive:
+    """The known input that a session plays when nothing closes the loop."""
+
+    kind: Literal["none", "sine"]
+    amplitude: FloatArray
+    """(axes * n_inputs,)"""
+    period_s: float
+    offset: FloatArray
+    """(axes * n_inputs,)"""
+
+    def inputs(self, first_step: int, n_steps: int, fast_step_s: float) -> FloatArray:
+        """Inputs for ``n_steps`` fast steps from ``first_step``, (n_steps, axes * n_inputs)."""
+        u = np.tile(self.offset, (n_steps, 1))
+        if self.kind == "sine":
+            t = np.arange(first_step, first_step + n_steps) * fast_step_s
+            u += np.sin(2 * np.pi * t / self.period_s)[:, None] * self.amplitude
+        return u
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """Faults that the simulated rig injects, by rate and by seed; all zero means a perfect link."""
+
+    bit_flip_rate: float = 0.0
+    """Probability that a packet from the device has one bit flipped."""
+    packet_loss_rate: float = 0.0
+    """Probability that a packet from the device is lost."""
+    command_loss_rate: float = 0.0
+    """Probability that a packet to the device is lost."""
+    duplicate_rate: float = 0.0
+    """Probability that a packet from the device is sent twice."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """What the simulated camera looks at, from one start of it to the next."""
+
+    kind: Literal["dark", "flat", "still", "moving"]
+    """Nothing; the same density everywhere; the spot held where it is when the camera starts; the spot."""
+    level: float | None = None
+    """Density of a flat, one over slope units; None: halfway from the black level to the full scale."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """What only the simulated rig needs to know."""
+
+    seed: int = 1
+    light: tuple[Light, ...] = (Light(kind="moving"),)
+    """Each start of the camera takes the next one; the last one stays."""
+    clock_offset_s: float = 0.0
+    """Device clock minus host clock at the start, s."""
+    clock_drift_ppm: float = 0.0
+    """How much faster the device clock runs than the host's, parts per million."""
+    latency_s: float = 100e-6
+    """Median one-way latency of the link on virtual time, s."""
+    faults: Faults = Faults()

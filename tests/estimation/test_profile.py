@@ -1,0 +1,220 @@
+"""The estimators of pixels: modes against the gradient and against sampling, claims, faults, independence of axes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aolink.estimation import Status, exposure_model, make_estimator, pixels, profile, run, score
+from aolink.estimation.estimators import measure
+from aolink.estimation.hypotheses import cholesky, single
+from aolink.estimation.mixture import explored, importance_corrected
+from aolink.estimation.observation import Belief
+from aolink.estimation.windowed import Profile, WindowedMoments
+from aolink.optics.camera import to_counts
+from aolink.optics.kernel import exposure_density
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+RIG = load_rig("section-vi-lively")
+PIXEL_ESTIMATORS = ["profile", "mixture"]
+
+
+def quiet(rig, V):
+    return dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=V))
+
+
+def seen(rig=RIG, *, width=1.0, seed=3):
+    """One exposure, with a prior of its start state so many times as wide as the plant's own, about the truth."""
+    (exposure,) = simulate(rig, 1, seed=seed)
+    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor), make_estimator(rig, "moments").options)
+    model = exposure_model(rig.plant, exposure.n_steps)
+    reduced = pixels.reduction(model, rig.sensor)
+    view = pixels.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
+    P = rig.plant.initial_covariance * width**2
+    offset = np.linalg.cholesky(P) @ np.random.default_rng(seed).standard_normal(2)
+    return view, Belief(exposure.truth.start_state + offset, P[None])
+
+
+def by_importance(view, state, count=60_000, seed=1):
+    """Mean and covariance of the posterior of t by plain importance sampling from the prior; and how many count."""
+    prior = view.reduced.prior(state)
+    e = np.random.default_rng(seed).standard_normal((count, view.reduced.size))
+    t = prior.mean + e @ cholesky(prior.covariance)[0].T
+    logs = np.concatenate([view.log_likelihood(view.predicted_of_many(part[None]))[0] for part in np.split(t, 20)])
+    w = np.exp(logs - logs.max())
+    w /= w.sum()
+    mean = w @ t
+    return mean, (w[:, None] * (t - mean)).T @ (t - mean), 1 / (w @ w)
+
+
+# Modes
+
+
+def test_the_gradient_is_zero_at_a_mode():
+    view, state = seen(quiet(RIG, 0.001), width=0.3)
+    prior = view.reduced.prior(state)
+    start = profile.whitened(prior, profile.broad(view, prior).mean[:, None])
+    modes = profile.find_modes(view, prior, start, passes=60)
+    inverse = np.linalg.inv(prior.covariance[0])
+
+    def objective(t):
+        away = t - prior.mean[0]
+        return 0.5 * away @ inverse @ away - view.log_likelihood(view.predicted(t[None, None]))[0, 0]
+
+    t, root = modes.mean[0, 0], np.linalg.cholesky(modes.covariance[0, 0])
+    assert objective(t) == pytest.approx(modes.objective[0, 0], abs=1e-6)
+    for direction in root.T:  # one standard deviation each
+        slope = (objective(t + 1e-4 * direction) - objective(t - 1e-4 * direction)) / 2e-4
+        assert abs(slope) < 0.05
+    assert objective(t) < min(objective(t + s * d) for d in root.T for s in (-0.5, 0.5))
+
+
+@pytest.mark.parametrize("photoelectrons", [0.0, 500.0])
+def test_posterior_is_that_of_importance_sampling(photoelectrons):
+    """Where the spot moves by less than the kernel's width, the posterior is a Gaussian."""
+    rig = load_rig("section-vi")
+    rig = dataclasses.replace(
+        rig, sensor=dataclasses.replace(rig.sensor, noise_density=0.005, photoelectrons=photoelectrons)
+    )
+    view, state = seen(rig)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 300
+    update = profile.ProfileUpdates().update(view, single(state), 0)
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.25)
+    np.testing.assert_allclose(np.sqrt(np.diag(update.coefficients.covariance[0])) / sd, 1.0, atol=0.15)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
+    view, state = seen(quiet(RIG, 0.01), width=0.5, seed=seed)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 100
+    _, proposal = explored(view, single(state))
+    after, points = importance_corrected(view, single(state), proposal)
+    assert points[0] > 40
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(after.belief.mean[0] / sd, mean / sd, atol=0.3)
+    np.testing.assert_allclose(np.sqrt(np.diag(after.belief.covariance[0])) / sd, 1.0, atol=0.25)
+
+
+def test_a_path_and_its_reversal_are_two_readings():
+    """From a start state at rest, with no preference, a fast sweep may have gone either way."""
+    rig = quiet(RIG, 0.001)
+    model = exposure_model(rig.plant, 200)
+    reduced = pixels.reduction(model, rig.sensor)
+    path = np.linspace(-0.2, 0.2, 200)
+    rng = np.random.default_rng(1)
+    density = exposure_density(rig.sensor.kernel, rig.sensor.edges, path) + 0.14 * rng.standard_normal(40)
+    measured = Profile(density=density[None], mask=np.ones((1, 40), bool))
+    view = pixels.PixelView(rig.sensor, model, model.response(np.zeros((200, 1))), measured, reduced)
+    P = np.diag([0.04, 25.0])
+    update = profile.ProfileUpdates().update(view, single(Belief(np.zeros((1, 2)), P[None])), 0)
+    assert update.several[0]
+    modes, _ = explored(view, single(Belief(np.zeros((1, 2)), P[None])))
+    there = np.isfinite(modes.log_evidence[0])
+    ends = view.paths(modes.mean)[0, there][:, 0, [0, -1]]
+    evidence = modes.log_evidence[0, there]
+    forth, back = evidence[ends[:, 1] > ends[:, 0]].max(), evidence[ends[:, 1] < ends[:, 0]].max()
+    assert abs(forth - back) < 3.0
+    np.testing.assert_allclose(np.sort(ends[np.argmax(evidence)]), [-0.2, 0.2], atol=0.06)
+
+
+# What they are good for
+
+
+def squared(exposures, estimates, skip=5):
+    return np.array([np.mean((e.path - x.truth.path) ** 2) for x, e in zip(exposures, estimates, strict=True)])[skip:]
+
+
+@pytest.mark.parametrize("V", [0.1, 0.01, 0.001])
+def test_better_than_o1_and_right_about_it(V):
+    rig = quiet(RIG, V)
+    exposures = simulate(rig, 45, seed=8, inputs=np.zeros((9_000, 1)))
+    found = run(rig, exposures, ["o1", "moments", *PIXEL_ESTIMATORS])
+    o1, moments = (squared(exposures, found[name]).mean() for name in ("o1", "moments"))
+    for name in PIXEL_ESTIMATORS:
+        ours = squared(exposures, found[name]).mean()
+        assert ours < 0.5 * o1
+        assert ours < 1.1 * moments
+        result = score(exposures, found[name], 5)
+        assert 1.0 < result.start_nees.mean < 3.2
+        assert 1.0 < result.end_nees.mean < 3.2
+        inside = [np.abs(e.path - x.truth.path) < 1.96 * e.path_sd for x, e in zip(exposures, found[name], strict=True)]
+        assert 0.9 < np.mean(inside[5:]) < 0.995
+        assert {e.status for e in found[name]} == {Status.OK}
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_order_matters(name):
+    """Frames fed in another order must ruin the estimate: it is the frames that it lives by."""
+    exposures = simulate(RIG, 24, seed=9)
+    order = np.random.default_rng(1).permutation(24)
+    shuffled = [dataclasses.replace(e, pixels=exposures[k].pixels) for e, k in zip(exposures, order, strict=True)]
+    right, wrong = (squared(exposures, run(RIG, each, [name])[name]).mean() for each in (exposures, shuffled))
+    assert wrong > 9 * right
+
+
+# Trust
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_missing_and_saturated_pixels_are_left_out(name):
+    exposures = simulate(RIG, 24, seed=5)
+    holed = []
+    for e in exposures:
+        pixels_, mask = e.pixels.copy(), e.mask.copy()
+        pixels_[0, 17], pixels_[0, 25] = 0, 65535
+        mask[0, 17] = False
+        holed.append(dataclasses.replace(e, pixels=pixels_, mask=mask))
+    whole, given = (run(RIG, series, [name])[name] for series in (exposures, holed))
+    assert {e.status for e in given} == {Status.OK}
+    assert "left out" in given[0].reason
+    assert squared(exposures, given).mean() < 1.5 * squared(exposures, whole).mean()
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
+    exposures = simulate(RIG, 24, seed=6)
+    moved = exposures[:10]
+    for e in exposures[10:]:
+        path = np.clip(e.truth.path - 0.8 * np.sign(e.truth.path.mean()), -0.9, 0.9)
+        noise = np.random.default_rng(e.frame_id).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
+        moved.append(
+            dataclasses.replace(
+                e, pixels=to_counts(RIG.sensor, exposure_density(RIG.sensor.kernel, RIG.sensor.edges, path) + noise)
+            )
+        )
+    estimates = run(RIG, moved, [name])[name]
+    statuses = [e.status for e in estimates]
+    assert set(statuses[:10]) == {Status.OK}
+    assert statuses[10] == Status.GATED
+    assert {Status.DIVERGED, Status.REINITIALISED} & set(statuses[10:])
+    for e in estimates:
+        assert np.isfinite(e.path).all()
+        assert np.linalg.eigvalsh(e.coefficient_covariance[0]).min() > -1e-12
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+@pytest.mark.parametrize("axes", [1, 7])
+def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
+    rng = np.random.default_rng(4)
+    paths = rng.uniform(-0.3, 0.3, (2, 40, 1)) + 0.1 * np.sin(np.linspace(0, 6, 200))
+    density = exposure_density(RIG.sensor.kernel, RIG.sensor.edges, paths) + 0.3 * rng.standard_normal((2, 40, 40))
+
+    def estimates(rows):
+        from aolink.estimation.estimators import _OF_PIXELS
+        from aolink.estimation.hypothesis_filter import HypothesisFilter
+
+        plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(40))))
+        own = HypothesisFilter(plant, RIG.sensor, _OF_PIXELS[name](make_estimator(RIG, name).options))
+        model = exposure_model(plant, 200)
+        response = model.response(np.zeros((200, plant.axes)))
+        return [own.step(model, response, Profile(density=d[rows], mask=np.ones(d[rows].shape, bool))) for d in density]
+
+    some = slice(3, 3 + axes)
+    for alone, together in zip(estimates(some), estimates(slice(0, 40)), strict=True):
+        assert alone.coefficients.mean.tobytes() == together.coefficients.mean[some].tobytes()
+        assert alone.coefficients.covariance.tobytes() == together.coefficients.covariance[some].tobytes()
+        assert alone.nis.tobytes() == together.nis[some].tobytes()
