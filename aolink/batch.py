@@ -8,8 +8,10 @@ import itertools
 import json
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, wait
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -18,7 +20,7 @@ from typing import Any
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
-from aolink.errors import AolinkError, RigError
+from aolink.errors import AolinkError, RecordingError, RigError
 from aolink.estimation import Engine, Scorer
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import recorded_estimates, write_reestimated
@@ -28,9 +30,10 @@ from aolink.workers import processes
 COLUMNS = (
     "recording", "model", "estimator", "exposures", "path_rmse", "start_rmse", "end_rmse",
     "nis", "nis_low", "nis_high", "start_nees", "end_nees", "nees_low", "nees_high", "not_ok", "seconds", "output",
-    "error",
+    "damage", "error",
 )  # fmt: skip
 """Of the table: one row for each recording, model and estimator; what is not known is empty."""
+_IN_EVERY_ROW = {"recording", "model", "estimator", "exposures", "output"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +41,7 @@ class Model:
     """The rig that recordings are estimated with: their own, or another, with some values changed."""
 
     name: str = ""
-    """What was changed; empty for the recording's own."""
+    """The other rig's name and what was changed; empty for the recording's own."""
     rig_text: str | None = None
     """Instead of the rig file in the recording."""
     changes: tuple[tuple[str, Any], ...] = ()
@@ -62,6 +65,13 @@ class Job:
     """Empty: those that the recording has."""
     output: Path
     engine: Engine = "aolink"
+    overwrite: bool = False
+    """Do it even if it was done before."""
+
+    @property
+    def partial(self) -> Path:
+        """What the output is called while it is written."""
+        return self.output.with_suffix(".mcap.partial")
 
     @property
     def record(self) -> Path:
@@ -76,10 +86,6 @@ class Job:
             status.st_size,
             status.st_mtime_ns,
             version("aolink"),
-            self.estimators,
-            self.engine,
-        ]
-        facts += [
             self.estimators,
             self.engine,
             self.model.rig_text,
@@ -99,25 +105,35 @@ class Done:
     skipped: bool = False
     """It had been done before."""
 
+    @property
+    def damage(self) -> str:
+        """What of the recording could not be read, in words; empty where all could."""
+        return str(self.rows[0].get("damage") or "") if self.rows else ""
 
-def models(rig_text: str | None, settings: Sequence[str]) -> list[Model]:
-    """The models that ``--rig`` and ``--set KEY=VALUE,VALUE`` ask for: every combination of the values.
+
+def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") -> list[Model]:
+    """The models that ``--rig`` and ``--set KEY=VALUE,VALUE`` ask for: every combination of the different values.
 
     Raises
     ------
     RigError
         A setting is not of that form.
     """
-    axes = []
+    axes: dict[str, list[Any]] = {}
     for setting in settings:
         key, equals, values = setting.partition("=")
         if not equals or not key.strip() or not values.strip():
             raise RigError(f"--set {setting}: KEY=VALUE or KEY=VALUE,VALUE is needed, as plant.process_noise=0.2,0.4")
-        axes.append([(key.strip(), value) for value in _values(values, setting)])
-    return [
-        Model(name=" ".join(f"{key}={_short(value)}" for key, value in each), rig_text=rig_text, changes=each)
-        for each in itertools.product(*axes)
-    ]
+        known = axes.setdefault(key.strip(), [])
+        for value in _values(values, setting):
+            if value not in known:
+                known.append(value)
+    made = []
+    for values_of_one in itertools.product(*axes.values()):
+        changes = tuple(zip(axes, values_of_one, strict=True))
+        name = " ".join([rig_name, *(f"{key}={_short(value)}" for key, value in changes)]).strip()
+        made.append(Model(name=name, rig_text=rig_text, changes=changes))
+    return made
 
 
 def jobs(
@@ -126,16 +142,36 @@ def jobs(
     estimators: Sequence[str],
     folder: Path,
     engine: Engine = "aolink",
+    *,
+    overwrite: bool = False,
 ) -> list[Job]:
-    """Every recording with every model. Raises RigError if two would write the same file."""
+    """Every recording with every model; with ``overwrite`` also those that were done before.
+
+    Raises
+    ------
+    RigError
+        Two would write the same file.
+    RecordingError
+        An output would take the place of a recording that is read, or, without ``overwrite``, of a file that no
+        job has written.
+    """
     made = []
     for source, model in itertools.product(sources, each):
         suffix = "".join(c if c.isalnum() or c in "=.-_" else "-" for c in model.name.replace("plant.", ""))
         name = f"{source.stem}-{suffix}" if suffix else source.stem
-        made.append(Job(source, model, tuple(dict.fromkeys(estimators)), folder / f"{name}.mcap", engine))
+        made.append(Job(source, model, tuple(dict.fromkeys(estimators)), folder / f"{name}.mcap", engine, overwrite))
     names = [job.output for job in made]
     if doubled := {name for name in names if names.count(name) > 1}:
         raise RigError(f"two recordings would be written as {doubled.pop().name}: give them different names")
+    for job in made:
+        if not job.output.exists():
+            continue
+        if any(source.exists() and job.output.samefile(source) for source in sources):
+            raise RecordingError(f"{job.output} is one of the recordings: give another folder for the results")
+        if not overwrite and _record(job.record) is None:
+            raise RecordingError(
+                f"{job.output} exists and is no result of a batch: give another folder, or --overwrite to replace it"
+            )
     return made
 
 
@@ -146,41 +182,64 @@ def run(
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda done: None,
 ) -> Iterator[Done]:
-    """Do the jobs on ``workers`` processes; gives each when it is done, in no order. A failed one stops no other."""
+    """Do the jobs on ``workers`` processes; gives each when it is done, in no order. A failed one stops no other.
+
+    When ``stop()`` says so no other job is begun, and those that are on the way are ended in good order.
+    """
     fresh: list[Job] = []
     for job in todo:
-        before = _done_before(job)
+        before = None if job.overwrite else _done_before(job)
         if before is None:
             fresh.append(job)
         else:
             yield before
     count = len(todo) - len(fresh)
     progress(count)
-    if workers == 1 or len(fresh) < 2:
-        for job in fresh:
-            if stop():
-                return
-            yield _do(job)
-            progress(count := count + 1)
-        return
-    with processes(workers) as pool:
-        waiting = {pool.submit(_do, job) for job in fresh}
-        while waiting and not stop():
-            finished, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield future.result()
-                progress(count := count + 1)
+    each = map(_do, itertools.takewhile(lambda job: not stop(), fresh))
+    for done in each if workers == 1 or len(fresh) < 2 else _in_parallel(fresh, workers, stop):
+        yield done
+        progress(count := count + 1)
 
 
-def write_table(path: Path, done: Sequence[Done]) -> None:
-    """Write all rows as CSV, or as Parquet if the name ends with .parquet, in the order of recording and model.
+def _in_parallel(todo: Sequence[Job], workers: int, stop: Callable[[], bool]) -> Iterator[Done]:
+    queue = deque(todo)
+    while queue and not stop():  # again, if a process was lost and its pool with it
+        running: dict[Future[Done], Job] = {}
+        lost = False
+        try:
+            with processes(workers) as pool:
+                while running or (queue and not lost and not stop()):
+                    # No more than can run: what waits in a pool cannot be taken back.
+                    while queue and not lost and len(running) < workers and not stop():
+                        try:
+                            running[pool.submit(_do, queue[0])] = queue[0]
+                        except BrokenProcessPool:
+                            lost = True
+                        else:
+                            queue.popleft()
+                    finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+                    for future in finished:
+                        job = running.pop(future)
+                        try:
+                            done = future.result()
+                        except BrokenProcessPool:
+                            lost = True
+                            done = Done(job, [], "its process was ended from outside: too little memory, or a signal")
+                        yield done
+        finally:
+            for job in running.values():
+                for path in (job.partial, job.partial.with_name(f".{job.partial.name}.partial")):
+                    path.unlink(missing_ok=True)
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of `COLUMNS` as CSV, or as Parquet if the name ends with .parquet.
 
     Raises
     ------
     AolinkError
         It cannot be written, or pyarrow is missing for Parquet.
     """
-    rows = table_rows(done)
     partial = path.with_name(f".{path.name}.new")
     try:
         if path.suffix == ".parquet":
@@ -189,7 +248,7 @@ def write_table(path: Path, done: Sequence[Done]) -> None:
                 import pyarrow.parquet as pq
             except ImportError:
                 raise AolinkError("Parquet needs pyarrow: pip install 'aolink[parquet]', or write .csv") from None
-            pq.write_table(pa.Table.from_pylist(rows), partial)
+            pq.write_table(pa.Table.from_pylist([dict(row) for row in rows]), partial)
         else:
             with partial.open("w", newline="") as file:
                 writer = csv.DictWriter(file, COLUMNS)
@@ -202,26 +261,51 @@ def write_table(path: Path, done: Sequence[Done]) -> None:
         partial.unlink(missing_ok=True)
 
 
-def table_rows(done: Sequence[Done]) -> list[dict[str, Any]]:
-    """Rows of all jobs by `COLUMNS`, sorted; a failed job has one with its error."""
+def table_rows(done: Sequence[Done], folder: Path) -> list[dict[str, Any]]:
+    """Rows by `COLUMNS` of these jobs, and of those whose results are in the folder from before, sorted.
+
+    A failed job has one row, with its error.
+    """
     rows = []
     for each in done:
         failed = {"recording": str(each.job.source), "model": each.job.model.name, "error": each.error}
         rows += [dict.fromkeys(COLUMNS) | row for row in (each.rows or [failed])]
+    known = {each.job.record.resolve() for each in done}
+    for path in folder.glob("*.json"):
+        if path.resolve() not in known and path.with_suffix(".mcap").exists() and (record := _record(path)):
+            rows += [dict.fromkeys(COLUMNS) | row for row in record["rows"]]
     return sorted(rows, key=lambda row: (row["recording"], row["model"]))
+
+
+def _record(path: Path) -> dict[str, Any] | None:
+    """What a job has written of itself; None if there is nothing, or something else."""
+    try:
+        record = json.loads(path.read_text())
+        rows = record["rows"]
+        if isinstance(record["digest"], str) and rows and all(_IN_EVERY_ROW <= {*row} <= {*COLUMNS} for row in rows):
+            return dict(record)
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return None
 
 
 def _do(job: Job) -> Done:
     """Estimate a recording again; whatever goes wrong is the result."""
-    partial = job.output.with_suffix(".mcap.partial")
+    record = job.record.with_suffix(".json.partial")
     try:
-        rows = _estimated(job, partial)
-        partial.replace(job.output)
-        job.record.write_text(json.dumps({"digest": job.digest(), "rows": rows}))
+        rows = _estimated(job, job.partial)
+        record.write_text(json.dumps({"digest": job.digest(), "rows": rows}))
+        # A result is never there without the record that says whose it is and what it depends on.
+        job.output.unlink(missing_ok=True)
+        record.replace(job.record)
+        job.partial.replace(job.output)
     except (AolinkError, OSError) as error:
         return Done(job, [], f"{error}")
+    except Exception as error:  # a value that nobody thought of stops no other job
+        return Done(job, [], f"it cannot be estimated with this model: {error!r}")
     finally:
-        partial.unlink(missing_ok=True)
+        job.partial.unlink(missing_ok=True)
+        record.unlink(missing_ok=True)
     return Done(job, rows)
 
 
@@ -257,17 +341,18 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
             {
                 "recording": str(job.source), "model": job.model.name, "estimator": name, "exposures": count,
                 **known, "not_ok": not_ok[name], "seconds": round(seconds, 3), "output": job.output.name,
+                "damage": recording.damage or None,
             }
         )  # fmt: skip
     return rows
 
 
 def _done_before(job: Job) -> Done | None:
+    record = _record(job.record)
     try:
-        before = json.loads(job.record.read_text())
-        if before["digest"] == job.digest() and job.output.exists():
-            return Done(job, before["rows"], skipped=True)
-    except (OSError, ValueError, KeyError, TypeError):
+        if record and record["digest"] == job.digest() and job.output.exists():
+            return Done(job, record["rows"], skipped=True)
+    except OSError:  # there is no such recording: the job will say so
         pass
     return None
 

@@ -10,11 +10,16 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_PATIENCE_S = 3.0
+"""For a process that was told to end."""
 
 
 @contextmanager
 def processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C is for this process alone."""
+    """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C is for this process alone.
+
+    Whatever is raised in the block ends the processes at once.
+    """
     environment = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -23,8 +28,15 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
         ) as pool:
             try:
                 yield pool
-            finally:
+            except BaseException:
+                running = list((pool._processes or {}).values())
+                for process in running:
+                    process.terminate()
                 pool.shutdown(wait=False, cancel_futures=True)
+                for process in running:
+                    process.join(_PATIENCE_S)
+                    process.kill()
+                raise
     finally:
         for name, value in environment.items():
             if value is None:

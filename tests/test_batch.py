@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import multiprocessing
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from aolink import batch
-from aolink.errors import RigError
+from aolink.errors import RecordingError, RigError
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
@@ -76,6 +77,121 @@ def test_what_was_done_is_not_done_again_until_something_changes(recorded: Sessi
     assert not next(batch.run(todo, 1)).skipped
     todo[0].output.unlink()
     assert not next(batch.run(todo, 1)).skipped
+
+
+def test_values_given_twice_are_one_model_and_another_rig_names_its_models() -> None:
+    settings = ["plant.process_noise=5,10,5.0", "plant.process_noise=10", "drive.amplitude=[0.1],[0.1]"]
+    names = [each.name for each in batch.models("", settings, "mine")]
+    assert names == [f"mine plant.process_noise={value} drive.amplitude=[0.1]" for value in (5, 10)]
+    (job,) = batch.jobs([Path("s.mcap")], batch.models("", [], "mine"), [], Path("out"))
+    assert job.output.name == "s-mine.mcap"
+
+
+def test_the_table_has_what_is_in_the_folder_from_before(recorded: Session, tmp_path: Path) -> None:
+    """And nothing else: neither files of others, nor results that are gone, nor rows twice."""
+
+    def rows(*values: str) -> list[tuple[str, float]]:
+        settings = [f"plant.process_noise={','.join(values)}"]
+        done = list(batch.run(batch.jobs([recorded.path], batch.models(None, settings), ["o3"], tmp_path), 1))
+        return [(row["model"], row["path_rmse"]) for row in batch.table_rows(done, tmp_path)]
+
+    (first,) = rows("5")
+    (tmp_path / "other.json").write_text('{"digest": "a", "rows": [{"recording": "x"}]}')
+    (tmp_path / "other.mcap").touch()
+    both = rows("10")
+    assert [name for name, _ in both] == ["plant.process_noise=10", "plant.process_noise=5"]
+    assert both[1] == first
+    assert rows("5", "10") == both
+    next(tmp_path.glob("*noise=10.mcap")).unlink()
+    assert rows("5") == [first]
+
+
+def test_nothing_is_written_over_but_results(recorded: Session, tmp_path: Path) -> None:
+    shutil.copy(recorded.path, source := tmp_path / "s.mcap")
+    kept = source.read_bytes()
+    for overwrite in (False, True):
+        with pytest.raises(RecordingError, match=r"s\.mcap is one of the recordings"):
+            batch.jobs([source], batch.models(None, []), ["o1"], tmp_path, overwrite=overwrite)
+    (link := tmp_path / "t.mcap").hardlink_to(source)
+    with pytest.raises(RecordingError, match=r"s\.mcap is one of the recordings"):
+        batch.jobs([source.parent.parent / "s.mcap", link], batch.models(None, []), [], tmp_path, overwrite=True)
+    assert source.read_bytes() == kept
+    (out := tmp_path / "out").mkdir()
+    (out / "s.mcap").write_text("mine")
+    with pytest.raises(RecordingError, match="is no result of a batch"):
+        batch.jobs([source], batch.models(None, []), ["o1"], out)
+    for _ in range(2):
+        (done,) = batch.run(batch.jobs([source], batch.models(None, []), ["o1"], out, overwrite=True), 1)
+        assert not done.skipped
+    (done,) = batch.run(batch.jobs([source], batch.models(None, []), ["o1"], out), 1)
+    assert done.skipped
+    assert {each.name for each in out.iterdir()} == {"s.mcap", "s.json"}
+
+
+def test_damage_of_a_recording_is_in_its_row(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(recorded.path.read_bytes()[:-3000])
+    shutil.copy(recorded.path, tmp_path / "whole.mcap")
+    result = aolink("estimate", "cut.mcap", "whole.mcap", "-e", "o1", "-o", "out/", "--json")
+    cut, whole = json.loads(result.stdout)
+    assert cut["damage"] == Recording(tmp_path / "cut.mcap").damage
+    assert not whole["damage"]
+    assert f"warning: cut.mcap: {cut['damage']}" in result.stderr
+    assert "warning: whole.mcap" not in result.stderr
+
+
+def test_an_absurd_value_fails_alone(recorded: Session, tmp_path: Path) -> None:
+    models = batch.models(None, ["sensor.counts_per_density=1e-300,300"])
+    bad, good = batch.run(batch.jobs([recorded.path], models, ["moments"], tmp_path), 1)
+    assert bad.error
+    assert not good.error
+    assert {each.suffix for each in tmp_path.iterdir()} == {".mcap", ".json"}
+
+
+def several(recorded: Session, folder: Path) -> list[batch.Job]:
+    models = batch.models(None, ["plant.process_noise=1,2,3,4,5,6"])
+    return batch.jobs([recorded.path], models, ["o1"], folder)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_stopped_no_job_is_begun_and_those_on_the_way_count(recorded: Session, tmp_path: Path, workers: int) -> None:
+    todo, done = several(recorded, tmp_path), list[batch.Done]()
+    for each in batch.run(todo, workers, stop=lambda: bool(done)):
+        done.append(each)
+    assert 1 <= len(done) <= workers + 1
+    assert not any(each.error for each in done)
+    assert {each.job.output for each in done} == {*tmp_path.glob("*.mcap")}
+    assert {*tmp_path.iterdir()} == {path for each in done for path in (each.job.output, each.job.record)}
+
+
+def test_stopped_twice_the_processes_end_at_once_and_leave_nothing_half(recorded: Session, tmp_path: Path) -> None:
+    """The second Ctrl-C is raised where the pool is waited for."""
+
+    def stop() -> bool:
+        if [*tmp_path.glob("*.partial")]:
+            raise KeyboardInterrupt
+        return False
+
+    with pytest.raises(KeyboardInterrupt):
+        list(batch.run(several(recorded, tmp_path), 2, stop=stop))
+    assert not multiprocessing.active_children()
+    assert not [*tmp_path.glob("*.partial"), *tmp_path.glob(".*")]
+
+
+def test_a_process_that_is_killed_costs_its_own_jobs(recorded: Session, tmp_path: Path) -> None:
+    killed = list[int]()
+
+    def stop() -> bool:
+        for process in multiprocessing.active_children() if not killed and [*tmp_path.glob("*.partial")] else ():
+            killed.append(process.pid or 0)
+            process.kill()
+            break
+        return False
+
+    done = list(batch.run(several(recorded, tmp_path), 2, stop=stop))
+    assert len(done) == 6
+    failed = [each.error for each in done if each.error]
+    assert 1 <= len(failed) <= 2
+    assert all("ended from outside" in each for each in failed)
 
 
 def test_two_names_that_are_one_are_refused(tmp_path: Path) -> None:

@@ -104,8 +104,8 @@ def estimate(
 
     if output is None:
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
-    models = batch.models(load_rig(rig).toml if rig else None, settings or [])
-    todo = batch.jobs(files, models, estimator or [], output, engine.value)
+    models = batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
+    todo = batch.jobs(files, models, estimator or [], output, engine.value, overwrite=overwrite)
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -117,8 +117,10 @@ def estimate(
             done.append(each)
             if each.error:
                 stderr.print(f"aolink: {each.job.source} {each.job.model.name}: {each.error}", markup=False)
-    batch.write_table(table, done)
-    rows = batch.table_rows(done)
+            if each.damage:
+                stderr.print(f"aolink: warning: {each.job.source}: {each.damage}", markup=False)
+    rows = batch.table_rows(done, output)
+    batch.write_table(table, rows)
     if as_json:
         print(json.dumps(rows, allow_nan=False))
     else:

@@ -91,7 +91,8 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
 
 
 def _is_exposure(info: pb.ExposureInfo) -> bool:
-    return 0 <= info.last_step - info.first_step < _MOST_STEPS
+    whole_runs = len(info.missing_offset) == len(info.missing_length)
+    return whole_runs and 0 <= info.last_step - info.first_step < _MOST_STEPS
 
 
 def estimate_message(estimate: Estimate) -> pb.Estimate:

@@ -96,6 +96,8 @@ class Recording:
         self.start_ns = self.end_ns = 0
         """Log times of the first and of the last message."""
         self._losses: dict[int, Loss] = {}
+        self._undecoded: dict[str, dict[tuple[int, int], int]] = {}
+        """Messages that are not of their kind, by topic: sequence, log time and length."""
         self._channels: dict[int, tuple[str, str]] = {}
         """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
@@ -116,7 +118,12 @@ class Recording:
     @property
     def losses(self) -> list[Loss]:
         """What of the file could not be read, as far as it has been read, in the order of the file."""
-        return [self._losses[offset] for offset in sorted(self._losses)]
+        found = [self._losses[offset] for offset in sorted(self._losses)]
+        for topic, messages in self._undecoded.items():
+            times = [time_ns for _, time_ns in messages]
+            what = f"{len(messages)} message(s) on {topic} cannot be decoded"
+            found.append(Loss(0, sum(messages.values()), what, min(times), max(times)))
+        return found
 
     @property
     def damage(self) -> str:
@@ -161,7 +168,8 @@ class Recording:
             try:
                 message = kind.FromString(raw.data)
             except DecodeError:
-                raise RecordingError(f"{self.path}: a message on {raw.topic} is damaged") from None
+                self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
+                continue
             yield RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
 
     def raw_messages(
@@ -280,7 +288,7 @@ class Recording:
         rig_texts: dict[str, str] = {}
         with open_recording(self.path) as file:
             summary = None if check else read_summary(file)
-            if summary is not None:
+            if summary is not None and summary.is_index and summary.statistics is not None:
                 self._index = summary.chunks
                 for schema in summary.schemas.values():
                     self.schemas[schema.name] = schema
@@ -297,10 +305,11 @@ class Recording:
                 return rig_texts.get(topics.RIG_ATTACHMENT, rig_texts.get(topics.RIG_METADATA))
         ids: dict[int, str] = {}
         names: dict[int, int] = {}
+        first_ns: int | None = None
         for record, sure in self._scanned():
             if isinstance(record, McapMessage):
                 names[record.channel_id] = names.get(record.channel_id, 0) + 1
-                self.start_ns = min(self.start_ns or record.log_time, record.log_time)
+                first_ns = record.log_time if first_ns is None else min(first_ns, record.log_time)
                 self.end_ns = max(self.end_ns, record.log_time)
             elif isinstance(record, Schema):
                 if sure or record.id not in ids:
@@ -313,6 +322,7 @@ class Recording:
                     self._channels[record.id] = (record.topic, kind)
             else:
                 self._note(record, rig_texts)
+        self.start_ns = first_ns or 0
         for channel_id, count in names.items():
             if channel_id in self._channels:
                 self.counts[self._channels[channel_id][0]] = count

@@ -3,13 +3,14 @@
 A recording is a sequence of records, [opcode u8 | length u64 | content]; messages are in chunks, which
 have a checksum each. Damage costs the chunk that it is in: where a length is damaged, the scan goes on at
 the next bytes that can only be a chunk or the end of the data. Nothing in the file is believed about
-sizes, so a hostile file costs no memory.
+sizes, so a hostile file costs no memory, and no more time than a few readings of it.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import stat
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -38,18 +39,24 @@ from mcap.records import (
     Statistics,
 )
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import breakup_chunk
 
 from aolink.errors import RecordingError
 
 MAX_RECORD = 256 << 20
 """Bytes; a larger record is damage, not data."""
+MAX_CHUNK = 128 << 20
+"""Bytes without compression: the largest that is written, 64 MiB, and the message that it ends with."""
+_MOST_READINGS = 4
+"""How many times the file's size is read, at most, of records that turn out to be none."""
 _MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 """First and last log time, size and CRC without compression, length of the compression's name."""
 _FOOTER_BYTES = _HEAD.size + 20 + len(_MAGIC)
 _SEARCH_BYTES = 1 << 20
+_LOOK_BYTES = 320
+"""Of a record's first bytes; the name of metadata of ours is shorter than 256."""
+_BEFORE_INDEX = (Opcode.CHUNK, Opcode.MESSAGE_INDEX)
 _COMPRESSIONS = (b"lz4", b"zstd", b"")
 _CANDIDATE = re.compile(rb"[\x06\x0f].{4}\x00{4}|\x0c.{4}\x00{4}.\x00{3}aolink", re.DOTALL)
 """A chunk (6), the end of the data (15) or metadata of ours (12), with a length below 4 GiB."""
@@ -58,6 +65,7 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
+    Opcode.MESSAGE: lambda stream: _read_message(stream),
     Opcode.CHUNK: Chunk.read,
     Opcode.CHUNK_INDEX: ChunkIndex.read,
     Opcode.ATTACHMENT: Attachment.read,
@@ -68,6 +76,8 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.FOOTER: Footer.read,
 }
 """What is looked into; message indexes and other records are stepped over."""
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""Channel, sequence, log time and publish time."""
 _LENGTHS: dict[int, int] = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
 """Content that is of one length always."""
 _KNOWN = {*_PARSERS, *_LENGTHS}
@@ -100,11 +110,27 @@ class Loss:
 class Summary:
     """What the end of a file says about it."""
 
-    statistics: Statistics
+    statistics: Statistics | None = None
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     others: list[AttachmentIndex | MetadataIndex] = field(default_factory=list)
+
+    @property
+    def is_index(self) -> bool:
+        """Whether everything in the file can be found by it: writers may leave out what they like."""
+        known = self.statistics
+        if known is None or (known.message_count and not known.chunk_count):
+            return False
+        counts = known.channel_message_counts
+        attachments = sum(isinstance(each, AttachmentIndex) for each in self.others)
+        return (
+            known.chunk_count == len(self.chunks)
+            and (known.attachment_count, known.metadata_count) == (attachments, len(self.others) - attachments)
+            and known.message_count == sum(counts.values())
+            and all(channel in self.channels for channel, count in counts.items() if count)
+            and all(each.schema_id in self.schemas or not each.schema_id for each in self.channels.values())
+        )
 
 
 def open_recording(path: Path) -> IO[bytes]:
@@ -116,6 +142,8 @@ def open_recording(path: Path) -> IO[bytes]:
         It cannot be read, or is no MCAP file, nor what is left of one.
     """
     try:
+        if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+            raise RecordingError(f"{path} is a pipe or a device: a recording must be a file, copy it into one")
         file = path.open("rb")
         head = file.read(len(_MAGIC) + _HEAD.size)
     except OSError as error:
@@ -131,7 +159,10 @@ def open_recording(path: Path) -> IO[bytes]:
 
 
 def read_summary(file: IO[bytes]) -> Summary | None:
-    """The summary at a file's end; None if the file was cut off, or what it says fails its checksum."""
+    """The summary at a file's end; None if the file was cut off, or what it says fails its checksum.
+
+    Empty where the writer has left it out.
+    """
     size = file.seek(0, os.SEEK_END)
     if size < len(_MAGIC) + _FOOTER_BYTES:
         return None
@@ -140,8 +171,9 @@ def read_summary(file: IO[bytes]) -> Summary | None:
     opcode, length = _HEAD.unpack_from(tail)
     start, _, crc = struct.unpack_from("<QQI", tail, _HEAD.size)
     end = size - _FOOTER_BYTES
-    if not tail.endswith(_MAGIC) or (opcode, length) != (Opcode.FOOTER, 20) or not 0 < start <= end:
+    if not tail.endswith(_MAGIC) or (opcode, length) != (Opcode.FOOTER, 20) or start > end:
         return None
+    start = start or end
     if end - start > MAX_RECORD:
         return None
     file.seek(start)
@@ -152,7 +184,7 @@ def read_summary(file: IO[bytes]) -> Summary | None:
 
 
 def _parse_summary(data: bytes) -> Summary | None:
-    summary: Summary | None = None
+    summary = Summary()
     records: list[McapRecord] = []
     position = 0
     try:
@@ -166,11 +198,8 @@ def _parse_summary(data: bytes) -> Summary | None:
         return None
     for record in records:
         if isinstance(record, Statistics):
-            summary = Summary(record)
-    if summary is None:
-        return None
-    for record in records:
-        if isinstance(record, Schema):
+            summary.statistics = record
+        elif isinstance(record, Schema):
             summary.schemas[record.id] = record
         elif isinstance(record, Channel):
             summary.channels[record.id] = record
@@ -192,50 +221,58 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
     if file.read(len(_MAGIC)) != _MAGIC:
         on_loss(Loss(0, len(_MAGIC), "the first bytes are damaged"))
     position = len(_MAGIC)
+    search, before = _Search(file, size), 0
+    whole_end: bool | None = None
+    readings = _MOST_READINGS * size
     while position < size:
         file.seek(position)
         head = file.read(_HEAD.size)
         length = _HEAD.unpack(head)[1] if len(head) == _HEAD.size else 0
         end = position + _HEAD.size + length
-        if len(head) < _HEAD.size or end > size or not _is_plausible(head[0], length, file):
-            found = end if _begins_a_record(file, end, size) else _next_chunk(file, position + 1, size)
+        if len(head) < _HEAD.size or end > size or not _is_plausible(head[0], length, file, before):
+            found = end if _begins_a_record(file, end, size) else search.next(position + 1)
             if found is None:
-                on_loss(
-                    Loss(
-                        position, size - position, f"it was cut off: it ends at byte {size}, in the middle of a record"
-                    )
-                )
+                what = f"it was cut off: it ends at byte {size}, in the middle of a record"
+                on_loss(Loss(position, size - position, what))
                 return
             on_loss(Loss(position, found - position, f"{found - position} bytes make no sense"))
-            position = found
+            position, before = found, 0
             continue
         lost: list[Loss] = []
         record = _record_at(file, position, lost.append)
-        if lost:  # its length may be wrong: what it covers may hold whole chunks
-            end = _next_chunk(file, position + 1, size, before=end) or end
+        if lost:
+            # Its length may be wrong, and what it covers may hold whole chunks. To look for them costs another
+            # reading: a file that was made to waste time gets a few.
+            readings -= length
+            end = (search.next(position + 1, before=end) if readings > 0 else None) or end
             on_loss(replace(lost[0], length=end - position))
         elif isinstance(record, Chunk):
             yield from ((each, True) for each in broken_up(record, position, on_loss))
         elif record is not None:
             yield record, False
-        position = end
-        file.seek(position)
         if head[0] == Opcode.DATA_END:
-            if read_summary(file) is None:
-                on_loss(Loss(end, size - end, "its index is damaged or was cut off"))
-            return
+            whole_end = read_summary(file) is not None if whole_end is None else whole_end
+            if whole_end:
+                return
+            found = search.next(end)  # it may have been no end
+            on_loss(Loss(end, (found or size) - end, "its index is damaged or was cut off"))
+            if found is None:
+                return
+            end = found
+        position, before = end, head[0]
     on_loss(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
 
 
-def chunk_at(file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None]) -> list[McapRecord]:
+def chunk_at(file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None]) -> Iterator[McapRecord]:
     """What is in a chunk that the summary names; nothing if it is damaged."""
     file.seek(index.chunk_start_offset)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size or head[0] != Opcode.CHUNK or _HEAD.unpack(head)[1] > MAX_RECORD:
         on_loss(_chunk_loss(index.chunk_start_offset, index.chunk_length, index))
-        return []
+        return
     record = _record_at(file, index.chunk_start_offset, on_loss)
-    return broken_up(record, index.chunk_start_offset, on_loss) if isinstance(record, Chunk) else []
+    if isinstance(record, Chunk):
+        yield from broken_up(record, index.chunk_start_offset, on_loss)
 
 
 def record_at(file: IO[bytes], offset: int) -> McapRecord | None:
@@ -247,13 +284,41 @@ def record_at(file: IO[bytes], offset: int) -> McapRecord | None:
     return _record_at(file, offset, lambda loss: None)
 
 
-def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None]) -> list[McapRecord]:
-    """The records in a chunk; nothing if it is damaged."""
+def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None]) -> Iterator[McapRecord]:
+    """The records in a chunk, one by one; nothing if it is damaged."""
     try:
-        return breakup_chunk(_decompressed(chunk), validate_crc=True)
+        data = _decompressed(chunk)
+        if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
+            raise ValueError("checksum")
+        for opcode, at, length in _heads(data):
+            if opcode != Opcode.MESSAGE:
+                _PARSERS[opcode](ReadDataStream(BytesIO(data[at : at + length])))
+            elif length < _MESSAGE_HEAD.size:
+                raise ValueError("a message without its times")
     except _DAMAGE:
         on_loss(_chunk_loss(offset, _HEAD.size + len(chunk.data), chunk))
-        return []
+        return
+    for opcode, at, length in _heads(data):
+        yield _PARSERS[opcode](ReadDataStream(BytesIO(data[at : at + length])))
+
+
+def _heads(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, first byte and length of the content of each record of a chunk that is looked into."""
+    position = 0
+    while position < len(data):
+        opcode, length = _HEAD.unpack_from(data, position)
+        position += _HEAD.size
+        if length > len(data) - position:
+            raise ValueError("a record that goes beyond its chunk")
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield opcode, position, length
+        position += length
+
+
+def _read_message(stream: ReadDataStream) -> McapMessage:
+    """A message that fills the stream."""
+    channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack(stream.read(_MESSAGE_HEAD.size))
+    return McapMessage(channel, log_time, stream.read(MAX_RECORD), publish_time, sequence)
 
 
 def _chunk_loss(offset: int, length: int, chunk: Chunk | ChunkIndex) -> Loss:
@@ -275,7 +340,7 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
         record = _PARSERS[opcode](stream)
         if stream.count != length:
             raise ValueError("size")
-        if opcode == Opcode.ATTACHMENT and zlib.crc32(content[:-4]) != struct.unpack("<I", content[-4:])[0]:
+        if opcode == Opcode.ATTACHMENT and struct.unpack("<I", content[-4:])[0] not in (0, zlib.crc32(content[:-4])):
             raise ValueError("checksum")
     except _DAMAGE:
         kind = Opcode(opcode).name.lower().replace("_", " ")
@@ -284,11 +349,17 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
     return record
 
 
-def _is_plausible(opcode: int, length: int, file: IO[bytes]) -> bool:
-    """Whether a record can be what it says: one flipped bit makes a chunk another kind, which would be skipped."""
-    if opcode == Opcode.MESSAGE_INDEX:
+def _is_plausible(opcode: int, length: int, file: IO[bytes], before: int) -> bool:
+    """Whether a record can be what it says, behind one of the kind ``before`` (0: not known).
+
+    One flipped bit makes a chunk another kind, which would be skipped, or an index of messages a message.
+    """
+    if opcode == Opcode.MESSAGE_INDEX or (opcode == Opcode.MESSAGE and before in _BEFORE_INDEX):
         rest = file.read(6)
-        return len(rest) == 6 and length == 6 + struct.unpack_from("<I", rest, 2)[0]
+        is_index = len(rest) == 6 and length == 6 + struct.unpack_from("<I", rest, 2)[0]
+        return is_index is (opcode == Opcode.MESSAGE_INDEX)
+    if opcode == Opcode.MESSAGE:
+        return _MESSAGE_HEAD.size <= length <= MAX_RECORD
     return opcode in _KNOWN and length <= MAX_RECORD and _LENGTHS.get(opcode, length) == length
 
 
@@ -296,27 +367,52 @@ def _begins_a_record(file: IO[bytes], position: int, size: int) -> bool:
     """Whether what stands at a position can be the next record: only its kind is damaged then, not its length."""
     file.seek(min(position, size))
     head = file.read(_HEAD.size)
-    return len(head) == _HEAD.size and _is_plausible(head[0], _HEAD.unpack(head)[1], file)
+    return len(head) == _HEAD.size and _is_plausible(head[0], _HEAD.unpack(head)[1], file, 0)
 
 
-def _next_chunk(file: IO[bytes], position: int, size: int, before: int | None = None) -> int | None:
-    """Where the next whole chunk, metadata or the end of the data begins; None if that is not ``before`` a byte."""
-    before = size if before is None else before
-    while position < before:
-        file.seek(position)
-        block = file.read(_SEARCH_BYTES + 128)
-        for match in _CANDIDATE.finditer(block):
-            at = match.start()
-            if at >= min(_SEARCH_BYTES, before - position):
-                break
-            opcode, length = _HEAD.unpack_from(block, at)
-            if opcode != Opcode.CHUNK:
-                if length == 4 or opcode == Opcode.METADATA:
-                    return position + at
-            elif length <= MAX_RECORD and position + at + length <= size and _is_chunk_head(block[at:], length):
-                return position + at
-        position += _SEARCH_BYTES
-    return None
+class _Search:
+    """Looks through a file from its start to its end for what can be a record, once."""
+
+    def __init__(self, file: IO[bytes], size: int) -> None:
+        self._file, self._size = file, size
+        self._start, self._data = 0, b""
+
+    def next(self, position: int, before: int | None = None) -> int | None:
+        """Where the next whole chunk, metadata or the end of the data begins; None if not ``before`` a byte.
+
+        Positions are asked for in ascending order.
+        """
+        before = self._size if before is None else before
+        while position < before:
+            if position + _LOOK_BYTES > self._start + len(self._data) and self._start + len(self._data) < self._size:
+                self._file.seek(position)
+                self._start, self._data = position, self._file.read(_SEARCH_BYTES)
+            match = _CANDIDATE.search(self._data, position - self._start)
+            at = self._start + (match.start() if match else len(self._data))
+            if match is None or at + _LOOK_BYTES > self._start + len(self._data) < self._size:
+                # Not here, or too near the edge to be looked at.
+                position = max(position + 1, min(at, self._start + len(self._data) - _LOOK_BYTES))
+                if self._start + len(self._data) >= self._size:
+                    return None
+            elif at >= before:
+                return None
+            elif self._is_record(at):
+                return at
+            else:
+                position = at + 1
+        return None
+
+    def _is_record(self, position: int) -> bool:
+        """Whether the bytes there can be what they say."""
+        data = self._data[position - self._start :][:_LOOK_BYTES]
+        opcode, length = _HEAD.unpack_from(data)
+        if position + _HEAD.size + length > self._size or length > MAX_RECORD:
+            return False
+        if opcode == Opcode.METADATA:
+            (name_length,) = struct.unpack_from("<I", data, _HEAD.size)
+            at = _HEAD.size + 4 + name_length
+            return len(data) >= at + 4 and length == 4 + name_length + 4 + struct.unpack_from("<I", data, at)[0]
+        return length == 4 if opcode == Opcode.DATA_END else _is_chunk_head(data, length)
 
 
 def _is_chunk_head(data: bytes, length: int) -> bool:
@@ -331,19 +427,20 @@ def _is_chunk_head(data: bytes, length: int) -> bool:
     return bool(length == _CHUNK_HEAD.size + name_length + 8 + held)
 
 
-def _decompressed(chunk: Chunk) -> Chunk:
-    """A chunk without compression. It may say one size and hold another: neither may fill the memory."""
-    if chunk.uncompressed_size > MAX_RECORD:
+def _decompressed(chunk: Chunk) -> bytes:
+    """What a chunk holds. It may say one size and hold another: neither may fill the memory."""
+    if chunk.uncompressed_size > MAX_CHUNK:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+    data = chunk.data
     if chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)
     elif chunk.compression == "zstd":
         data = zstandard.ZstdDecompressor().stream_reader(chunk.data).read(chunk.uncompressed_size + 1)
-    else:
-        return chunk
+    elif chunk.compression:
+        raise ValueError(f"the compression {chunk.compression} is not known")
     if len(data) != chunk.uncompressed_size:
         raise ValueError("a chunk that is not of the size that it says")
-    return replace(chunk, compression="", data=data)
+    return data
 
 
 __all__ = [

@@ -198,6 +198,10 @@ class RecordingWriter:
                     self._add(*item)
                     self._taken_bytes += len(item[2])
                     self._busy_since = last_write = time.monotonic()
+                    if not self._deterministic and last_write - last_sync > options.fsync_s:
+                        self._file.flush()
+                        self._file.sync()
+                        self._busy_since = last_sync = time.monotonic()
                 if ending:
                     self._finish(self._end_metadata)
                     return

@@ -15,6 +15,9 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.wire import messages_pb2 as wire
 
+_NAP_S = 0.1
+"""How long one sleeps at most before asking whether to stop."""
+
 
 def replay(
     recording: Recording,
@@ -58,7 +61,11 @@ def replay(
         if began is None:
             began = (at_s, now_s())
         elif rate > 0:
-            sleep(max(0.0, began[1] + (at_s - began[0]) / rate - now_s()))
+            due_s = began[1] + (at_s - began[0]) / rate
+            while (left_s := due_s - now_s()) > 0 and not stop():
+                sleep(min(left_s, _NAP_S))
+            if stop():
+                break
         yield exposure, driver.step(exposure)
     if began is None and not stop():
         raise RecordingError(f"{recording.path} has no exposure between {start_s:g} s and {end_s:g} s")

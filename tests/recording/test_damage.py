@@ -149,9 +149,8 @@ def test_an_index_that_lies_costs_no_memory(recorded: Session, tmp_path: Path) -
     assert summary is not None
     rng = np.random.default_rng(3)
     for each in summary.chunk_indexes:
-        # With its times, for the offset alone may stand elsewhere by chance.
-        entry = struct.pack("<QQQ", each.message_start_time, each.message_end_time, each.chunk_start_offset)
-        at = bytes(data).rindex(entry) + 16
+        known = (each.message_start_time, each.message_end_time, each.chunk_start_offset)
+        at = bytes(data).rindex(struct.pack("<QQQ", *known)) + 16
         struct.pack_into("<Q", data, at, int(rng.integers(0, 2 * len(data))))
     # Without a checksum of the summary, which a hostile writer leaves out, it is believed until it fails.
     struct.pack_into("<I", data, len(data) - 12, 0)
