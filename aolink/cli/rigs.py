@@ -359,7 +359,7 @@ def _replay_to_rig(
     for warning in report.warnings:
         stderr.print(f"aolink: warning: {escape(warning)}")
     only = ("/mirror/", "/camera/", "/estimate/", "/truth")
-    found = compare(recording, Recording(output), only=only)
+    found = compare(recording, Recording(output), only=only, relative_to_start=True)
     if as_json:
         print(json.dumps(tables.comparison_as_json(found, same_rig=True), allow_nan=False))
     else:

@@ -69,6 +69,7 @@ def compare(
     relative: float = RELATIVE,
     absolute: float = ABSOLUTE,
     only: Sequence[str] = (),
+    relative_to_start: bool = False,
     progress: Callable[[int], None] = lambda messages: None,
 ) -> dict[str, TopicComparison]:
     """Compare two recordings by topic.
@@ -81,6 +82,8 @@ def compare(
     ----------
     only:
         Topics to look at; all if none is given. One that ends with "/" means all that begin with it.
+    relative_to_start:
+        Count exposures and fast steps from the first of each recording: those of two sessions of one rig go on.
 
     Raises
     ------
@@ -93,7 +96,9 @@ def compare(
     if not names:
         asked = f" of {', '.join(only)}" if only else ""
         raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")
-    for number, (is_first, key, message, frame_id) in enumerate(_alternating(first, second, sorted(names)), 1):
+    for number, (is_first, key, message, frame_id) in enumerate(
+        _alternating(first, second, sorted(names), relative_to_start), 1
+    ):
         topic = key[0]
         found = result.setdefault(topic, TopicComparison())
         other = waiting.get(key)
@@ -123,10 +128,13 @@ def _is_wanted(topic: str, only: Sequence[str]) -> bool:
 
 
 def _alternating(
-    first: Recording, second: Recording, names: Sequence[str]
+    first: Recording, second: Recording, names: Sequence[str], relative_to_start: bool
 ) -> Iterator[tuple[bool, tuple[str, object], Message, int | None]]:
     """The messages of both, a little of each in turn, so that only what has no partner yet is kept."""
-    sides = [(True, _named(_messages(first, names))), (False, _named(_messages(second, names)))]
+    sides = []
+    for is_first, recording in ((True, first), (False, second)):
+        found = _messages(recording, names)
+        sides.append((is_first, _named(_from_start(found, recording) if relative_to_start else found)))
     while sides:
         for side in list(sides):
             is_first, messages = side
@@ -146,6 +154,20 @@ def _messages(recording: Recording, names: Sequence[str]) -> Iterator[tuple[str,
             yield raw.topic, kind.FromString(raw.data) if kind else BytesValue(value=raw.data)
         except DecodeError:
             raise RecordingError(f"{recording.path}: a message on {raw.topic} is damaged") from None
+
+
+def _from_start(messages: Iterator[tuple[str, Message]], recording: Recording) -> Iterator[tuple[str, Message]]:
+    """Messages with exposures and fast steps counted from the recording's first exposure."""
+    start = next((each.message for each in recording.messages(topics.EXPOSURE)), schemas_pb2.ExposureInfo())
+    assert isinstance(start, schemas_pb2.ExposureInfo)
+    first = {"frame_id": start.frame_id, "cause_frame_id": start.frame_id}
+    first |= dict.fromkeys(("first_step", "last_step"), start.first_step)
+    for topic, message in messages:
+        for name, value in first.items():
+            # What is from before the start wraps around, as it would in the other recording.
+            if isinstance(was := getattr(message, name, None), int) and (was or name != "cause_frame_id"):
+                setattr(message, name, (was - value) % 2**64)
+        yield topic, message
 
 
 def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[tuple[str, object], Message, int | None]]:

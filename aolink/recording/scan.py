@@ -65,7 +65,6 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
-    Opcode.MESSAGE: lambda stream: _read_message(stream),
     Opcode.CHUNK: Chunk.read,
     Opcode.CHUNK_INDEX: ChunkIndex.read,
     Opcode.ATTACHMENT: Attachment.read,
@@ -80,7 +79,7 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence, log time and publish time."""
 _LENGTHS: dict[int, int] = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
 """Content that is of one length always."""
-_KNOWN = {*_PARSERS, *_LENGTHS}
+_KNOWN = {*_PARSERS, *_LENGTHS, Opcode.MESSAGE}
 
 # What the mcap library and the decompressors raise on content that is damaged.
 _DAMAGE = (McapError, struct.error, RuntimeError, ValueError, EOFError, KeyError, zstandard.ZstdError)
@@ -292,14 +291,14 @@ def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None]) -> Ite
             raise ValueError("checksum")
         for opcode, at, length in _heads(data):
             if opcode != Opcode.MESSAGE:
-                _PARSERS[opcode](ReadDataStream(BytesIO(data[at : at + length])))
+                _parsed(opcode, data[at : at + length])
             elif length < _MESSAGE_HEAD.size:
                 raise ValueError("a message without its times")
     except _DAMAGE:
         on_loss(_chunk_loss(offset, _HEAD.size + len(chunk.data), chunk))
         return
     for opcode, at, length in _heads(data):
-        yield _PARSERS[opcode](ReadDataStream(BytesIO(data[at : at + length])))
+        yield _parsed(opcode, data[at : at + length])
 
 
 def _heads(data: bytes) -> Iterator[tuple[int, int, int]]:
@@ -315,10 +314,16 @@ def _heads(data: bytes) -> Iterator[tuple[int, int, int]]:
         position += length
 
 
-def _read_message(stream: ReadDataStream) -> McapMessage:
-    """A message that fills the stream."""
-    channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack(stream.read(_MESSAGE_HEAD.size))
-    return McapMessage(channel, log_time, stream.read(MAX_RECORD), publish_time, sequence)
+def _parsed(opcode: int, content: bytes) -> McapRecord:
+    """A record; raises one of `_DAMAGE` if its content is not of its kind and length."""
+    if opcode == Opcode.MESSAGE:
+        channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(content)
+        return McapMessage(channel, log_time, content[_MESSAGE_HEAD.size :], publish_time, sequence)
+    stream = ReadDataStream(BytesIO(content))
+    record = _PARSERS[opcode](stream)
+    if stream.count != len(content):
+        raise ValueError("size")
+    return record
 
 
 def _chunk_loss(offset: int, length: int, chunk: Chunk | ChunkIndex) -> Loss:
@@ -331,15 +336,11 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
     """The record at a position, whose length is known to be possible; None if it is damaged or of no interest."""
     file.seek(position)
     opcode, length = _HEAD.unpack(file.read(_HEAD.size))
-    if opcode not in _PARSERS:
-        file.seek(length, os.SEEK_CUR)
+    if opcode not in _PARSERS and opcode != Opcode.MESSAGE:
         return None
     content = file.read(length)
-    stream = ReadDataStream(BytesIO(content))
     try:
-        record = _PARSERS[opcode](stream)
-        if stream.count != length:
-            raise ValueError("size")
+        record = _parsed(opcode, content)
         if opcode == Opcode.ATTACHMENT and struct.unpack("<I", content[-4:])[0] not in (0, zlib.crc32(content[:-4])):
             raise ValueError("checksum")
     except _DAMAGE:
@@ -411,8 +412,8 @@ class _Search:
         if opcode == Opcode.METADATA:
             (name_length,) = struct.unpack_from("<I", data, _HEAD.size)
             at = _HEAD.size + 4 + name_length
-            return len(data) >= at + 4 and length == 4 + name_length + 4 + struct.unpack_from("<I", data, at)[0]
-        return length == 4 if opcode == Opcode.DATA_END else _is_chunk_head(data, length)
+            return len(data) >= at + 4 and bool(length == 4 + name_length + 4 + struct.unpack_from("<I", data, at)[0])
+        return bool(length == 4) if opcode == Opcode.DATA_END else _is_chunk_head(data, length)
 
 
 def _is_chunk_head(data: bytes, length: int) -> bool:

@@ -10,6 +10,7 @@ import contextlib
 import errno
 import io
 import os
+import re
 import threading
 import time
 from collections import deque
@@ -124,6 +125,8 @@ class RecordingWriter:
         self._busy_since: float | None = None
         """When the thread began what it is doing with the file."""
         try:
+            if self._lead is not None:
+                self._clear_parts()
             self._begin(start_ns)
         except OSError as error:
             self._give_up(error)
@@ -173,6 +176,19 @@ class RecordingWriter:
         else:
             with contextlib.suppress(RecordingError):
                 self.close({"ended": f"error: {error}"})
+
+    def _clear_parts(self) -> None:
+        """Parts of another session with the same name would be taken for some of this one."""
+        name = re.compile(re.escape(self.path.stem) + r"-\d{3,}" + re.escape(self.path.suffix))
+        folder = self.path.parent
+        known = sorted(each for each in folder.iterdir() if name.fullmatch(each.name)) if folder.is_dir() else []
+        if known and not self._overwrite:
+            raise RecordingError(
+                f"{known[0]} exists and is not overwritten: give another name, or --overwrite to remove"
+                f" {'it' if len(known) == 1 else f'all {len(known)} parts'}"
+            )
+        for each in known:
+            each.unlink()
 
     def _begin(self, start_ns: int) -> None:
         """Create the file, or the next of several."""

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import io
+import os
 import struct
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message as Message_
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.records import Message
+from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader
-from mcap.writer import Writer
+from mcap.writer import IndexType, Writer
 
 from aolink.errors import AolinkError, RecordingError
 from aolink.recording import schemas_pb2 as pb
@@ -21,7 +26,8 @@ from aolink.recording import topics
 from aolink.recording.editing import recover
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
-from aolink.recording.writer import begin_recording
+from aolink.recording.scan import MAX_CHUNK, Loss, broken_up, scan
+from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
 from tests.conftest import Session
 
@@ -217,3 +223,138 @@ def test_a_channel_whose_chunk_is_lost_is_known_from_elsewhere(recorded: Session
     assert len(recording.losses) == 2
     assert set(recording.counts) == set(Recording(recorded.path).counts)
     assert len(list(recording.exposures())) >= len(list(Recording(recorded.path).exposures())) - 3
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.mcap")
+    for path in (tmp_path / "pipe.mcap", Path("/dev/zero")):
+        with pytest.raises(RecordingError, match="is a pipe or a device"):
+            Recording(path)
+
+
+class Counting(io.BytesIO):
+    """A file that counts what is read of it."""
+
+    count = 0
+
+    def read(self, size: int | None = -1) -> bytes:
+        data = super().read(size)
+        self.count += len(data)
+        return data
+
+
+@pytest.mark.parametrize("kind", ["chunks", "metadata", "ends"])
+def test_records_inside_each_other_cost_a_few_readings_of_the_file(kind: str) -> None:
+    """Each says that it reaches to the end of the file, and is none."""
+    size, step = 600_000, 60
+    data = bytearray(b"\x89MCAP0\r\n" + struct.pack("<BQ", 1, 8) + bytes(8))
+    data += bytes([0xEE]) * (size - len(data))
+    for at in range(100, size - 200, step):
+        length = size - at - 9
+        if kind == "chunks":
+            head = struct.pack("<BQQQQII", 6, length, 1, 2, 1 << 20, 7, 0) + struct.pack("<Q", length - 40)
+        elif kind == "metadata":
+            head = struct.pack("<BQI", 12, length, 6) + b"aolink" + struct.pack("<I", length - 14)
+        else:
+            head = struct.pack("<BQI", 15, 4, 0)
+        data[at : at + len(head)] = head
+    file, losses = Counting(bytes(data)), list[Loss]()
+    list(scan(file, losses.append))
+    assert losses
+    assert file.count < 8 * size + (len(losses) + 100) * 64
+
+
+def test_small_messages_in_a_large_chunk_cost_no_memory() -> None:
+    message = struct.pack("<BQHIQQ", 5, 22, 1, 1, 1, 1)
+    data = message * ((8 << 20) // len(message))
+    chunk = Chunk("zstd", zstandard.compress(data), 1, 1, 0, len(data))
+    losses: list[Loss] = []
+    tracemalloc.start()
+    count = sum(1 for _ in broken_up(chunk, 0, losses.append))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (count, losses) == (len(data) // len(message), [])
+    assert peak < 4 * len(data)
+    huge = Chunk("zstd", b"", 1, 1, 0, MAX_CHUNK + 1)
+    assert list(broken_up(huge, 0, losses.append)) == []
+    assert len(losses) == 1
+
+
+def other_writer(source: Recording, path: Path, **options: bool) -> None:
+    """A recording by the stock writer, as other software may set it up."""
+    with path.open("wb") as file:
+        writer = Writer(file, **options)  # type: ignore[arg-type]
+        writer.start()
+        writer.add_attachment(0, 0, topics.RIG_ATTACHMENT, "application/toml", source.rig.toml.encode())
+        channels: dict[str, int] = {}
+        for raw in source.raw_messages():
+            if raw.topic not in channels:
+                schema = schema_of(topics.SCHEMAS[raw.schema])
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[raw.topic] = writer.register_channel(raw.topic, "protobuf", known)
+            writer.add_message(channels[raw.topic], raw.log_time_ns, raw.data, raw.log_time_ns, raw.sequence)
+        writer.finish()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {}, {"use_chunking": False}, {"use_statistics": False}, {"repeat_channels": False}, {"repeat_schemas": False},
+        {"index_types": IndexType.NONE}, {"index_types": IndexType.ATTACHMENT}, {"index_types": IndexType.CHUNK},
+        {"use_summary_offsets": False},
+        {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False, "index_types": IndexType.NONE,
+         "use_summary_offsets": False},
+    ],
+)  # fmt: skip
+def test_what_other_writers_leave_out_is_no_damage(recorded: Session, tmp_path: Path, options: dict[str, bool]) -> None:
+    source = Recording(recorded.path)
+    other_writer(source, tmp_path / "a.mcap", **options)
+    for check in (False, True):
+        found = Recording(tmp_path / "a.mcap", check=check)
+        assert list(found.raw_messages()) == list(source.raw_messages())
+        assert (found.counts, found.damage) == (source.counts, "")
+        assert len(list(found.exposures())) == len(list(source.exposures()))
+
+
+def write_messages(path: Path, *messages: tuple[str, Message_, int] | tuple[str, bytes, int]) -> Recording:
+    file = McapFile(path, WriteOptions())
+    begin_recording(file, load_rig("section-vi"), {}, 0, {})
+    for k, (topic, message, time_ns) in enumerate(messages, 1):
+        data = message if isinstance(message, bytes) else message.SerializeToString()
+        kind = pb.ExposureInfo if isinstance(message, bytes) else type(message)
+        file.add(topic, schema_of(kind), data, time_ns, k)
+    file.finish()
+    return Recording(path)
+
+
+def test_a_message_of_another_kind_is_a_loss(tmp_path: Path) -> None:
+    good = pb.ExposureInfo(frame_id=1)
+    path = tmp_path / "a.mcap"
+    recording = write_messages(
+        path, (topics.EXPOSURE, good, 0), (topics.EXPOSURE, b"\xff", 5), (topics.EXPOSURE, good, 9)
+    )
+    for _ in range(2):
+        assert [each.log_time_ns for each in recording.messages()] == [0, 9]
+    (loss,) = recording.losses
+    assert loss.what == f"1 message(s) on {topics.EXPOSURE} cannot be decoded"
+    path.write_bytes(path.read_bytes()[:-40])
+    assert (Recording(path).start_ns, Recording(path).end_ns) == (0, 9)
+
+
+def test_lists_of_missing_pixels_that_do_not_fit_are_one_error(tmp_path: Path) -> None:
+    info = pb.ExposureInfo(frame_id=1, missing_offset=[0, 4], missing_length=[2])
+    image = RawImage(width=40, height=1, encoding="mono16", data=bytes(80))
+    recording = write_messages(tmp_path / "a.mcap", (topics.EXPOSURE, info, 0), (topics.IMAGE, image, 1))
+    with pytest.raises(RecordingError, match="the picture of frame 1 is damaged"):
+        list(recording.exposures())
+
+
+def test_parts_of_another_session_are_refused_or_removed(tmp_path: Path) -> None:
+    (stale := tmp_path / "a-007.mcap").write_bytes(b"old")
+    (other := tmp_path / "a-b.mcap").write_bytes(b"mine")
+    rig, options = load_rig("section-vi"), WriteOptions(split_s=1.0)
+    with pytest.raises(RecordingError, match=r"a-007\.mcap exists and is not overwritten"):
+        RecordingWriter(tmp_path / "a.mcap", rig, {}, 0, options=options)
+    assert {each.name for each in tmp_path.iterdir()} == {stale.name, other.name}
+    RecordingWriter(tmp_path / "a.mcap", rig, {}, 0, options=options, overwrite=True).close()
+    assert {each.name for each in tmp_path.iterdir()} == {"a-001.mcap", other.name}

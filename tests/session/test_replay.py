@@ -16,6 +16,7 @@ from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference
+from aolink.session import record
 from aolink.session.replay import RecordedCommands, replay
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
@@ -85,6 +86,39 @@ def test_through_a_rig_again(aolink: Run, recorded: Session, tmp_path: Path) -> 
     found = compare(Recording(recorded.path), Recording(tmp_path / "again.mcap"))
     assert {topics.IMAGE, topics.APPLIED, topics.TRUTH, "/estimate/o3"} <= found.keys()
     assert all(each.same for each in found.values())
+
+
+def test_through_a_rig_that_has_served_a_session_before(recorded: Session, tmp_path: Path) -> None:
+    """Its frames and fast steps go on: exposure by exposure the inputs are the same, at other times."""
+    recording = Recording(recorded.path)
+    with simulated_rig("section-vi-lively") as (camera, mirror):
+        for name in ("before", "again"):
+            record(
+                recording.rig, camera, mirror, tmp_path / name, exposures=3,
+                inputs=RecordedCommands(recording).inputs,
+            )  # fmt: skip
+    before, again = Recording(tmp_path / "before"), Recording(tmp_path / "again")
+    only = ("/mirror/", "/camera/exposure", "/truth")
+    assert not compare(before, again, only=only)[topics.EXPOSURE].compared
+    found = compare(before, again, only=only, relative_to_start=True)
+    for topic in (topics.EXPOSURE, topics.COMMAND, topics.APPLIED, topics.TRUTH):
+        assert found[topic].compared
+        assert not found[topic].missing
+        assert not found[topic].added
+        assert not {"first_step", "last_step", "frame_id", "u"} & found[topic].fields.keys()
+
+
+@pytest.mark.parametrize("rate", [1e-3, 1e-300, 5e-324])
+def test_a_replay_that_waits_can_be_stopped(recorded: Session, rate: float) -> None:
+    """However slow it is."""
+    clock, steps = Clock(), 0
+    for _ in replay(
+        Recording(recorded.path), ["o1"], rate=rate, now_s=lambda: clock.now, sleep=clock.sleep,
+        stop=lambda: clock.now > 101.0,
+    ):  # fmt: skip
+        steps += 1
+    assert steps == 1
+    assert 101.0 < clock.now < 101.2
 
 
 def test_the_command_line(aolink: Run, recorded: Session) -> None:
