@@ -5,7 +5,7 @@ An intensity of one is the brightest that a picture file of whole numbers can ho
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -134,7 +134,16 @@ def read_scene_picture(sensor: SceneSensor, folder: Path) -> FloatArray:
 
 def framed(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
     """The middle of a picture in the sensor's pixels, each the mean of its own, (rows, columns)."""
-    n, (rows, columns) = sensor.picture_pixels, sensor.shape
-    top, left = ((have - n * want) // 2 for have, want in zip(picture.shape, sensor.shape, strict=True))
-    middle = picture[top : top + n * rows, left : left + n * columns]
-    return np.asarray(middle.reshape(rows, n, columns, n).mean(axis=(1, 3)))
+    return framed_columns(sensor, framed_rows(sensor, picture))
+
+
+def framed_rows(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
+    """The same for the rows alone, (rows, the picture's columns)."""
+    n, rows = sensor.picture_pixels, sensor.shape[0]
+    top = (picture.shape[0] - n * rows) // 2
+    return np.asarray(picture[top : top + n * rows].reshape(rows, n, -1).mean(axis=1))
+
+
+def framed_columns(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
+    """And for the columns alone, (the picture's rows, columns)."""
+    return framed_rows(replace(sensor, shape=sensor.shape[::-1]), picture.T).T

@@ -291,7 +291,7 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
         lines.append(f"deblurred {result.deblurred_recording}")
     lines.append(f"rerun     {result.rrd}")
     lines.append(f"picture   {result.picture}" if result.picture else f"picture   none: {result.no_picture}")
-    lines.append(f"next      {command} view {result.recording}")
+    lines.append(f"next      {command} view {result.deblurred_recording or result.recording}")
     lines.append(f"          {command} info {result.recording}")
     lines.append(f"          {command} estimate {result.recording} --estimator o3")
     return lines

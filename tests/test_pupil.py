@@ -200,3 +200,12 @@ def test_a_pupil_that_cannot_be_is_refused(old, new, message):
 def test_a_plant_for_all_windows_is_told_how_many_are_lit():
     with pytest.raises(RigError, match="sees 24 slopes in 12 lit windows, two a spot, but the plant has 32"):
         parse_rig(FOUR.toml.replace("axes = 24", "axes = 32"))
+
+
+def test_estimators_of_pixels_refuse_what_they_do_not_know() -> None:
+    from aolink.errors import EstimatorError
+    from aolink.estimation import make_estimator
+
+    for name in ("profile", "mixture", "sampled"):
+        with pytest.raises(EstimatorError, match="partly lit lenslets: use moments or o3"):
+            make_estimator(load_rig("sh-8x8"), name)

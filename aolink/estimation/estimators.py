@@ -262,6 +262,10 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     orders = tuple(chosen.orders)
     if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
+    if name in _OF_PIXELS and isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None:
+        raise EstimatorError(
+            f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets: use moments or o3"
+        )
     if chosen.engine == "filterpy" and (name not in _PAPER_ORDERS or rig.plant.axes != 1):
         raise EstimatorError(
             f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, this is {name} with"

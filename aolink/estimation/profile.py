@@ -172,13 +172,20 @@ def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float
 
 
 def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> FloatArray:
-    """Whitened coordinates whose paths are nearest to those of points (axes, k, n), run backwards: the same blur."""
+    """Whitened coordinates of paths that blur like those of points (axes, k, n), (axes, 3 k, n).
+
+    Run backwards, which gives the same blur; mirrored about their mean, which gives the same where the blur is
+    symmetric, as that of a vibration is; and both.
+    """
     L, m = cholesky(prior.covariance), prior.mean
     count = view.outputs * view.whole_nodes
     rows = view.rows.reshape(view.outputs, -1, view.reduced.size)[:, : view.whole_nodes].reshape(count, -1)
     precision = 1 / (_REVERSED_TO**2 * view.kernel_variance * view.whole_nodes)
     B = stacked.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
-    back = view.paths(points)[..., view.whole_nodes - 1 :: -1].reshape(*points.shape[:2], count)
+    path = view.paths(points)[..., : view.whole_nodes]
+    mirrored = 2 * path.mean(axis=-1, keepdims=True) - path
+    like = np.concatenate([path[..., ::-1], mirrored, mirrored[..., ::-1]], axis=1)
+    back = like.reshape(len(like), -1, count)
     away = back - view.paths(m[:, None])[..., : view.whole_nodes].reshape(-1, 1, count)
     H = precision * stacked.matmul(stacked.transpose(B), B) + np.eye(B.shape[-1])
     right = precision * stacked.matmul(away, B)
@@ -186,7 +193,7 @@ def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> Float
 
 
 def with_reversals(view: PixelView, prior: Belief, modes: Modes) -> Modes:
-    """The same modes, and the one that the reversal of the best one leads to."""
+    """The same modes, and those that the reversal of the best one and its mirror images lead to."""
     back = reversed_starts(view, prior, modes.mean[np.arange(len(modes.mean)), modes.best][:, None])
     more = find_modes(view, prior, back)
     each = [(getattr(modes, f.name), getattr(more, f.name)) for f in fields(Modes)]

@@ -34,8 +34,8 @@ from aolink.workers import processes
 
 FloatArray = NDArray[np.float64]
 
-_MOST_SPOTS = 64
-"""More of them are not restored: each is a restoration of its own."""
+_MOST_SPOTS = 16
+"""More of them are not restored: each is a restoration of its own, of some tenth of a second."""
 _AHEAD = 4
 """Exposures for each worker that are handed out before the first of them is written."""
 
@@ -70,11 +70,12 @@ def motion(estimate: Estimate, mix: FloatArray) -> tuple[FloatArray, FloatArray]
     covariance = estimate.coefficient_covariance
     axes, count = covariance.shape[:2]
     weights = mix.reshape(len(mix), axes, -1)
-    basis = estimate.model.state_rows if count == estimate.model.plant.n_states else estimate.model.basis
-    total = np.zeros((len(mix) * basis.shape[1],) * 2)
+    outputs, paths = estimate.model.factors
+    total = np.zeros((len(mix) * paths.shape[1],) * 2)
     for axis in range(axes):
         if weights[:, axis].any():
-            rows = np.tensordot(weights[:, axis], basis[:, :, :count], axes=1).reshape(-1, count)
+            mixed = weights[:, axis] if outputs is None else weights[:, axis] @ outputs
+            rows = np.tensordot(mixed, paths[:, :, :count], axes=1).reshape(-1, count)
             total += rows @ covariance[axis] @ rows.T
     return mix @ estimate.path, total
 
@@ -128,10 +129,10 @@ def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: Me
         psf = _psf(estimate, np.eye(1), sensor.kernel, sensor.pixel_width)
         return np.asarray(restore(share, psf, method=method, mask=good).image)
     if sensor.spots > _MOST_SPOTS:
-        raise RestorationError(f"{sensor.spots} spots are not restored, {_MOST_SPOTS} would be")
-    out, (height, width) = np.empty_like(share), sensor.window
-    for spot in range(sensor.spots):
-        row, column = divmod(spot, sensor.grid[1])
+        raise RestorationError(f"{sensor.spots} spots are not restored, at most {_MOST_SPOTS} are")
+    out, (height, width) = np.zeros_like(share), sensor.window
+    for spot, place in enumerate(sensor.lit):
+        row, column = divmod(int(place), sensor.grid[1])
         window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
         psf = _psf(estimate, np.eye(rig.n_outputs)[2 * spot : 2 * spot + 2], sensor.kernel, sensor.pixel_width)
         out[window] = restore(share[window], psf, method=method, mask=good[window]).image

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.rig import Rig
-from aolink.scene import framed, read_scene_picture, scene_motion
+from aolink.scene import framed, framed_columns, framed_rows, read_scene_picture, scene_motion
 
 FloatArray = NDArray[np.float64]
 
@@ -33,6 +33,10 @@ class SceneCamera:
         width = math.pi * rig.scene.kernel.sigma * self._scale
         kernel = np.exp(-((width * self._fy) ** 2)) * np.exp(-((width * self._fx.T) ** 2))
         self._spectrum = np.fft.rfft2(picture) * kernel
+        self._along_x = rig.n_outputs == 1
+        if self._along_x:  # what happens to the rows is always the same
+            rows = framed_rows(rig.scene, np.fft.irfft2(self._spectrum, picture.shape))
+            self._spectrum = np.fft.rfft(rows)
 
     def frame(self, path: FloatArray, weights: FloatArray, light: str) -> NDArray[np.uint16]:
         """Counts of one exposure, (rows, columns).
@@ -51,7 +55,10 @@ class SceneCamera:
             intensity = np.full(sensor.shape, _FLAT if light == "flat" else 0.0)
         else:
             spectrum = self._spectrum * self._motion(scene_motion(len(path)) @ path * self._scale, weights)
-            intensity = framed(sensor, np.fft.irfft2(spectrum, self._shape))
+            if self._along_x:
+                intensity = framed_columns(sensor, np.fft.irfft(spectrum, self._shape[1]))
+            else:
+                intensity = framed(sensor, np.fft.irfft2(spectrum, self._shape))
         return sensor.to_counts(intensity + sensor.noise_sd * self._rng.standard_normal(sensor.shape))
 
     def _motion(self, path: FloatArray, weights: FloatArray) -> NDArray[np.complex128]:

@@ -243,7 +243,7 @@ def test_o1_of_a_membrane_is_the_dense_least_squares_solution():
             F[j * n : (j + 1) * n, k * n : (k + 1) * n] = np.linalg.matrix_power(model.transition, j - k)
     P = F @ linalg.block_diag(rig.plant.initial_covariance, *[model.process_noise] * count) @ F.T
     H = np.hstack([np.kron(np.eye(count), model.mean_row), np.zeros((count * 8, n))])
-    R = linalg.block_diag(*(m.covariance[0] for m in measured))
+    R = linalg.block_diag(*(block for m in measured for block in m.covariance[0]))
     gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
     mean, covariance = gain @ np.concatenate([m.value[0] for m in measured]), P - gain @ H @ P
     scale = np.sqrt(np.diag(covariance)[-n:])

@@ -19,6 +19,7 @@ from aolink.cli import app
 from aolink.demo import simulated_rig
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
 from aolink.exposure import Exposure
+from aolink.optics.camera import to_density
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.deblur import blurred_psnr, deblur, motion, psnr, write_deblurred
@@ -29,6 +30,7 @@ from aolink.recording.writer import RecordingWriter
 from aolink.restoration import motion_psf, restore
 from aolink.rig import load_rig
 from aolink.scene import framed, read_scene_picture
+from aolink.sensor import SpotSensor
 from aolink.session import Report, record
 from aolink.viewing import LiveView, save_rrd
 from tests.session.test_session import FAULTY
@@ -279,6 +281,25 @@ def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:
     some = [0, n_steps - 1, n_steps, 2 * n_steps - 1]
     expected = covariance[np.ix_(some, some)]
     np.testing.assert_allclose(np.cov(np.array(drawn).T), expected, atol=0.1 * expected.max())
+
+
+def test_spots_are_restored_in_the_windows_that_have_one() -> None:
+    """Dark windows stay dark, and spots are counted without them; too many are left as they are."""
+    exposures = aolink.simulate("sh-4x4", 2)
+    rig, exposure = exposures.rig, exposures[-1]
+    estimate = aolink.estimate(exposures, "o3")[-1]
+    assert isinstance(rig.sensor, SpotSensor)
+    sensor = replace(rig.sensor, light=(0.0, 0.0, 1.0) + 13 * (0.0,))
+    done = deblur(replace(rig, sensor=sensor), exposure, estimate)
+    assert done.spots is not None
+    window = np.s_[: sensor.window[0], 2 * sensor.window[1] : 3 * sensor.window[1]]
+    path, covariance = motion(estimate, np.eye(32)[:2])
+    psf = motion_psf(path, covariance, sensor.kernel, sensor.pixel_width)
+    alone = restore(to_density(sensor, exposure.pixels[window]) * sensor.pixel_size, psf).image
+    np.testing.assert_allclose(done.spots[window], np.clip(alone, 0, 1), atol=1e-6)
+    assert done.spots.sum() == pytest.approx(done.spots[window].sum())
+    many = deblur(replace(rig, sensor=replace(rig.sensor, grid=(4, 5))), exposure, estimate)
+    assert many.info.reason == "spot: 20 spots are not restored, at most 16 are"
 
 
 def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None:

@@ -37,6 +37,7 @@ def small(tmp_path: Path) -> tuple[Rig, SceneSensor]:
 
 def intensity(rig: Rig, path: np.ndarray, light: str = "moving") -> np.ndarray:
     assert rig.scene is not None
+    rig = replace(rig, plant=replace(rig.plant, C=np.ones((len(path), 2))))
     camera = SceneCamera(rig, np.random.default_rng(0))
     weights = np.full(path.shape[1], 1 / path.shape[1])
     return rig.scene.to_intensity(camera.frame(path, weights, light))
@@ -71,6 +72,13 @@ def test_it_is_what_restoration_takes_it_for(tmp_path: Path) -> None:
         expected = framed(sensor, whole)
         still = framed(sensor, smooth)
         assert np.abs(seen - expected).max() < 0.05 * np.abs(still - expected).max()
+
+
+def test_along_x_alone_it_is_as_on_the_plane(small: tuple[Rig, SceneSensor]) -> None:
+    """Motion along a line of pixels is made row by row; still along y it is the same."""
+    rig, _ = small
+    path = np.random.default_rng(4).normal(0, 0.1, (1, 9))
+    np.testing.assert_allclose(intensity(rig, path), intensity(rig, np.concatenate([path, 0 * path])), atol=3e-5)
 
 
 def test_lights(small: tuple[Rig, SceneSensor]) -> None:

@@ -12,6 +12,7 @@ import pytest
 from aolink.estimation import run
 from aolink.estimation.estimate import Estimate
 from aolink.exposure import Exposure
+from aolink.recording.deblur import deblur
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
 from aolink.viewing import save_rrd
@@ -43,6 +44,11 @@ class Simulated:
 
     def messages(self, *topics: str) -> list[Any]:
         return []
+
+    def restored(self) -> list[Any]:
+        return [deblur(self.rig, self._exposures[0], self._estimates["o1"][0])]
+
+    true_scene = None
 
 
 @pytest.fixture(scope="module")

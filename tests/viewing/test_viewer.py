@@ -117,7 +117,7 @@ def test_a_viewer_ends_with_its_block_whatever_happens_in_it(rrd: Path) -> None:
 
     def interrupted() -> None:
         with headless_viewer(rrd):
-            viewers.extend(psutil.Process().children(recursive=True))
+            viewers.extend(p for p in psutil.Process().children(recursive=True) if "rerun" in p.name().lower())
             assert listening(*viewers) == {"127.0.0.1"}
             raise KeyboardInterrupt
 
