@@ -29,17 +29,23 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
             try:
                 yield pool
             except BaseException:
-                running = list((pool._processes or {}).values())
-                for process in running:
-                    process.terminate()
-                pool.shutdown(wait=False, cancel_futures=True)
-                for process in running:
-                    process.join(_PATIENCE_S)
-                    process.kill()
+                _end(pool)
                 raise
+            if pool._broken:  # a process that began while the pool broke would be waited for without end
+                _end(pool)
     finally:
         for name, value in environment.items():
             if value is None:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    running = list((pool._processes or {}).values())
+    for process in running:
+        process.terminate()
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in running:
+        process.join(_PATIENCE_S)
+        process.kill()
