@@ -49,3 +49,4 @@ def _end(pool: ProcessPoolExecutor) -> None:
     for process in running:
         process.join(_PATIENCE_S)
         process.kill()
+        process.join(_PATIENCE_S)

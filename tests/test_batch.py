@@ -163,6 +163,14 @@ def test_stopped_no_job_is_begun_and_those_on_the_way_count(recorded: Session, t
     assert {*tmp_path.iterdir()} == {path for each in done for path in (each.job.output, each.job.record)}
 
 
+def runs(pid: int) -> bool:
+    """Whether a process is there and no zombie. (Two threads wait for these, and one may not hear of their end.)"""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
 def test_stopped_twice_the_processes_end_at_once_and_leave_nothing_half(recorded: Session, tmp_path: Path) -> None:
     """The second Ctrl-C is raised where the pool is waited for."""
 
@@ -173,7 +181,7 @@ def test_stopped_twice_the_processes_end_at_once_and_leave_nothing_half(recorded
 
     with pytest.raises(KeyboardInterrupt):
         list(batch.run(several(recorded, tmp_path), 2, stop=stop))
-    assert not multiprocessing.active_children()
+    assert not [each for each in multiprocessing.active_children() if each.pid and runs(each.pid)]
     assert not [*tmp_path.glob("*.partial"), *tmp_path.glob(".*")]
 
 
@@ -181,7 +189,8 @@ def test_a_process_that_is_killed_costs_its_own_jobs(recorded: Session, tmp_path
     killed = list[int]()
 
     def stop() -> bool:
-        for process in multiprocessing.active_children() if not killed else ():
+        begun = bool([*tmp_path.glob("*.json")])  # the processes are all there: one job is done
+        for process in multiprocessing.active_children() if begun and not killed else ():
             killed.append(process.pid or 0)
             process.kill()
             break
@@ -190,8 +199,10 @@ def test_a_process_that_is_killed_costs_its_own_jobs(recorded: Session, tmp_path
     done = list(batch.run(several(recorded, tmp_path), 2, stop=stop))
     assert len(done) == 6
     failed = [each.error for each in done if each.error]
-    assert 1 <= len(failed) <= 2
+    assert killed
+    assert len(failed) <= 2, "no more than were on the way"
     assert all("ended from outside" in each for each in failed)
+    assert len({*tmp_path.glob("*.mcap")}) >= 6 - len(failed)
 
 
 def test_two_names_that_are_one_are_refused(tmp_path: Path) -> None:
