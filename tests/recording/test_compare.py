@@ -155,3 +155,8 @@ def test_accept_is_refused_where_it_would_replace_more(aolink: Run, recorded: Se
     assert damaged.returncode == 5
     assert "a damaged recording is not accepted" in damaged.stderr
     assert (tmp_path / "a.mcap").read_bytes() == data
+
+
+def test_nan_is_equal_to_nan_and_to_nothing_else() -> None:
+    assert module._numbers_differ([np.nan, 1.0], [np.nan, 1.0], 0, 0)[2] is False
+    assert module._numbers_differ([np.nan], [1.0], 1, 1)[2] is True
