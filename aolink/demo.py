@@ -18,10 +18,12 @@ from aolink.estimation import make_estimator
 from aolink.recording.deblur import Summary, write_deblurred
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
-from aolink.rig import Rig
+from aolink.rig import Rig, Sensor
 from aolink.session import Report, record
 
 ESTIMATORS = ("open-loop", "o1", "o2", "o3", "moments")
+_OF_LINES = ("profile", "mixture")
+"""For line sensors as well; of spots on a plane they would make a demo long."""
 _RIG_START_S = 20.0
 
 
@@ -49,9 +51,9 @@ class DemoResult:
 
 
 def possible_estimators(rig: Rig) -> tuple[str, ...]:
-    """Those of `ESTIMATORS` that can work on a rig: not each of them knows plants that move many spots."""
+    """Those that can work on a rig: not each of them knows plants that move many spots."""
     possible = []
-    for name in ESTIMATORS:
+    for name in (*ESTIMATORS, *(_OF_LINES if isinstance(rig.sensor, Sensor) else ())):
         with contextlib.suppress(EstimatorError):
             make_estimator(rig, name)
             possible.append(name)

@@ -1,17 +1,41 @@
-"""Processes that share the cores: one thread each, so that numbers do not depend on how many cores there are."""
+"""Processes and threads that share the cores.
+
+A process of a pool has one thread for its linear algebra, so that numbers do not depend on how many cores there are.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from multiprocessing import get_context
+from typing import TypeVar
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _PATIENCE_S = 3.0
 """For a process that was told to end."""
+
+
+def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """A function of each item, on as many threads as there are cores for this process; for what lets go of the lock."""
+    threads = min(thread_count(), len(items))
+    if threads < 2:
+        return [function(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, items))
+
+
+def thread_count() -> int:
+    """Cores that this process may use; one in a process of a pool, which shares them with the others."""
+    if multiprocessing.parent_process() is not None:
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager

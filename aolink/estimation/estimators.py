@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,6 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.exposure_model import InputResponse, exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
 from aolink.estimation.filterpy_engine import FilterpyMoments
-from aolink.estimation.hypothesis_filter import HypothesisFilter, Updates
-from aolink.estimation.mixture import MixtureUpdates
 from aolink.estimation.moments import (
     Flux,
     Measurement,
@@ -25,8 +23,6 @@ from aolink.estimation.moments import (
     spot_significance,
 )
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
-from aolink.estimation.profile import ProfileUpdates
-from aolink.estimation.sampled import SampledUpdates
 from aolink.estimation.spots import measure_spots
 from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
@@ -34,15 +30,14 @@ from aolink.exposure import Exposure
 from aolink.optics.camera import is_saturated, to_density
 from aolink.rig import Rig, Sensor, SpotSensor
 
+if TYPE_CHECKING:
+    from aolink.estimation.hypothesis_filter import HypothesisFilter
+
 FloatArray = NDArray[np.float64]
 Engine = Literal["aolink", "filterpy"]
 
 _PAPER_ORDERS: dict[str, tuple[int, ...]] = {"o1": (1,), "o2": (2,), "o3": (1, 2)}
-_OF_PIXELS: dict[str, Callable[[Options], Updates]] = {
-    "profile": lambda options: ProfileUpdates(),
-    "mixture": lambda options: MixtureUpdates(),
-    "sampled": lambda options: SampledUpdates(options.particles, options.seed),
-}
+_OF_PIXELS = ("profile", "mixture", "sampled")
 ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments", *_OF_PIXELS)
 """The names that `make_estimator` knows."""
 
@@ -98,7 +93,7 @@ class Estimator:
         self._observation = _observation(rig, name, options)
         self._filter: BlurFilter | HypothesisFilter
         if name in _OF_PIXELS:
-            self._filter = HypothesisFilter(rig.plant, rig.sensor, _OF_PIXELS[name](options), gate=options.gate)
+            self._filter = _of_pixels(rig, name, options)
         else:
             predict = self._observation.predict if isinstance(self._observation, FilterpyMoments) else None
             self._filter = BlurFilter(
@@ -118,11 +113,7 @@ class Estimator:
         reasons = self._bridge(exposure)
         response = response or model.response(exposure.inputs)
         taken, remark = measured or self.measure_all([exposure])[0]
-        if isinstance(self._filter, HypothesisFilter):
-            assert not isinstance(taken, Measurement)
-            posterior = self._filter.step(model, response, taken)
-        else:
-            posterior = self._filter.step(model, response, taken)
+        posterior = self._filter.step(model, response, taken)  # type: ignore[arg-type] # what it measured itself
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
         return Estimate(
@@ -339,6 +330,19 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
         spots = rig.plant.n_outputs // 2
         return WindowedSpots(rig.sensor, spots, options.orders, basis=options.basis, flux=options.flux)
     return WindowedMoments(rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux)
+
+
+def _of_pixels(rig: Rig, name: str, options: Options) -> HypothesisFilter:
+    """The filters of the pixels themselves; the code that they compile is loaded when one is wanted."""
+    from aolink.estimation.hypothesis_filter import HypothesisFilter, Updates
+    from aolink.estimation.mixture import MixtureUpdates
+    from aolink.estimation.profile import ProfileUpdates
+    from aolink.estimation.sampled import SampledUpdates
+
+    updates: Updates = SampledUpdates(options.particles, options.seed)
+    if name != "sampled":
+        updates = ProfileUpdates() if name == "profile" else MixtureUpdates()
+    return HypothesisFilter(rig.plant, rig.sensor, updates, gate=options.gate)
 
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation import stacked
+from aolink.estimation.compiled.mixtures import merge
 from aolink.estimation.observation import Belief
 
 FloatArray = NDArray[np.float64]
@@ -56,16 +57,34 @@ class Hypotheses:
         constant = self.log_weight - log_root - 0.5 * n * math.log(2 * math.pi)
         return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1))
 
-    def reduced(self, most: int) -> Hypotheses:
-        """The same with ``most`` components: those two are merged, again and again, whose merger costs least.
+    @property
+    def contiguous(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Its arrays as compiled code takes them."""
+        return (
+            np.ascontiguousarray(self.log_weight),
+            np.ascontiguousarray(self.mean),
+            np.ascontiguousarray(self.covariance),
+        )
 
-        The cost is Runnalls' bound on the Kullback-Leibler divergence; a merger keeps mean and covariance. Runnalls,
-        Kullback-Leibler approach to Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
+    def reduced(self, most: int, free: float = 0.0) -> Hypotheses:
+        """The same with ``most`` components, or fewer if mergers cost less than ``free``.
+
+        Those two are merged, again and again, whose merger costs least. The cost is Runnalls' bound on the
+        Kullback-Leibler divergence; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to
+        Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
         """
-        mixture = self
-        while mixture.mean.shape[1] > most:
-            mixture = _merged_once(mixture)
-        return mixture
+        merged = Hypotheses(self.log_weight.copy(), self.mean.copy(), self.covariance.copy())
+        merge(*merged.contiguous, most, free)
+        return merged.ordered(most)
+
+    def ordered(self, most: int | None = None) -> Hypotheses:
+        """The heaviest components first, without columns of which none is there."""
+        order = np.argsort(-self.log_weight, axis=1, kind="stable")[:, :most]
+        rows = np.arange(len(order))[:, None]
+        kept = self.log_weight[rows, order]
+        count = max(1, int(np.isfinite(kept).sum(axis=1).max(initial=1)))
+        order = order[:, :count]
+        return Hypotheses(kept[:, :count], self.mean[rows, order], self.covariance[rows, order])
 
 
 def single(belief: Belief) -> Hypotheses:
@@ -81,35 +100,6 @@ def joined(*mixtures: Hypotheses) -> Hypotheses:
         np.concatenate([each.mean for each in mixtures], axis=1),
         np.concatenate([each.covariance for each in mixtures], axis=1),
     )
-
-
-def _merged_once(m: Hypotheses) -> Hypotheses:
-    """The two components whose merger costs least are one, in each axis."""
-    axes, count = m.log_weight.shape
-    first, second = np.triu_indices(count, 1)
-    w = np.exp(m.log_weight)
-    total = w[:, first] + w[:, second]
-    share = w[:, second] / np.where(total > 0, total, 1.0)
-    away = m.mean[:, second] - m.mean[:, first]
-    P, Q = m.covariance[:, first], m.covariance[:, second]
-    outer = away[..., :, None] * away[..., None, :]
-    a, b = share[..., None, None], (share * (1 - share))[..., None, None]
-    merged = (1 - a) * P + a * Q + b * outer
-    logs = log_determinant(m.covariance)
-    cost = 0.5 * (total * log_determinant(merged) - w[:, first] * logs[:, first] - w[:, second] * logs[:, second])
-    chosen = np.argmin(cost, axis=1)
-    rows, i, j = np.arange(axes), first[chosen], second[chosen]
-    mean, covariance, log_weight = m.mean.copy(), m.covariance.copy(), m.log_weight.copy()
-    mean[rows, i] += share[rows, chosen][:, None] * away[rows, chosen]
-    covariance[rows, i] = merged[rows, chosen]
-    log_weight[rows, i] = np.logaddexp(log_weight[rows, i], log_weight[rows, j])
-    keep = np.ones((axes, count), dtype=bool)
-    keep[rows, j] = False
-
-    def kept(values: FloatArray) -> FloatArray:
-        return values[keep].reshape(axes, count - 1, *values.shape[2:])
-
-    return Hypotheses(kept(log_weight), kept(mean), kept(covariance))
 
 
 def log_sum(values: FloatArray, axis: int) -> FloatArray:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aolink.estimation import stacked
 from aolink.estimation.estimate import Status
-from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
+from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis, exposure_model
 from aolink.estimation.filter import Posterior, predicted
 from aolink.estimation.hypotheses import Hypotheses, single
 from aolink.estimation.observation import Belief
@@ -26,13 +26,15 @@ from aolink.estimation.windowed_spots import SpotWindows
 from aolink.plant import input_response, lift
 from aolink.rig import Plant
 from aolink.sensor import BaseSensor
+from aolink.workers import in_threads
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _PATIENCE = 3
-# Chunks of axes: what is computed for them together fits into the cache.
+# Chunks of axes: what NumPy computes for them together fits into the cache; compiled code has fewer calls to pay for.
 _AT_ONCE = 32
+_AT_ONCE_COMPILED = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +98,18 @@ class HypothesisFilter:
         self._unseen = self.belief.belief
         self._missed = np.zeros(axes, dtype=np.int64)
         self._number = 0
+        self._warm_up()
+
+    def _warm_up(self) -> None:
+        """Have all code compiled before the first exposure: a session must not wait for it."""
+        if self.plant.n_outputs > 1:
+            return
+        model, pixels = exposure_model(self.plant, 2), self.sensor.profile.pixels
+        dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
+        response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
+        view = PixelView(self.sensor, model, response, dark, self._updates.reduction(model, self.sensor))
+        one = slice(0, 1)
+        self._updates.update(view.part(one), self.belief.part(one), 0)
 
     def bridge(self, inputs: FloatArray) -> None:
         """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
@@ -119,13 +133,15 @@ class HypothesisFilter:
         if measured is not None:
             view = PixelView(self.sensor, model, response, measured, reduced)
             seen = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
-            parts = [seen[k : k + _AT_ONCE] for k in range(0, axes, _AT_ONCE)]
-            done = [self._updates.update(view.part(p), prior.part(p), self._number) for p in parts if len(p)]
+            at_once = _AT_ONCE_COMPILED if view.compiled else _AT_ONCE
+            parts = [seen[k : k + at_once] for k in range(0, len(seen), at_once)]
+            done = in_threads(lambda p: self._updates.update(view.part(p), prior.part(p), self._number), parts)
             new = _spread([each.innovation for each in done], seen, axes)
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
             if len(took):
-                after = [np.concatenate(each)[trusted] for each in zip(*(_arrays(d) for d in done), strict=True)]
+                most = max(each.end.mean.shape[1] for each in done)
+                after = [np.concatenate(each)[trusted] for each in zip(*(_arrays(d, most) for d in done), strict=True)]
                 coefficients.mean[took], coefficients.covariance[took], several[took] = after[3], after[4], after[5]
                 kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
                 end = _replaced(end, took, kicked)
@@ -141,8 +157,8 @@ class HypothesisFilter:
         )  # fmt: skip
 
 
-def _arrays(done: Update) -> tuple[NDArray[Any], ...]:
-    e, c = done.end, done.coefficients
+def _arrays(done: Update, components: int) -> tuple[NDArray[Any], ...]:
+    e, c = _with_components(done.end, components), done.coefficients
     return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several)
 
 

@@ -11,6 +11,7 @@ importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import special, stats
 
 from aolink.estimation import stacked
+from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.hypotheses import Hypotheses, cholesky, joined, log_sum
 from aolink.estimation.hypothesis_filter import Update
@@ -43,6 +45,8 @@ _ROUNDS = 2
 _LEAST_EFFECTIVE = 64.0
 _HALVINGS = 10
 _CARRIED = 6
+# Mergers that lose less than this, in nats, cost nothing that matters.
+_FREE = 1e-3
 # Points of a round for each coefficient; as many as the next power of two.
 _POINTS = 32
 _MOST_POINTS = 1024
@@ -70,7 +74,7 @@ class MixtureUpdates:
         after, _ = importance_corrected(view, prior, proposal)
         new = innovation(view, reduced.prior(prior.belief), modes)
         end = reduced.end(Belief(after.mean, after.covariance))
-        carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(_CARRIED)
+        carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(_CARRIED, _FREE)
         share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
         return Update(after.belief, carried, new, (share > LEAST_SHARE).sum(axis=1) > 1)
 
@@ -81,47 +85,58 @@ def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
     The modes' log-evidence has the weights of the components in it.
     """
     before = view.reduced.prior(Belief(prior.mean, prior.covariance))
-    axes, count, n = before.mean.shape
-    rows = view.part(np.repeat(np.arange(axes), count))
-    each = Belief(before.mean.reshape(-1, n), before.covariance.reshape(-1, n, n))
+    axes, count, _ = before.mean.shape
+    there = np.nonzero(np.isfinite(prior.log_weight))
+    rows, each = view.part(there[0]), Belief(before.mean[there], before.covariance[there])
     wide = broad(rows, each)
     starts = spread_starts(rows, wide, _START_DIRECTIONS, _START_REACH)
     found = with_reversals(rows, each, find_modes(rows, each, whitened(each, starts)))
-    shape = (axes, count * found.mean.shape[1])
-    evidence = found.log_evidence.reshape(shape) + np.repeat(prior.log_weight, found.mean.shape[1], axis=1)
+    of_each = found.mean.shape[1]
+    found = replace(found, log_evidence=found.log_evidence + prior.log_weight[there][:, None])
+
+    def placed(values: FloatArray, empty: float) -> FloatArray:
+        out = np.full((axes, count, *values.shape[1:]), empty)
+        out[there] = values
+        return out.reshape(axes, count * of_each, *values.shape[2:])
+
     modes = without_repeats(
         Modes(
-            found.mean.reshape(*shape, n), found.covariance.reshape(*shape, n, n), evidence,
-            found.distance.reshape(shape), found.objective.reshape(shape),
+            placed(found.mean, 0.0), placed(found.covariance, 0.0), placed(found.log_evidence, -math.inf),
+            placed(found.distance, 0.0), placed(found.objective, math.inf),
         )
     )  # fmt: skip
+    flat = Belief(np.zeros_like(before.mean), np.zeros_like(before.covariance))
+    flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
     evidence = modes.log_evidence
     narrow = Hypotheses(
         evidence - log_sum(evidence, axis=1)[:, None] + math.log(1 - _WIDE), modes.mean, modes.covariance * _INFLATION
     )
-    flat = Hypotheses(
-        prior.log_weight + math.log(_WIDE),
-        wide.mean.reshape(axes, count, n),
-        wide.covariance.reshape(axes, count, n, n),
-    )
-    return modes, joined(narrow, flat)
+    both = joined(narrow, Hypotheses(prior.log_weight + math.log(_WIDE), flat.mean, flat.covariance))
+    return modes, both.ordered()
 
 
 def importance_corrected(
     view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, rounds: int = _ROUNDS
 ) -> tuple[Hypotheses, FloatArray]:
     """The posterior of t as the mixture that fits it, and the effective number of points, (axes,)."""
+    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(_POINTS * view.reduced.size)))
+    if (line := view.line) is not None:
+        numbers = [_quasi_random(points, view.reduced.size, k) for k in range(rounds)]
+        fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))
+        effective = np.empty(len(prior.mean))
+        compiled_mixtures.importance_corrected(
+            line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
+            np.stack([e for _, e in numbers]), _LEAST_EFFECTIVE, _HALVINGS, _PRIOR_POINTS, effective,
+        )  # fmt: skip
+        return fit, effective
     proposals: list[Hypotheses] = []
     t = np.zeros((len(prior.mean), 0, view.reduced.size))
     target = np.zeros(t.shape[:2])
-    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(_POINTS * view.reduced.size)))
     for k in range(rounds):
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
         t = np.concatenate([t, new], axis=1)
-        target = np.concatenate(
-            [target, _log_prior(prior, new) + view.log_likelihood(view.predicted_of_many(new))], axis=1
-        )
+        target = np.concatenate([target, _log_prior(prior, new) + view.log_likelihoods(new)], axis=1)
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         last = k == rounds - 1

@@ -17,7 +17,7 @@ import math
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,9 @@ from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.sensor import BaseSensor
 
+if TYPE_CHECKING:
+    from aolink.estimation.compiled.line import Line
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
@@ -42,8 +45,8 @@ _SPACING = 1.5
 # Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
 _SERIES = 1e-6
 _MOST_TERMS = 30
-# Points of a grid of positions in one standard deviation of the kernel, and how far it goes beyond the pixels.
-_POINTS = 6
+# Of a pixel's light by the spot's place: points in one standard deviation of the kernel, and where it ends.
+_POINTS = 16
 _REACH = 5.0
 
 
@@ -111,7 +114,7 @@ def _reduction(model: ExposureModel, tolerance: float, blurred: float) -> Reduct
     n = model.plant.n_states
     noise = model.basis[..., n:]
     size = noise.shape[2]
-    paths = noise.reshape(-1, size) / math.sqrt(model.n_steps)
+    paths = noise.reshape(noise.shape[0] * noise.shape[1], size) / math.sqrt(model.n_steps)
     _, values, vectors = np.linalg.svd(paths, full_matrices=False) if size else (0, np.zeros(0), np.zeros((0, 0)))
     # Each output by itself: a remainder that is spread over many of them is as small on each.
     rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / model.plant.n_outputs
@@ -164,6 +167,8 @@ class PixelView:
         self.read_noise = effective_noise_density(self._optics) / self._optics.pixel_size
         self.gain = shot_gain(self._optics)
         self._line = line
+        self.compiled = line
+        """Whether compiled code does what it can; its twins in NumPy do all."""
         self._kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
         self._measured, self._windowed = measured, _windowed(sensor, line, model.plant.n_outputs)
 
@@ -195,6 +200,11 @@ class PixelView:
         """Path at the nodes of the coefficients, (n_outputs * nodes, n)."""
         return self._basis.reshape(-1, self._basis.shape[2])
 
+    @property
+    def gram(self) -> FloatArray:
+        """Their squares summed over the path, (n, n)."""
+        return self.rows.T @ self.rows
+
     def moments(self, about: Belief) -> tuple[FloatArray, FloatArray, Regression]:
         """Windowed moments about a belief of t, their noise and regression, as `Windowed.look`; of all axes."""
         nodes = Nodes(basis=self._basis, weights=self._weights, inputs=self._inputs)
@@ -220,28 +230,32 @@ class PixelView:
         light = sum(c * stacked.long_matmul(stacked.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms))
         return np.asarray(light).reshape(*t.shape[:2], -1) / self._optics.pixel_size
 
-    def predicted_of_many(self, t: FloatArray) -> FloatArray:
-        """`predicted` to 1e-4 of the brightest pixel, some ten times as fast for a line of pixels.
+    def log_likelihoods(self, t: FloatArray) -> FloatArray:
+        """Of many points (axes, points, n), (axes, points)."""
+        line = self.line
+        if line is None:
+            return self.log_likelihood(self.predicted(t))
+        from aolink.estimation.compiled.line import log_likelihoods
 
-        The path's share of time at the points of a grid, by quadratic B-splines, whose own width (variance h^2 / 4) is
-        taken off the kernel's, times what a spot at each point gives.
-        """
-        if not self._line:
-            return self.predicted(t)
-        edges = self._optics.profile.edges
-        masses, low, step = _grid_of_masses(float(self._kernel[0, 0]), tuple(edges.tolist()))
-        place = (self.paths(t)[:, :, 0] - low) / step
-        np.clip(place, 1, len(masses) - 2, out=place)
-        nearest = np.rint(place)
-        away = place - nearest
-        count = len(masses)
-        lead = place.shape[:2]
-        start = nearest.astype(np.intp) + (count * np.arange(math.prod(lead)).reshape(*lead, 1))
-        shares = np.zeros(math.prod(lead) * count)
-        for shift, weight in ((-1, 0.5 * (0.5 - away) ** 2), (0, 0.75 - away**2), (1, 0.5 * (0.5 + away) ** 2)):
-            flat = (weight * self._weights).ravel()
-            shares += np.bincount((start + shift).ravel(), weights=flat, minlength=len(shares))
-        return stacked.long_matmul(shares.reshape(*lead, count), masses) / self._optics.pixel_size
+        out = np.empty(t.shape[:2])
+        log_likelihoods(line, np.ascontiguousarray(t), out)
+        return out
+
+    @property
+    def line(self) -> Line | None:
+        """What compiled code needs of line sensors."""
+        if not self.compiled:
+            return None
+        from aolink.estimation.compiled.line import Line
+
+        edges, variance = self._optics.profile.edges, float(self._kernel[0, 0])
+        return Line(
+            y=np.ascontiguousarray(self.y), usable=np.ascontiguousarray(self.mask),
+            inputs=np.ascontiguousarray(self._inputs[:, 0]), basis=np.ascontiguousarray(self._basis[0]),
+            weights=self._weights, table=_light_table(variance, self._optics.pixel_size), low=float(edges[0]),
+            high=float(edges[-1]), pixel=self._optics.pixel_size, read_noise=self.read_noise, gain=self.gain,
+            kernel_variance=self.sensor.kernel.variance,
+        )  # fmt: skip
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The same and their Jacobian, (axes, hypotheses, pixels, n)."""
@@ -314,13 +328,13 @@ def _windowed(sensor: BaseSensor, line: bool, outputs: int) -> Windowed[Any]:
 
 
 @lru_cache(maxsize=16)
-def _grid_of_masses(variance: float, pixel_edges: tuple[float, ...]) -> tuple[FloatArray, float, float]:
-    """Masses of the pixels for a spot at the points of a grid, (points, pixels), its first point and its step."""
-    edges, step = np.array(pixel_edges), math.sqrt(variance) / _POINTS
-    margin = _REACH * math.sqrt(variance) + 2 * step
-    points = np.arange(edges[0] - margin, edges[-1] + margin + step, step)
-    (masses,) = _masses(variance - step**2 / 4, edges, points, 0)
-    return masses, float(points[0]), step
+def _light_table(variance: float, pixel: float) -> FloatArray:
+    """Taylor coefficients of the densities of pixels about a spot, by its place in its own, (points, 4, pixels)."""
+    points = math.ceil(_POINTS * pixel / math.sqrt(variance))
+    half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1
+    places = (np.arange(points) + 0.5) * pixel / points
+    masses = _masses(variance, pixel * np.arange(-half, half + 1.0), places, 3)
+    return np.stack([mass / (math.factorial(k) * pixel) for k, mass in enumerate(masses)], axis=1)
 
 
 def _masses(variance: float, edges: FloatArray, positions: FloatArray, highest: int) -> list[FloatArray]:

@@ -17,17 +17,21 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation import stacked
+from aolink.estimation.compiled import line as compiled_line
+from aolink.estimation.compiled.line import Line, mark_repeats
 from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, lower_inverse, single
 from aolink.estimation.hypothesis_filter import Innovation, Update
 from aolink.estimation.observation import Belief, corrected
 from aolink.estimation.pixels import PixelView, Reduction, reduction
+from aolink.estimation.windowed import KERNEL_REACH, PATH_REACH
 from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _PASSES = 16
+_BROAD_PASSES = 3
 _FIRST_DAMPING = 0.01
 _LARGEST_DAMPING = 1e6
 _FREE_DAMPING = 0.1
@@ -43,6 +47,8 @@ _REVERSED_TO = 0.2
 # Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
 _DIRECTIONS = 4
 _GATE_PROBABILITY = 1e-9
+# Information of a direction, as a share of the largest, that is rounding.
+_TELLS_NOTHING = 1e-8
 # A second mode is one if the posterior gives it this much.
 LEAST_SHARE = 0.05
 
@@ -77,6 +83,8 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
         In whitened coordinates, (axes, starts, n).
     """
     axes, count, n = starts.shape
+    if (line := view.line) is not None:
+        return _found_compiled(line, prior, starts, passes)
     if prior.mean.ndim == 2:
         prior = Belief(
             np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
@@ -119,6 +127,19 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
     )  # fmt: skip
 
 
+def _found_compiled(line: Line, prior: Belief, starts: FloatArray, passes: int) -> Modes:
+    axes, count, n = starts.shape
+    found = Modes(
+        np.empty((axes, count, n)), np.empty((axes, count, n, n)), *(np.empty((axes, count)) for _ in range(3))
+    )
+    compiled_line.find_modes(
+        line, np.ascontiguousarray(prior.mean), cholesky(prior.covariance), np.ascontiguousarray(starts), passes,
+        _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, _CONVERGED, found.mean, found.covariance, found.log_evidence,
+        found.distance, found.objective,
+    )  # fmt: skip
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class _Point:
     H: FloatArray
@@ -138,21 +159,22 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
 
 def without_repeats(modes: Modes) -> Modes:
     """The same, log-evidence minus infinity for modes that a better start, or an earlier one, led to as well."""
-    count = modes.mean.shape[1]
     evidence = modes.log_evidence.copy()
-    for j in range(1, count):
-        away = modes.mean[:, :j] - modes.mean[:, j, None]
-        inverse = lower_inverse(cholesky(modes.covariance[:, j]))
-        white = stacked.matmul(away, stacked.transpose(inverse))
-        same = (np.add.reduce(white * white, axis=-1) < _APART**2) & np.isfinite(evidence[:, :j])
-        evidence[:, j] = np.where(same.any(axis=1), -np.inf, evidence[:, j])
+    mark_repeats(modes.mean, modes.covariance, _APART, evidence)
     return replace(modes, log_evidence=evidence)
 
 
 def broad(view: PixelView, prior: Belief) -> Belief:
     """What windowed moments make of the prior of t: wide where the blur has several readings."""
+    if (line := view.line) is not None:
+        after = Belief(np.empty_like(prior.mean), np.empty_like(prior.covariance))
+        compiled_line.broad(
+            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), _BROAD_PASSES, _NO_NOISE,
+            PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
+        )  # fmt: skip
+        return after
     about = prior
-    for _ in range(3):
+    for _ in range(_BROAD_PASSES):
         y, noise, fit = view.moments(about)
         innovation = y - fit.expected - stacked.matvec(fit.slope, prior.mean - about.mean)
         # A window without a pixel that can be used has neither moments nor noise.
@@ -163,9 +185,9 @@ def broad(view: PixelView, prior: Belief) -> Belief:
 
 def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float) -> FloatArray:
     """The mean of a belief and points beside it along the path's most uncertain directions, (axes, 1 + 2d, n)."""
-    B = view.rows
     L = cholesky(belief.covariance)
-    _, _, V = np.linalg.svd(stacked.matmul(np.broadcast_to(B, (len(L), *B.shape)), L), full_matrices=False)
+    _, V = np.linalg.eigh(stacked.symmetric(stacked.matmul(stacked.transpose(L), stacked.matmul(view.gram, L))))
+    V = stacked.transpose(V[:, :, ::-1])
     along = stacked.matmul(V[:, :directions], stacked.transpose(L)) * reach
     mean = belief.mean[:, None]
     return np.concatenate([mean, mean + along, mean - along], axis=1)
@@ -215,25 +237,39 @@ def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
     t, distance = modes.mean[rows], modes.distance[rows]
     n, L = t.shape[1], cholesky(prior.covariance)
     s = whitened(prior, t[:, None])[:, 0]
-    f, J = view.linearised(t[:, None])
-    score, information = (each[:, 0] for each in view.information(f))
-    root = np.sqrt(information)
-    A = stacked.matmul(J[:, 0] * root[..., None], L)
-    e = score / np.where(root > 0, root, 1.0)
-    values, V = np.linalg.eigh(stacked.matmul(stacked.transpose(A), A))
-    outputs = view.outputs
-    k = min(_DIRECTIONS * outputs, n)
+    gram, pull, square = _linear_fit(view, prior, L, s)
+    values, V = np.linalg.eigh(gram)
+    k = min(_DIRECTIONS * view.outputs, n)
     values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
     S = np.sqrt(values)
-    along = stacked.matvec(stacked.transpose(stacked.matmul(A, V)), e) / np.where(S > 0, S, 1.0)
+    # Nothing is new in a direction in which the pixels do not tell anything.
+    tells = values > _TELLS_NOTHING * values[:, :1]
+    along = np.where(tells, stacked.matvec(stacked.transpose(V), pull) / np.where(tells, S, 1.0), 0.0)
     u = along + S * stacked.matvec(stacked.transpose(V), s)
     nis = np.add.reduce(u * u / (1 + values), axis=1)
     # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
-    total = stacked.dot(e, e) + distance
+    total = square + distance
     degrees = np.add.reduce(view.mask, axis=1) + n
     believed = total <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
     covariance = (1 + values)[..., None] * np.eye(k)
     return Innovation(u, covariance, nis, believed & np.isfinite(nis))
+
+
+def _linear_fit(
+    view: PixelView, prior: Belief, L: FloatArray, s: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A'A, A'e and e'e of each axis, A = R^(-1/2) J L and e = R^(-1/2) (y - f), at whitened coordinates s."""
+    axes, n = s.shape
+    if (line := view.line) is not None:
+        gram, pull, square = np.empty((axes, n, n)), np.empty((axes, n)), np.empty(axes)
+        compiled_line.linear_fits(line, np.ascontiguousarray(prior.mean), L, s, gram, pull, square)
+        return gram, pull, square
+    f, J = view.linearised((prior.mean + stacked.matvec(L, s))[:, None])
+    score, information = (each[:, 0] for each in view.information(f))
+    root = np.sqrt(information)
+    A = stacked.matmul(J[:, 0] * root[..., None], L)
+    e = score / np.where(root > 0, root, 1.0)
+    return stacked.matmul(stacked.transpose(A), A), stacked.matvec(stacked.transpose(A), e), stacked.dot(e, e)
 
 
 class ProfileUpdates:

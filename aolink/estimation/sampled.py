@@ -162,7 +162,7 @@ def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
 
 
 def _log_likelihood(view: PixelView, t: FloatArray) -> FloatArray:
-    return np.asarray(view.log_likelihood(view.predicted_of_many(t[None]))[0])
+    return np.asarray(view.log_likelihoods(t[None])[0])
 
 
 def _next_power(log_light: FloatArray, power: float) -> float:

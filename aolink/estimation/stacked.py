@@ -36,7 +36,7 @@ def transpose(a: FloatArray) -> FloatArray:
 
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """(..., n, k) @ (..., k, m)"""
-    if a.shape[-1] > _WRITTEN_OUT:
+    if a.shape[-1] > _WRITTEN_OUT or max(a.shape[-2], b.shape[-1]) > 2 * _WRITTEN_OUT:
         return np.asarray(np.matmul(np.ascontiguousarray(a), np.ascontiguousarray(b)))
     return _sum_of_products(
         [a[..., :, j, None] for j in range(a.shape[-1])], [b[..., None, j, :] for j in range(b.shape[-2])]

@@ -43,8 +43,8 @@ Basis = Literal["monomial", "legendre", "fourier"]
 
 _PASSES = 3
 # Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
-_PATH_REACH = 3.0
-_KERNEL_REACH = 2.0
+PATH_REACH = 3.0
+KERNEL_REACH = 2.0
 # The path is averaged over blocks of steps so that there are no more than this; a mean over it stays exact.
 _MOST_NODES = 100
 _MOST_MEMORY = 1e3
@@ -189,11 +189,11 @@ class Windowed(ABC, Generic[Light]):
             True where a pixel can be used, (axes, pixels).
         """
         sd = np.sqrt(np.maximum(variance, 0.0))
-        margin = _KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
+        margin = KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
         # A window needs room on the sensor, wherever the path is believed to be.
         room = max(margin, 2 * sensor.pixel_width)
-        low = np.minimum((mean - _PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
-        high = np.maximum((mean + _PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
+        low = np.minimum((mean - PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
+        high = np.maximum((mean + PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
         low, high = np.maximum(low, sensor.field[0]), np.minimum(high, sensor.field[1])
         edges = sensor.edges
         inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask

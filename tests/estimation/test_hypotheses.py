@@ -51,7 +51,7 @@ def test_merging_keeps_weight_mean_and_covariance(seed, most, gone):
         m.log_weight[:, 2] = -np.inf
         m = Hypotheses(m.log_weight - log_sum(m.log_weight, axis=1)[:, None], m.mean, m.covariance)
     less = m.reduced(most)
-    assert less.mean.shape == (3, most, 3)
+    assert less.mean.shape == (3, min(most, 5 - gone), 3)
     np.testing.assert_allclose(np.exp(less.log_weight).sum(axis=1), 1.0)
     np.testing.assert_allclose(less.belief.mean, m.belief.mean, atol=1e-9)
     np.testing.assert_allclose(less.belief.covariance, m.belief.covariance, atol=1e-8)
@@ -62,9 +62,10 @@ def test_twins_are_merged_first():
     m = mixture(5, axes=1, components=3)
     twins = joined(m, Hypotheses(m.log_weight[:, 1:2], m.mean[:, 1:2] + 1e-6, m.covariance[:, 1:2]))
     less = twins.reduced(3)
-    np.testing.assert_allclose(less.mean, m.mean, atol=1e-5)
     weights = np.exp(m.log_weight[0]) * [1, 2, 1]
-    np.testing.assert_allclose(np.exp(less.log_weight[0]), weights / weights.sum())
+    order = np.argsort(-weights)  # the heaviest comes first
+    np.testing.assert_allclose(less.mean[0], m.mean[0, order], atol=1e-5)
+    np.testing.assert_allclose(np.exp(less.log_weight[0]), weights[order] / weights.sum())
 
 
 def test_what_is_known_for_certain_has_a_root():

@@ -76,14 +76,6 @@ def test_their_slope_is_that_of_finite_differences(kind):
         np.testing.assert_allclose(J[..., k], difference, atol=1e-8 * np.abs(J).max())
 
 
-def test_many_points_at_once_are_right_to_the_fourth_digit():
-    view, _ = view_of(LINE)
-    t = some_points(view, 200)
-    t[0, :20, 0] += np.linspace(-3, 3, 20)  # beyond the sensor's ends as well
-    exact = view.predicted(t)
-    np.testing.assert_allclose(view.predicted_of_many(t), exact, atol=1e-4 * exact.max())
-
-
 @pytest.mark.parametrize("photoelectrons", [0.0, 300.0])
 def test_score_and_information_are_those_of_the_likelihood(photoelectrons):
     view, _ = view_of(LINE, photoelectrons=photoelectrons)

@@ -29,11 +29,8 @@ class LinearView:
     def part(self, axes):
         return LinearView(self.H, self.y[axes], self.sd, self.reduced)
 
-    def predicted_of_many(self, t):
-        return t @ self.H.T
-
-    def log_likelihood(self, f):
-        return -0.5 * (((self.y[:, None] - f) / self.sd) ** 2).sum(axis=-1)
+    def log_likelihoods(self, t):
+        return -0.5 * (((self.y[:, None] - t @ self.H.T) / self.sd) ** 2).sum(axis=-1)
 
 
 def test_it_is_the_kalman_filter_where_all_is_linear():

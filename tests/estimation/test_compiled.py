@@ -1,0 +1,272 @@
+"""Compiled code against its twins in NumPy, on frames of every kind; and nothing left to compile in a session."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aolink.estimation import exposure_model, make_estimator, pixels, profile
+from aolink.estimation.compiled import line, mixtures, small
+from aolink.estimation.hypotheses import Hypotheses, log_determinant, single
+from aolink.estimation.hypothesis_filter import HypothesisFilter
+from aolink.estimation.mixture import MixtureUpdates, explored, importance_corrected
+from aolink.estimation.observation import Belief
+from aolink.estimation.windowed import Profile
+from aolink.optics.camera import to_density
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+LIVELY = load_rig("section-vi-lively")
+
+
+def changed(rig, **sensor):
+    return dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, **sensor))
+
+
+def exposures_of(rig, count, seed):
+    steps = count * rig.timing.exposure_steps
+    return simulate(rig, count, seed=seed, inputs=np.zeros((steps, rig.n_inputs)))
+
+
+def side_by_side(rig, axes):
+    return dataclasses.replace(rig, plant=dataclasses.replace(rig.plant, axes=axes))
+
+
+AXES = 12
+KINDS = {
+    "lively": changed(LIVELY, noise_density=0.01),
+    "bright": changed(LIVELY, noise_density=0.001),
+    "shot noise": changed(LIVELY, noise_density=0.001, photoelectrons=300.0),
+    "few pixels": changed(LIVELY, pixels=16, kernel=dataclasses.replace(LIVELY.sensor.kernel, sigma=0.1)),
+    "fine pixels": changed(LIVELY, pixels=160, noise_density=0.001),
+    "dark pixels": changed(LIVELY, noise_density=0.01),
+    "between steps": dataclasses.replace(
+        changed(LIVELY, noise_density=0.01), timing=dataclasses.replace(LIVELY.timing, exposure_offset=0.4)
+    ),
+    "jitter": load_rig("jitter"),
+}
+
+
+def looked_at(kind):
+    """A view of many axes and a prior of their start states; the first of them is of a spot beyond the sensor."""
+    rig = side_by_side(KINDS[kind], AXES)
+    (exposure,) = exposures_of(rig, 1, 5)
+    sensor = rig.sensor
+    density = to_density(sensor, exposure.pixels).reshape(AXES, -1)
+    mask = np.ones(density.shape, dtype=bool)
+    if kind == "dark pixels":
+        mask[:, ::7], mask[3], mask[4, :20] = False, False, False
+    model = exposure_model(rig.plant, exposure.n_steps, exposure.start_offset)
+    measured = Profile(density=np.where(mask, density, 0.0), mask=mask)
+    view = pixels.PixelView(
+        sensor, model, model.response(exposure.inputs), measured, pixels.reduction(model, sensor)
+    )  # fmt: skip
+    assert view.compiled
+    n, P = rig.plant.n_states, rig.plant.initial_covariance / 9
+    away = np.random.default_rng(1).standard_normal((AXES, n)) @ np.linalg.cholesky(P + 1e-12 * np.eye(n)).T
+    mean = exposure.truth.start_state.reshape(AXES, n) + away
+    mean[0, 0] += 30.0
+    in_numpy = view.part(slice(None))
+    in_numpy.compiled = False
+    return view, in_numpy, Belief(mean, np.tile(P, (AXES, 1, 1)))
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def pair(request):
+    return looked_at(request.param)
+
+
+def test_likelihood_of_many_points(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    rng = np.random.default_rng(2)
+    t = prior.mean[:, None] + rng.standard_normal((AXES, 40, view.reduced.size)) * 0.3
+    f = in_numpy.predicted(t)
+    ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)
+    # An error of the light by 2e-7 of the brightest pixel moves it by what that is of a pixel's noise, times residuals.
+    noise = np.sqrt(view.read_noise)
+    residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
+    assert np.all(np.abs(ours - theirs) < 2e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
+
+
+def test_windowed_moments(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    ours, theirs = profile.broad(view, prior), profile.broad(in_numpy, prior)
+    sd = np.sqrt(np.einsum("aii->ai", theirs.covariance))
+    np.testing.assert_allclose(ours.mean / sd, theirs.mean / sd, atol=3e-5)
+    np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-5 * sd.max() ** 2)
+
+
+def test_every_start_leads_to_the_same_mode(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    starts = profile.spread_starts(in_numpy, profile.broad(in_numpy, prior), 2, 1.3)
+    white = profile.whitened(prior, starts)
+    ours, theirs = (profile.find_modes(each, prior, white) for each in (view, in_numpy))
+    # A long search may end in another mode, as one that begins 1e-6 away may.
+    settled = np.abs(ours.objective - theirs.objective) < 0.02
+    assert settled.mean() > 0.9
+    sd = np.sqrt(np.einsum("asii->asi", theirs.covariance))
+    apart = np.abs(ours.mean - theirs.mean) / sd
+    assert np.quantile(apart[settled], 0.95) < 0.15
+    assert np.quantile(np.abs(ours.log_evidence - theirs.log_evidence)[settled], 0.95) < 0.15
+
+
+def test_a_mode_is_where_the_gradient_is_zero(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    found = profile.find_modes(view, prior, profile.whitened(prior, profile.broad(view, prior).mean[:, None]), 60)
+    t, root = found.mean[1:], np.linalg.cholesky(found.covariance[1:, 0])
+    inverse, rest = np.linalg.inv(prior.covariance[1:]), in_numpy.part(slice(1, None))
+
+    def objective(points):
+        away = points - prior.mean[1:, None]
+        return 0.5 * np.einsum("aki,aij,akj->ak", away, inverse, away) - rest.log_likelihood(rest.predicted(points))
+
+    np.testing.assert_allclose(objective(t), found.objective[1:], atol=1e-3)
+    for k in range(t.shape[2]):
+        step = 1e-3 * root[:, None, :, k]
+        slope = (objective(t + step) - objective(t - step)) / 2e-3
+        assert np.quantile(np.abs(slope), 0.9) < 0.05
+
+
+def test_repeats():
+    rng = np.random.default_rng(3)
+    mean, root = rng.standard_normal((20, 7, 3)) * 0.4, np.linalg.cholesky(0.3 * np.eye(3) + 0.1)
+    covariance = np.tile(root @ root.T, (20, 7, 1, 1))
+    evidence = rng.standard_normal((20, 7))
+    evidence[0, 2] = -np.inf
+    ours = evidence.copy()
+    line.mark_repeats(mean, covariance, 0.7, ours)
+    for axis in range(20):
+        for j in range(1, 7):
+            white = np.linalg.solve(root, (mean[axis, :j] - mean[axis, j]).T)
+            if np.any((np.sum(white**2, axis=0) < 0.49) & np.isfinite(evidence[axis, :j])):
+                evidence[axis, j] = -np.inf
+    np.testing.assert_array_equal(ours, evidence)
+    assert 20 < np.isinf(ours).sum() < 120
+
+
+def test_innovation(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    modes = profile.find_modes(view, prior, profile.whitened(prior, profile.broad(view, prior).mean[:, None]))
+    ours, theirs = (profile.innovation(each, prior, modes) for each in (view, in_numpy))
+    np.testing.assert_allclose(ours.nis, theirs.nis, rtol=0.02, atol=2e-3)
+    np.testing.assert_array_equal(ours.believed, theirs.believed)
+    np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=5e-3, atol=1e-3)
+
+
+def test_importance_sampling_with_the_same_points(pair):
+    view, in_numpy, state = pair
+    some = slice(1, None)  # not the one beyond the sensor, where no point counts
+    prior = single(Belief(state.mean[some], state.covariance[some]))
+    _, proposal = explored(view.part(some), prior)
+    (ours, points), (theirs, their_points) = (
+        importance_corrected(each.part(some), prior, proposal) for each in (view, in_numpy)
+    )
+    np.testing.assert_allclose(points, their_points, rtol=0.02)
+    np.testing.assert_allclose(np.exp(ours.log_weight), np.exp(theirs.log_weight), atol=2e-3)
+    sd = np.sqrt(np.einsum("aii->ai", theirs.belief.covariance))
+    np.testing.assert_allclose(ours.belief.mean / sd, theirs.belief.mean / sd, atol=5e-3)
+    np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.belief.covariance)) / sd, 1.0, atol=5e-3)
+
+
+def merged_once(m):
+    """The two components whose merger costs least are one, in each axis."""
+    axes, count = m.log_weight.shape
+    first, second = np.triu_indices(count, 1)
+    w = np.exp(m.log_weight)
+    total = w[:, first] + w[:, second]
+    share = w[:, second] / np.where(total > 0, total, 1.0)
+    away = m.mean[:, second] - m.mean[:, first]
+    P, Q = m.covariance[:, first], m.covariance[:, second]
+    outer = away[..., :, None] * away[..., None, :]
+    a, b = share[..., None, None], (share * (1 - share))[..., None, None]
+    merged = (1 - a) * P + a * Q + b * outer
+    logs = log_determinant(m.covariance)
+    cost = 0.5 * (total * log_determinant(merged) - w[:, first] * logs[:, first] - w[:, second] * logs[:, second])
+    chosen = np.argmin(cost, axis=1)
+    rows, i, j = np.arange(axes), first[chosen], second[chosen]
+    mean, covariance, log_weight = m.mean.copy(), m.covariance.copy(), m.log_weight.copy()
+    mean[rows, i] += share[rows, chosen][:, None] * away[rows, chosen]
+    covariance[rows, i] = merged[rows, chosen]
+    log_weight[rows, i] = np.logaddexp(log_weight[rows, i], log_weight[rows, j])
+    keep = np.ones((axes, count), dtype=bool)
+    keep[rows, j] = False
+
+    def kept(values):
+        return values[keep].reshape(axes, count - 1, *values.shape[2:])
+
+    return Hypotheses(kept(log_weight), kept(mean), kept(covariance))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mergers(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((9, 8, 3, 3)) * 0.5
+    weight = rng.uniform(0.1, 1, (9, 8))
+    m = Hypotheses(
+        np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((9, 8, 3)),
+        root @ root.swapaxes(-1, -2) + 0.1 * np.eye(3),
+    )  # fmt: skip
+    slow = m
+    for _ in range(5):
+        slow = merged_once(slow)
+    fast, order = m.reduced(3), np.argsort(-slow.log_weight, axis=1)
+    rows = np.arange(9)[:, None]
+    np.testing.assert_allclose(fast.log_weight, slow.log_weight[rows, order], rtol=1e-9)
+    np.testing.assert_allclose(fast.mean, slow.mean[rows, order], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(fast.covariance, slow.covariance[rows, order], rtol=1e-7, atol=1e-9)
+    # What costs nothing to merge is merged, however few there are.
+    twice = Hypotheses(
+        *(np.concatenate([each, each], axis=1) for each in (m.log_weight - np.log(2), m.mean, m.covariance))
+    )
+    assert twice.reduced(16, 1e-6).mean.shape[1] == 8
+
+
+def test_small_matrices_are_those_of_numpy():
+    rng = np.random.default_rng(5)
+    for n in (1, 2, 5, 12):
+        a = rng.standard_normal((n, n))
+        a = a @ a.T + 0.1 * np.eye(n)
+        root, inverse, x = np.empty((n, n)), np.empty((n, n)), rng.standard_normal(n)
+        small.cholesky(a, root)
+        np.testing.assert_allclose(root, np.linalg.cholesky(a), rtol=1e-7, atol=1e-9)
+        small.lower_inverse(root, inverse)
+        np.testing.assert_allclose(inverse @ root, np.eye(n), atol=1e-9)
+        solved = x.copy()
+        small.solve(root, solved)
+        np.testing.assert_allclose(a @ solved, x, rtol=1e-6, atol=1e-8)
+    assert small.log_sum(np.full(3, -np.inf)) == -np.inf
+    assert small.log_sum(np.array([0.0, -np.inf, 0.0])) == pytest.approx(np.log(2))
+
+
+def overloads():
+    each = (value for module in (small, line, mixtures) for value in vars(module).values())
+    return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
+
+
+@pytest.mark.parametrize("name", ["profile", "mixture"])
+@pytest.mark.parametrize("axes", [1, 3])
+def test_nothing_is_compiled_in_a_session(name, axes):
+    rig = side_by_side(KINDS["shot noise"], axes)
+    estimator = make_estimator(rig, name)
+    before = overloads()
+    assert before > 10
+    for exposure in exposures_of(rig, 3, 2):
+        estimator.step(exposure)
+    assert overloads() == before
+
+
+@pytest.mark.parametrize("updates", [profile.ProfileUpdates(), MixtureUpdates()])
+def test_a_plant_without_process_noise(updates):
+    plant = dataclasses.replace(LIVELY.plant, process_noise=0.0 * LIVELY.plant.process_noise)
+    HypothesisFilter(plant, LIVELY.sensor, updates)  # it looks at a frame when it is made
+    rig = dataclasses.replace(LIVELY, plant=plant)
+    name = "profile" if isinstance(updates, profile.ProfileUpdates) else "mixture"
+    estimator = make_estimator(rig, name)
+    for exposure in simulate(rig, 12, seed=2):
+        estimate = estimator.step(exposure)
+    assert np.sqrt(np.mean((estimate.path - exposure.truth.path) ** 2)) < 0.03
