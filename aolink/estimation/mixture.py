@@ -41,15 +41,16 @@ from aolink.sensor import BaseSensor
 FloatArray = NDArray[np.float64]
 
 _ROUNDS = 2
-# Points that count at least when the mixture for the next round is fitted, and steps of the search for the power.
+# Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
+# is too sure. And steps of the search for the power.
 _LEAST_EFFECTIVE = 64.0
 _HALVINGS = 10
 _CARRIED = 6
 # Mergers that lose less than this, in nats, cost nothing that matters.
 _FREE = 1e-3
-# Points of a round for each coefficient; as many as the next power of two.
-_POINTS = 32
-_MOST_POINTS = 1024
+# Points of a round for each pair of coefficients; as many as the next power of two.
+_POINTS = 6
+_MOST_POINTS = 2048
 _START_DIRECTIONS = 1
 _START_REACH = 1.3
 # Share of the points that come from the wide Gaussians.
@@ -57,7 +58,7 @@ _WIDE = 0.3
 # Modes are flattened by this much: tails that are too thin cost more than ones that are too thick.
 _INFLATION = 1.5
 # A component's covariance counts as so many points beside those that it is fitted to.
-_PRIOR_POINTS = 8.0
+_PRIOR_POINTS = 20.0
 
 
 class MixtureUpdates:
@@ -119,7 +120,7 @@ def importance_corrected(
     view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, rounds: int = _ROUNDS
 ) -> tuple[Hypotheses, FloatArray]:
     """The posterior of t as the mixture that fits it, and the effective number of points, (axes,)."""
-    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(_POINTS * view.reduced.size)))
+    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(_POINTS * view.reduced.size**2)))
     if (line := view.line) is not None:
         numbers = [_quasi_random(points, view.reduced.size, k) for k in range(rounds)]
         fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))
@@ -139,9 +140,7 @@ def importance_corrected(
         target = np.concatenate([target, _log_prior(prior, new) + view.log_likelihoods(new)], axis=1)
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
-        last = k == rounds - 1
-        weight = log_weight if last else _tempered(log_weight, _LEAST_EFFECTIVE)
-        proposal = _refitted(proposal, t, weight)
+        proposal = _refitted(proposal, t, _tempered(log_weight, _LEAST_EFFECTIVE))
     return proposal, np.exp(-log_sum(2 * log_weight, axis=1))
 
 

@@ -175,11 +175,8 @@ def importance_corrected(
                     total[q] = drawn[q, k]
                 weight[k] = target[k] - log_sum(total[: r + 1])
             weight[:end] -= log_sum(weight[:end])
-            if r < rounds - 1:
-                _temper(weight[:end], least_effective, halvings, tempered[:end])
-                _refit(w, x, P, t[:end], tempered[:end], logs[:end], drawn[r, :end], prior_points)
-            else:
-                _refit(w, x, P, t[:end], weight[:end], logs[:end], drawn[r, :end], prior_points)
+            _temper(weight[:end], least_effective, halvings, tempered[:end])
+            _refit(w, x, P, t[:end], tempered[:end], logs[:end], drawn[r, :end], prior_points)
         square = 0.0
         for k in range(many):
             square += math.exp(2 * weight[k])
