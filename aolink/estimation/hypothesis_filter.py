@@ -26,7 +26,7 @@ from aolink.estimation.windowed_spots import SpotWindows
 from aolink.plant import input_response, lift
 from aolink.rig import Plant
 from aolink.sensor import BaseSensor
-from aolink.workers import in_threads
+from aolink.workers import in_threads, thread_count
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -133,7 +133,7 @@ class HypothesisFilter:
         if measured is not None:
             view = PixelView(self.sensor, model, response, measured, reduced)
             seen = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
-            at_once = _AT_ONCE_COMPILED if view.compiled else _AT_ONCE
+            at_once = min(_AT_ONCE_COMPILED if view.compiled else _AT_ONCE, -(-len(seen) // thread_count()) or 1)
             parts = [seen[k : k + at_once] for k in range(0, len(seen), at_once)]
             done = in_threads(lambda p: self._updates.update(view.part(p), prior.part(p), self._number), parts)
             new = _spread([each.innovation for each in done], seen, axes)

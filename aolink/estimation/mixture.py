@@ -2,27 +2,21 @@
 
 Modes are not Gaussian: the blur fixes how much a path moves and leaves open which way, and such a posterior is
 bent. So the modes, and the wide Gaussians of windowed moments about them, are where points are drawn from only;
-what counts is the points' weights, prior times likelihood over the density that they were drawn from. After a first
-round the mixture is fitted to the weighted points, and a second round is drawn from that. All points of both are
-weighted against both densities together (Veach's balance heuristic; in this use Cornuet et al., Adaptive multiple
-importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and frame.
+what counts is the points' weights (`aolink.estimation.importance`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
 
-from aolink.estimation import stacked
-from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.exposure_model import ExposureModel
-from aolink.estimation.hypotheses import Hypotheses, cholesky, joined, log_sum
+from aolink.estimation.hypotheses import Hypotheses, log_sum
 from aolink.estimation.hypothesis_filter import Update
+from aolink.estimation.importance import importance_corrected, proposed
 from aolink.estimation.observation import Belief
 from aolink.estimation.pixels import PixelView, Reduction, reduction
 from aolink.estimation.profile import (
@@ -40,25 +34,11 @@ from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 
-_ROUNDS = 2
-# Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
-# is too sure. And steps of the search for the power.
-_LEAST_EFFECTIVE = 64.0
-_HALVINGS = 10
 _CARRIED = 6
 # Mergers that lose less than this, in nats, cost nothing that matters.
 _FREE = 1e-3
-# Points of a round for each pair of coefficients; as many as the next power of two.
-_POINTS = 6
-_MOST_POINTS = 2048
 _START_DIRECTIONS = 1
 _START_REACH = 1.3
-# Share of the points that come from the wide Gaussians.
-_WIDE = 0.3
-# Modes are flattened by this much: tails that are too thin cost more than ones that are too thick.
-_INFLATION = 1.5
-# A component's covariance counts as so many points beside those that it is fitted to.
-_PRIOR_POINTS = 20.0
 
 
 class MixtureUpdates:
@@ -108,96 +88,4 @@ def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
     )  # fmt: skip
     flat = Belief(np.zeros_like(before.mean), np.zeros_like(before.covariance))
     flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
-    evidence = modes.log_evidence
-    narrow = Hypotheses(
-        evidence - log_sum(evidence, axis=1)[:, None] + math.log(1 - _WIDE), modes.mean, modes.covariance * _INFLATION
-    )
-    both = joined(narrow, Hypotheses(prior.log_weight + math.log(_WIDE), flat.mean, flat.covariance))
-    return modes, both.ordered()
-
-
-def importance_corrected(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, rounds: int = _ROUNDS
-) -> tuple[Hypotheses, FloatArray]:
-    """The posterior of t as the mixture that fits it, and the effective number of points, (axes,)."""
-    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(_POINTS * view.reduced.size**2)))
-    if (line := view.line) is not None:
-        numbers = [_quasi_random(points, view.reduced.size, k) for k in range(rounds)]
-        fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))
-        effective = np.empty(len(prior.mean))
-        compiled_mixtures.importance_corrected(
-            line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
-            np.stack([e for _, e in numbers]), _LEAST_EFFECTIVE, _HALVINGS, _PRIOR_POINTS, effective,
-        )  # fmt: skip
-        return fit, effective
-    proposals: list[Hypotheses] = []
-    t = np.zeros((len(prior.mean), 0, view.reduced.size))
-    target = np.zeros(t.shape[:2])
-    for k in range(rounds):
-        new = _drawn(proposal, points, k)
-        proposals.append(proposal)
-        t = np.concatenate([t, new], axis=1)
-        target = np.concatenate([target, _log_prior(prior, new) + view.log_likelihoods(new)], axis=1)
-        log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
-        log_weight -= log_sum(log_weight, axis=1)[:, None]
-        proposal = _refitted(proposal, t, _tempered(log_weight, _LEAST_EFFECTIVE))
-    return proposal, np.exp(-log_sum(2 * log_weight, axis=1))
-
-
-def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Weights raised to the largest power up to one at which so many points, or half of all, count."""
-    least = min(least, log_weight.shape[1] / 2)
-    low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
-    power = high
-    for _ in range(_HALVINGS):
-        w = power[:, None] * log_weight
-        enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
-        low, high = np.where(enough, power, low), np.where(enough, high, power)
-        power = (low + high) / 2
-        power = np.where(low == 1, 1.0, power)
-    w = np.where(low == 1, 1.0, low)[:, None] * log_weight
-    return w - log_sum(w, axis=1)[:, None]
-
-
-def _drawn(proposal: Hypotheses, count: int, number: int) -> FloatArray:
-    """Points of a mixture, (axes, count, n); those of each round have a number."""
-    axes, _, n = proposal.mean.shape
-    u, e = _quasi_random(count, n, number)
-    total = np.cumsum(np.exp(proposal.log_weight), axis=1)
-    component = np.minimum((total[:, None] < u[:, None] * total[:, -1:, None]).sum(axis=2), total.shape[1] - 1)
-    rows = np.arange(axes)[:, None]
-    root = cholesky(proposal.covariance)[rows, component]
-    return np.asarray(proposal.mean[rows, component] + np.add.reduce(root * e[:, None], axis=-1))
-
-
-@lru_cache(maxsize=32)
-def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArray]:
-    """Sobol's points, shifted: one uniform number and n normal ones for each, (count,) and (count, n)."""
-    points = stats.qmc.Sobol(n + 1, scramble=False).random(count)
-    points = (points + np.random.default_rng(number).random(n + 1)) % 1.0
-    return points[:, 0], np.asarray(special.ndtri(np.clip(points[:, 1:], 1e-12, 1 - 1e-12)))
-
-
-def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
-    """Of t = (start state, noise coefficients), (axes, points)."""
-    states = prior.mean.shape[2]
-    rest = t[..., states:]
-    noise = -0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi)
-    return np.asarray(prior.log_density(t[..., :states]) + noise)
-
-
-def _refitted(mixture: Hypotheses, points: FloatArray, log_weight: FloatArray) -> Hypotheses:
-    """One step of expectation and maximisation with weighted points."""
-    logs = mixture.component_log_densities(points)
-    share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
-    mass = np.add.reduce(share, axis=2)
-    effective = mass**2 / np.maximum(np.add.reduce(share * share, axis=2), 1e-300)
-    safe = np.maximum(mass, 1e-300)[..., None]
-    mean = stacked.long_matmul(share, points) / safe
-    mean = np.where(mass[..., None] > 1e-9, mean, mixture.mean)
-    away = points[:, None] - mean[:, :, None]
-    spread = stacked.long_matmul(stacked.transpose(away * share[..., None]), away) / safe[..., None]
-    trust = (effective / (effective + _PRIOR_POINTS))[..., None, None]
-    covariance = stacked.symmetric(trust * spread + (1 - trust) * mixture.covariance)
-    with np.errstate(divide="ignore"):
-        return Hypotheses(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)
+    return modes, proposed(modes.log_evidence, Belief(modes.mean, modes.covariance), prior.log_weight, flat)

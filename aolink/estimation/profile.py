@@ -22,6 +22,7 @@ from aolink.estimation.compiled.line import Line, mark_repeats
 from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, lower_inverse, single
 from aolink.estimation.hypothesis_filter import Innovation, Update
+from aolink.estimation.importance import importance_corrected, proposed
 from aolink.estimation.observation import Belief, corrected
 from aolink.estimation.pixels import PixelView, Reduction, reduction
 from aolink.estimation.windowed import KERNEL_REACH, PATH_REACH
@@ -290,7 +291,15 @@ class ProfileUpdates:
         modes = without_repeats(with_reversals(view, before, found))
         log_weight = modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None]
         after = Hypotheses(log_weight, modes.mean, modes.covariance).belief
-        new = innovation(view, before, modes)
-        end = single(view.reduced.end(after))
         several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
-        return Update(after, end, new, several)
+        at = np.flatnonzero(several)
+        if len(at):
+            # Where there are several the posterior is far from Gaussian about each, and what is between them counts.
+            proposal = proposed(
+                modes.log_evidence[at], Belief(modes.mean[at], modes.covariance[at]),
+                np.zeros((len(at), 1)), Belief(wide.mean[at, None], wide.covariance[at, None]),
+            )  # fmt: skip
+            fit, _ = importance_corrected(view.part(at), prior.part(at), proposal, rounds=1)
+            after.mean[at], after.covariance[at] = fit.belief.mean, fit.belief.covariance
+        new = innovation(view, before, modes)
+        return Update(after, single(view.reduced.end(after)), new, several)

@@ -9,7 +9,8 @@ from aolink.estimation import exposure_model, make_estimator, pixels, profile
 from aolink.estimation.compiled import line, mixtures, small
 from aolink.estimation.hypotheses import Hypotheses, log_determinant, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
-from aolink.estimation.mixture import MixtureUpdates, explored, importance_corrected
+from aolink.estimation.importance import importance_corrected
+from aolink.estimation.mixture import MixtureUpdates, explored
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import Profile
 from aolink.optics.camera import to_density

@@ -9,7 +9,8 @@ from aolink.estimation import Status, exposure_model, make_estimator, pixels, pr
 from aolink.estimation.estimators import measure
 from aolink.estimation.hypotheses import cholesky, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
-from aolink.estimation.mixture import MixtureUpdates, explored, importance_corrected
+from aolink.estimation.importance import importance_corrected
+from aolink.estimation.mixture import MixtureUpdates, explored
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.optics.camera import to_counts

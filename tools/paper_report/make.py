@@ -16,7 +16,7 @@ from paper_report import figures, shahin
 from paper_report import numbers as n
 from paper_report.blocks import as_html, as_markdown
 from paper_report.ensemble import Cell, map_cells
-from paper_report.limit import limit_table
+from paper_report.limit import against_o1, limit_table
 from paper_report.page import Results, build
 from paper_report.shake import shake_table
 
@@ -62,7 +62,7 @@ def compute(effort: n.Effort) -> Results:
     with _timed("shake"):
         shake = shake_table(printed, effort)
     with _timed("limit"):
-        limit = limit_table(effort)
+        limit, over_o1 = limit_table(effort), against_o1(effort)
     with _timed("map"):
         mechanism = n.mechanism(lively, effort)
         cells = map_cells(
@@ -71,7 +71,7 @@ def compute(effort: n.Effort) -> Results:
         )  # fmt: skip
     return Results(
         printed=printed, lively=lively, effort=effort, rows=rows, norms=norms, errors=errors, forms=forms,
-        remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, cells=cells,
+        remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, over_o1=over_o1, cells=cells,
     )  # fmt: skip
 
 

@@ -43,6 +43,9 @@ class Effort:
     limit_skip: int = 4
     limit_every: int = 1
     """Of the scenes of the table of the limit, every so many."""
+    o1_runs: int = 60
+    """Of each scene without the sampler."""
+    o1_exposures: int = 24
     particles: int = 1500
     """Of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -55,7 +58,7 @@ class Effort:
 FULL = Effort()
 QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
-    limit_runs=2, limit_exposures=4, limit_skip=1, limit_every=5, particles=150,
+    limit_runs=2, limit_exposures=4, limit_skip=1, limit_every=5, o1_runs=6, o1_exposures=6, particles=150,
     offsets=(0.0, 0.5), densities=(0.1, 0.01), process_noises=(0.1, 10.0), frequencies=100, dpi=70,
 )  # fmt: skip
 

@@ -13,7 +13,7 @@ from aolink.rig import Rig
 from paper_report import figures
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
 from paper_report.ensemble import Cell, Measured
-from paper_report.limit import Scene, limit_section
+from paper_report.limit import Scene, against_o1_section, limit_section
 from paper_report.numbers import (
     Effort,
     ErrorRow,
@@ -48,6 +48,7 @@ class Results:
     mechanism: Mechanism
     shake: list[ShakeRow]
     limit: list[Scene]
+    over_o1: list[tuple[str, dict[str, Measured]]]
     cells: list[Cell]
 
 
@@ -81,6 +82,7 @@ def build(results: Results) -> list[Block]:
         *_map(results),
         *shake_section(results.shake, results.effort),
         *limit_section(results.limit, results.effort),
+        *against_o1_section(results.over_o1, results.effort),
     ]
 
 
