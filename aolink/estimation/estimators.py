@@ -99,6 +99,8 @@ class Estimator:
             self._filter = BlurFilter(
                 rig.plant, self._observation, process_noise=options.process_noise, gate=options.gate, predict=predict
             )
+        self.several: NDArray[np.bool_] | None = None
+        """Which axes of the last exposure have a blur of more than one reading; None of estimators that do not look."""
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
 
@@ -114,6 +116,7 @@ class Estimator:
         response = response or model.response(exposure.inputs)
         taken, remark = measured or self.measure_all([exposure])[0]
         posterior = self._filter.step(model, response, taken)  # type: ignore[arg-type] # what it measured itself
+        self.several = posterior.several
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
         return Estimate(

@@ -48,6 +48,8 @@ class Found:
     """RMS distance of the path from the limit's, in its standard deviations, without the sampler's own noise."""
     time_ms: float
     """For an axis and exposure."""
+    one_mode: tuple[float, float, float]
+    """Of exposures in which `profile` saw one mode: their share, the distance and the NEES there."""
 
 
 @dataclass(frozen=True)
@@ -94,18 +96,22 @@ def limit_table(effort: Effort) -> list[Scene]:
     table = []
     every = islice(scenes(effort.limit_runs, effort.limit_exposures), 0, None, effort.limit_every)
     for name, rig, exposures in every:
-        estimates, seconds = {}, {}
+        estimates, seconds, one_mode = {}, {}, []
         for each in (*NAMES, "again"):
             options = {"particles": effort.particles, "seed": int(each == "again")}
             estimator = make_estimator(rig, "sampled" if each == "again" else each, **options)
             start = time.perf_counter()
-            estimates[each] = [estimator.step(exposure) for exposure in exposures]
+            estimates[each] = []
+            for exposure in exposures:
+                estimates[each].append(estimator.step(exposure))
+                if each == "profile" and estimator.several is not None:
+                    one_mode.append(~estimator.several)
             seconds[each] = time.perf_counter() - start
         limits = estimates["sampled"], estimates.pop("again")
         per = rig.plant.axes * len(exposures)
         table.append(
             Scene(name, {
-                each: _found(exposures, estimates[each], limits, effort.limit_skip, seconds[each] * 1e3 / per)
+                each: _found(exposures, estimates[each], limits, one_mode, effort.limit_skip, seconds[each] * 1e3 / per)
                 for each in NAMES
             })
         )  # fmt: skip
@@ -138,7 +144,7 @@ def against_o1_section(table: Sequence[tuple[str, dict[str, Measured]]], effort:
 
 def _found(
     exposures: Sequence[Exposure], estimates: Sequence[Estimate], limits: tuple[list[Estimate], list[Estimate]],
-    skip: int, time_ms: float,
+    one_mode: Sequence[NDArray[np.bool_]], skip: int, time_ms: float,
 ) -> Found:  # fmt: skip
     path, end, nees, inside, product, variance = [], [], [], [], [], []
     for exposure, e, one, two in list(zip(exposures, estimates, *limits, strict=True))[skip:]:
@@ -149,18 +155,32 @@ def _found(
         inside.append(np.mean(np.abs(error) < 1.96 * e.path_sd))
         away = e.end_state - truth.end_state
         end.append(np.mean(np.sum(away**2, axis=1)))
-        nees.append(np.mean(np.einsum("ai,ai->a", away, np.linalg.solve(e.end_covariance, away[..., None])[..., 0])))
+        nees.append(np.einsum("ai,ai->a", away, np.linalg.solve(e.end_covariance, away[..., None])[..., 0]))
         # Two independent runs of the sampler: their own noise has no part in the product.
-        product.append(np.mean((e.path - one.path) * (e.path - two.path)))
-        variance.append(np.mean(one.path_sd**2))
+        product.append(_of_axes((e.path - one.path) * (e.path - two.path), len(away)))
+        variance.append(_of_axes(one.path_sd**2, len(away)))
     axes, states = estimates[0].end_state.shape
     samples = axes * len(nees)
     low, high = (2 * float(special.gammaincinv(samples * states / 2, p)) / (samples * states) for p in (0.025, 0.975))
+    alone = np.array(one_mode[skip:])
     return Found(
         path=math.sqrt(np.mean(path)), end=math.sqrt(np.mean(end)), nees=float(np.mean(nees)) / states, nees_low=low,
         nees_high=high, inside=float(np.mean(inside)),
-        distance=math.sqrt(max(0.0, float(np.mean(product) / np.mean(variance)))), time_ms=time_ms,
+        distance=_root(np.array(product), np.array(variance)), time_ms=time_ms,
+        one_mode=(
+            float(alone.mean()), _root(np.array(product)[alone], np.array(variance)[alone]),
+            float(np.array(nees)[alone].mean()) / states if alone.any() else math.nan,
+        ),
     )  # fmt: skip
+
+
+def _of_axes(values: FloatArray, axes: int) -> FloatArray:
+    """Mean over outputs and steps, (axes,), of (axes * outputs, steps)."""
+    return np.asarray(values.reshape(axes, -1).mean(axis=1))
+
+
+def _root(square: FloatArray, variance: FloatArray) -> float:
+    return math.sqrt(max(0.0, float(square.mean() / variance.mean()))) if len(square) else math.nan
 
 
 def limit_section(table: Sequence[Scene], effort: Effort) -> list[Block]:
@@ -185,6 +205,11 @@ def limit_section(table: Sequence[Scene], effort: Effort) -> list[Block]:
             " sampler with other random numbers take its noise out. 0.32 costs 5 % in RMSE, 0.46 10 %."
         ),
         Table(["scene", *below], rows("distance", below)),
+        Text("Exposures in which profile saw one mode: their share, its distance and its NEES there:"),
+        Table(
+            ["scene", "share", "distance", "NEES"],
+            [[scene.name, *(format(x, ".2f") for x in scene.found["profile"].one_mode)] for scene in table],
+        ),
         Text("RMSE of the end state's norm:"),
         Table(["scene", *NAMES], rows("end")),
         Text(
