@@ -1,10 +1,16 @@
 """Blur that nobody here made: frames of diffusing spheres, averaged, against where a tracker saw them in each."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
-from spheres import HALF, spheres
 
 from aolink.estimation import run
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+
+from paper_report.spheres import HALF, spheres
 
 NAMES = ["o1", "moments", "profile", "mixture"]
 

@@ -31,6 +31,8 @@ SECTIONS = (
     "The map o3/o1",
     "A shake faster than the frames",
     "How near to the limit",
+    "Not worse than o1, anywhere",
+    "Blur that nobody here made",
 )
 NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
 

@@ -19,6 +19,7 @@ from paper_report.ensemble import Cell, map_cells
 from paper_report.limit import against_o1, limit_table
 from paper_report.page import Results, build
 from paper_report.shake import shake_table
+from paper_report.spheres import film
 
 
 @contextmanager
@@ -63,6 +64,8 @@ def compute(effort: n.Effort) -> Results:
         shake = shake_table(printed, effort)
     with _timed("limit"):
         limit, over_o1 = limit_table(effort), against_o1(effort)
+    with _timed("spheres"):
+        spheres = film(effort)
     with _timed("map"):
         mechanism = n.mechanism(lively, effort)
         cells = map_cells(
@@ -71,7 +74,8 @@ def compute(effort: n.Effort) -> Results:
         )  # fmt: skip
     return Results(
         printed=printed, lively=lively, effort=effort, rows=rows, norms=norms, errors=errors, forms=forms,
-        remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, over_o1=over_o1, cells=cells,
+        remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, over_o1=over_o1, film=spheres,
+        cells=cells,
     )  # fmt: skip
 
 

@@ -46,6 +46,8 @@ class Effort:
     o1_runs: int = 60
     """Of each scene without the sampler."""
     o1_exposures: int = 24
+    film_frames: tuple[int, ...] = (8, 12, 24)
+    film_estimators: tuple[str, ...] = ESTIMATOR_NAMES
     particles: int = 1500
     """Of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -59,6 +61,7 @@ FULL = Effort()
 QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
     limit_runs=2, limit_exposures=4, limit_skip=1, limit_every=5, o1_runs=6, o1_exposures=6, particles=150,
+    film_frames=(24,), film_estimators=("o1", "moments", "profile", "mixture"),
     offsets=(0.0, 0.5), densities=(0.1, 0.01), process_noises=(0.1, 10.0), frequencies=100, dpi=70,
 )  # fmt: skip
 

@@ -28,6 +28,7 @@ from paper_report.numbers import (
     number,
 )
 from paper_report.shake import ShakeRow, shake_section
+from paper_report.spheres import Film, film_section
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +50,7 @@ class Results:
     shake: list[ShakeRow]
     limit: list[Scene]
     over_o1: list[tuple[str, dict[str, Measured]]]
+    film: list[Film]
     cells: list[Cell]
 
 
@@ -83,6 +85,7 @@ def build(results: Results) -> list[Block]:
         *shake_section(results.shake, results.effort),
         *limit_section(results.limit, results.effort),
         *against_o1_section(results.over_o1, results.effort),
+        *film_section(results.film),
     ]
 
 
