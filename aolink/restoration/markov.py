@@ -13,8 +13,9 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, linalg
+from scipy import fft
 
+from aolink.restoration.banded import dense, normal_bands
 from aolink.restoration.psf import Psf, line_matrix
 
 FloatArray = NDArray[np.floating[Any]]
@@ -23,6 +24,9 @@ BoolArray = NDArray[np.bool_]
 _THREADS = 2
 _MOST_STEPS = 400
 _TOLERANCE = 1e-4
+# Above this kappa, in squares of the PSF's sum, single precision is wrong by far less than the noise; its error grows
+# with one over kappa.
+_SINGLE = 1e-3
 
 
 class Solver(Protocol):
@@ -41,8 +45,8 @@ class Solver(Protocol):
         """The scene x with (H'WH + kappa L) x = right; an error is measured against the root of kappa x'L x."""
         ...
 
-    def gauss_markov(self, images: FloatArray, tolerance: float = _TOLERANCE) -> FloatArray:
-        """The scene of images, which hold something likely where they were not measured."""
+    def guess(self, images: FloatArray) -> FloatArray | None:
+        """A scene to start from, of images that hold something likely where they were not measured, if it helps."""
         ...
 
 
@@ -71,30 +75,34 @@ class LineSolver:
     def project(self, images: FloatArray) -> FloatArray:
         return np.asarray(images.astype(self.C.dtype, copy=False) @ self.C)
 
+    def guess(self, images: FloatArray) -> None:
+        """It needs none."""
+
     def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
-        z = fft.dct(right, axis=-2, norm="ortho", workers=_THREADS) @ self.vectors
+        # A second thread for the cosines would cost more than it saves: that of the products is still awake.
+        z = fft.dct(right, axis=-2, norm="ortho") @ self.vectors
         z *= self.inverse
-        return np.asarray(fft.idct(z @ self.vectors.T, axis=-2, norm="ortho", workers=_THREADS, overwrite_x=True))
-
-    def gauss_markov(self, images: FloatArray, tolerance: float = 0.0) -> FloatArray:
-        return self.solve(self.project(images))
+        return np.asarray(fft.idct(z @ self.vectors.T, axis=-2, norm="ortho", overwrite_x=True))
 
 
-def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, dtype: type = np.float64) -> LineSolver:
-    """The exact solver of a PSF along the rows, which may differ from pixel to pixel."""
-    C = line_matrix(psf.values, shape[1])
-    normal = C.T @ C
-    size = len(normal)
-    i = np.arange(size)
-    normal[i, i] += 2 * kappa
-    normal[[0, -1], [0, -1]] -= kappa
-    normal[i[1:], i[:-1]] -= kappa
-    normal[i[:-1], i[1:]] -= kappa
-    values, vectors = linalg.eigh(normal, driver="evd", overwrite_a=True, check_finite=False)
+def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = False) -> LineSolver:
+    """The exact solver of a PSF along the rows, which may differ from pixel to pixel; in single precision if allowed.
+
+    It is the latter where that costs nothing that shows.
+    """
+    taps = np.broadcast_to(psf.values, (shape[1], psf.values.shape[-1]))
+    single = single and kappa >= _SINGLE * float(taps.sum(axis=1).max()) ** 2
+    dtype = np.float32 if single else np.float64
+    bands = normal_bands(taps, np.ones(shape[1]))
+    bands[0] += 2 * kappa
+    bands[0, [0, -1]] -= kappa
+    bands[1, :-1] -= kappa
+    # NumPy's, not SciPy's: each of them has threads of its own, and those would be in the way of the products'.
+    values, vectors = np.linalg.eigh(dense(bands))
     return LineSolver(
-        C=C.astype(dtype), vectors=vectors.astype(dtype),
+        C=line_matrix(taps, shape[1]).astype(dtype), vectors=vectors.astype(dtype),
         inverse=(1 / (values + kappa * difference_spectrum(shape[0])[:, None])).astype(dtype),
-        first=psf.values.shape[-1] - 1 - psf.origin[0],
+        first=taps.shape[1] - 1 - psf.origin[0],
     )  # fmt: skip
 
 
@@ -108,7 +116,6 @@ class IterativeSolver:
     nearly: Callable[[FloatArray], FloatArray]
     """A symmetric positive definite operator near the inverse."""
     guess: Callable[[FloatArray], FloatArray]
-    """A scene to start from, of images without holes."""
     seen: BoolArray | None
     frame: tuple[slice, slice]
     white: bool = False
@@ -116,9 +123,6 @@ class IterativeSolver:
 
     def project(self, images: FloatArray) -> FloatArray:
         return self.blur_transposed(images if self.seen is None else np.where(self.seen, images, 0.0))
-
-    def gauss_markov(self, images: FloatArray, tolerance: float = _TOLERANCE) -> FloatArray:
-        return self.solve(self.project(images), self.guess(images), tolerance)
 
     def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
         x = self.nearly(right) if start is None else start.copy()
@@ -214,16 +218,19 @@ def masked_line_solver(psf: Psf, seen: BoolArray, kappa: float) -> IterativeSolv
     exact = line_solver(psf, (seen.shape[0], seen.shape[1]), kappa)
     return IterativeSolver(
         kappa=kappa, blur=lambda x: np.asarray(x @ exact.C.T), blur_transposed=lambda y: np.asarray(y @ exact.C),
-        nearly=exact.solve, guess=exact.gauss_markov, seen=seen, frame=exact.frame,
+        nearly=exact.solve, guess=lambda y: exact.solve(exact.project(y)), seen=seen, frame=exact.frame,
     )  # fmt: skip
 
 
 def make_solver(
-    psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, dtype: type = np.float64
+    psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, single: bool = False
 ) -> Solver:
-    """The solver for a PSF, a frame's shape, kappa, and a mask (rows, columns), False where nothing was measured."""
+    """The solver for a PSF, a frame's shape, kappa, and a mask (rows, columns), False where nothing was measured.
+
+    ``single`` allows single precision, where it costs nothing that shows.
+    """
     if not psf.on_line:
         return plane_solver(psf, shape, kappa, seen)
     if seen is None:
-        return line_solver(psf, shape, kappa, dtype)
+        return line_solver(psf, shape, kappa, single)
     return masked_line_solver(psf, seen, kappa)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from aolink.restoration import Psf, non_local_means
 from aolink.restoration.markov import differences_transposed, line_solver, make_solver, plane_solver, roughness
-from aolink.restoration.tv import WEIGHT, total_variation
+from aolink.restoration.tv import ITERATIONS, WEIGHT, total_variation
 from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, psnr, roughness_matrix
 
 FloatArray = NDArray[np.float64]
@@ -98,13 +98,13 @@ def test_total_variation_meets_its_dual() -> None:
 
 
 @pytest.mark.parametrize("values", [UNIFORM, CORNER], ids=["line", "plane"])
-def test_ten_iterations_are_enough(values: FloatArray) -> None:
+def test_few_iterations_are_enough(values: FloatArray) -> None:
     origin = tuple(n // 2 for n in values.shape)
     image, inside = blurred(blocks(60, 90), values, origin)
     image = image + 0.01 * np.random.default_rng(6).standard_normal(image.shape)
     psf = Psf(values=values, origin=origin)
     found = []
-    for iterations in (10, 200):
+    for iterations in (ITERATIONS, 200):
         x, solver = total_variation(
             lambda kappa: make_solver(psf, image.shape, kappa), image[None], 1e-4, 60.0, iterations
         )
@@ -117,11 +117,24 @@ def test_single_precision_is_enough_for_total_variation() -> None:
     image, _ = blurred(blocks(40, 80), UNIFORM, (3,))
     psf = Psf(values=UNIFORM, origin=(3,))
     one, two = (
-        total_variation(lambda kappa, t=t: make_solver(psf, image.shape, kappa, dtype=t), image[None], 1e-4, 60.0)[0]
-        for t in (np.float32, np.float64)
+        total_variation(lambda kappa, t=t: make_solver(psf, image.shape, kappa, single=t), image[None], 1e-4, 60.0)[0]
+        for t in (True, False)
     )
     assert one.dtype == np.float32
     assert abs(one - two).max() < 1e-3
+
+
+@pytest.mark.parametrize("noise_sd", [1e-2, 1e-3, 1e-4, 1e-5])
+def test_single_precision_is_wrong_by_less_than_the_noise(noise_sd: float) -> None:
+    """Its error grows with one over kappa: where the noise is small, it is not used."""
+    image, _ = blurred(blocks(40, 80), LOPSIDED, (3,))
+    image = image + noise_sd * np.random.default_rng(1).standard_normal(image.shape)
+    psf = Psf(values=LOPSIDED, origin=(3,))
+    one, two = (
+        total_variation(lambda k, t=t: make_solver(psf, image.shape, k, single=t), image[None], noise_sd**2, 60.0)[0]
+        for t in (True, False)
+    )
+    assert np.std(one - two) < 0.1 * noise_sd
 
 
 def test_one_plane_solver_is_the_other() -> None:

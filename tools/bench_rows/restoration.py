@@ -79,8 +79,7 @@ def restoration_time() -> list[Row]:
 
     def tv() -> None:
         total_variation(
-            lambda kappa: make_solver(psf, (512, 512), kappa, dtype=np.float32), image[None].astype(np.float32),
-            variance, weight,
+            lambda kappa: make_solver(psf, (512, 512), kappa, single=True), image[None], variance, weight
         )  # fmt: skip
 
     ours = {
