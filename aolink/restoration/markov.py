@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
+from scipy import fft, linalg
 
 from aolink.restoration.banded import dense, normal_bands
 from aolink.restoration.psf import Psf, line_matrix
@@ -27,6 +27,9 @@ _TOLERANCE = 1e-4
 # Above this kappa, in squares of the PSF's sum, single precision is wrong by far less than the noise; its error grows
 # with one over kappa.
 _SINGLE = 1e-3
+# Scenes of so many pixels are solved by one dense factorisation, which conjugate gradients do not come up to; FFTs of
+# less than this gain nothing by a second thread.
+_SMALL_SCENE, _SMALL_FFT = 1200, 40_000
 
 
 class Solver(Protocol):
@@ -107,6 +110,62 @@ def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = F
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class DenseSolver:
+    """Any blur on the plane and any mask of a small frame: exact, by the Cholesky factor of the whole matrix."""
+
+    H: FloatArray
+    """Blurs a scene, zero where nothing was measured, (pixels, scene's pixels)."""
+    factor: FloatArray
+    """Lower one of (H'WH + kappa L), (scene's pixels, scene's pixels)."""
+    shape: tuple[int, int]
+    """Of the scene."""
+    frame: tuple[slice, slice]
+
+    def project(self, images: FloatArray) -> FloatArray:
+        return np.asarray(images.reshape(len(images), -1) @ self.H).reshape(-1, *self.shape)
+
+    def guess(self, images: FloatArray) -> None:
+        """It needs none."""
+
+    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
+        flat = right.reshape(len(right), -1).T
+        return np.asarray(linalg.cho_solve((self.factor, True), flat, check_finite=False)).T.reshape(right.shape)
+
+
+def dense_solver(psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None) -> DenseSolver:
+    """The exact solver of a PSF on the plane, or along all rows alike, for a small frame."""
+    taps, frame = _on_plane(psf, shape)
+    (rows, columns), (high, wide) = shape, (shape[0] + taps.shape[0] - 1, shape[1] + taps.shape[1] - 1)
+    H = np.zeros((rows, columns, high, wide))
+    each = np.lib.stride_tricks.as_strided(
+        H, (rows, columns, *taps.shape), (H.strides[0] + H.strides[2], H.strides[1] + H.strides[3], *H.strides[2:])
+    )
+    each[...] = taps[::-1, ::-1]
+    if seen is not None:
+        H *= seen[:, :, None, None]
+    flat = H.reshape(rows * columns, high * wide)
+    A = (flat.T @ flat).reshape(high, wide, high, wide)
+    r, c = np.arange(high), np.arange(wide)
+    A[r, :, r, :] += kappa * _differences_squared(wide)
+    A[:, c, :, c] += kappa * _differences_squared(high)
+    factor = linalg.cholesky(A.reshape(high * wide, -1), lower=True, overwrite_a=True, check_finite=False)
+    return DenseSolver(H=flat, factor=factor, shape=(high, wide), frame=frame)
+
+
+def _differences_squared(n: int) -> NDArray[np.float64]:
+    """D'D for n pixels in a row, (n, n)."""
+    D = np.diff(np.eye(n), axis=0)
+    return np.asarray(D.T @ D)
+
+
+def _on_plane(psf: Psf, shape: tuple[int, int]) -> tuple[NDArray[np.float64], tuple[slice, slice]]:
+    """Taps on the plane, and where a frame lies in its scene."""
+    taps, origin = np.atleast_2d(psf.values), (0, *psf.origin)[-2:]
+    top, left = (n - 1 - o for n, o in zip(taps.shape, origin, strict=True))
+    return taps, (slice(top, top + shape[0]), slice(left, left + shape[1]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class IterativeSolver:
     """Any blur on the plane and any mask, by conjugate gradients from a solver that is nearly right."""
 
@@ -171,9 +230,10 @@ def plane_solver(
     psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, white: bool = False
 ) -> IterativeSolver:
     """The solver of a PSF on the plane (or along all rows alike), starting from its periodic one."""
-    taps, origin = np.atleast_2d(psf.values), (0, *psf.origin)[-2:]
+    taps, frame = _on_plane(psf, shape)
     reach = (taps.shape[0] - 1, taps.shape[1] - 1)
     rows, columns = size = (shape[0] + reach[0], shape[1] + reach[1])
+    threads = _THREADS if rows * columns > _SMALL_FFT else 1
     transfer = fft.rfft2(taps, size)
     fraction = 1.0 if seen is None else float(seen.mean())
     y, x = fft.fftfreq(rows)[:, None], fft.rfftfreq(columns)[None]
@@ -184,8 +244,8 @@ def plane_solver(
     inverse = 1 / (share * np.abs(transfer) ** 2 + kappa * prior)
 
     def through(images: FloatArray, factor: NDArray[np.inexact[Any]]) -> FloatArray:
-        spectrum = fft.rfft2(images, size, workers=_THREADS)
-        return np.asarray(fft.irfft2(spectrum * factor, size, workers=_THREADS))
+        spectrum = fft.rfft2(images, size, workers=threads)
+        return np.asarray(fft.irfft2(spectrum * factor, size, workers=threads))
 
     def blur(scene: FloatArray) -> FloatArray:
         return through(scene, transfer)[..., reach[0] :, reach[1] :]
@@ -205,11 +265,9 @@ def plane_solver(
         padded[..., : reach[1]] = (1 - right) * padded[..., -1:] + right * padded[..., reach[1], None]
         return through(padded, transfer.conj() * inverse)
 
-    first = [m - o for m, o in zip(reach, origin, strict=True)]
     return IterativeSolver(
         kappa=kappa, blur=blur, blur_transposed=blur_transposed, nearly=lambda r: through(r, inverse), guess=guess,
-        seen=seen, white=white,
-        frame=(slice(first[0], first[0] + shape[0]), slice(first[1], first[1] + shape[1])),
+        seen=seen, white=white, frame=frame,
     )  # fmt: skip
 
 
@@ -229,8 +287,12 @@ def make_solver(
 
     ``single`` allows single precision, where it costs nothing that shows.
     """
-    if not psf.on_line:
-        return plane_solver(psf, shape, kappa, seen)
-    if seen is None:
+    if psf.on_line and seen is None:
         return line_solver(psf, shape, kappa, single)
-    return masked_line_solver(psf, seen, kappa)
+    if not psf.varies:
+        taps = np.atleast_2d(psf.values).shape
+        if (shape[0] + taps[0] - 1) * (shape[1] + taps[1] - 1) <= _SMALL_SCENE:
+            return dense_solver(psf, shape, kappa, seen)
+    if psf.on_line and seen is not None:
+        return masked_line_solver(psf, seen, kappa)
+    return plane_solver(psf, shape, kappa, seen)

@@ -7,7 +7,19 @@ import pytest
 from numpy.typing import NDArray
 
 from aolink.restoration import Psf, non_local_means
-from aolink.restoration.markov import differences_transposed, line_solver, make_solver, plane_solver, roughness
+from aolink.restoration.markov import (
+    DenseSolver,
+    IterativeSolver,
+    LineSolver,
+    Solver,
+    dense_solver,
+    differences_transposed,
+    line_solver,
+    make_solver,
+    masked_line_solver,
+    plane_solver,
+    roughness,
+)
 from aolink.restoration.tv import ITERATIONS, WEIGHT, total_variation
 from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, psnr, roughness_matrix
 
@@ -37,16 +49,38 @@ def test_along_lines_it_is_dense_least_squares(values: FloatArray, kappa: float)
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("line", [False, True])
-def test_on_the_plane_and_masked_it_is_dense_least_squares(line: bool, masked: bool) -> None:
+@pytest.mark.parametrize("iterative", [False, True])
+def test_on_the_plane_and_masked_it_is_dense_least_squares(line: bool, masked: bool, iterative: bool) -> None:
+    """Solved directly where the frame is as small as here, and by conjugate gradients."""
     rng = np.random.default_rng(2)
-    psf = Psf(values=UNIFORM, origin=(3,)) if line else Psf(values=CORNER, origin=(1, 1))
+    psf = Psf(values=LOPSIDED, origin=(3,)) if line else Psf(values=CORNER, origin=(1, 1))
     images = rng.standard_normal((2, *SHAPE))
     seen = rng.random(SHAPE) > 0.15 if masked else None
-    solver = make_solver(psf, SHAPE, 0.01, seen)
-    found = solver.solve(solver.project(images), None, 1e-12)
+    solver: Solver = dense_solver(psf, SHAPE, 0.01, seen)
+    if iterative and line and seen is not None:
+        solver = masked_line_solver(psf, seen, 0.01)
+    elif iterative:
+        solver = plane_solver(psf, SHAPE, 0.01, seen)
+    found = solver.solve(solver.project(images), solver.guess(images), 1e-12)
     assert abs(found - dense(psf, images, 0.01, seen)).max() < 1e-8
-    expected = (slice(None), slice(3, 17)) if line else (slice(1, 12), slice(1, 15))
-    assert np.empty(found.shape[1:])[solver.frame].shape == np.empty(found.shape[1:])[expected].shape == SHAPE
+    expected = (slice(1, 12), slice(1, 15)) if not line else (slice(0, 11), slice(1, 15))
+    rows, columns = np.indices(found.shape[1:])
+    assert (rows[solver.frame] == rows[expected]).all()
+    assert (columns[solver.frame] == columns[expected]).all()
+
+
+def test_small_frames_are_solved_directly_and_large_ones_are_not() -> None:
+    mask = np.ones((40, 40), bool)
+    mask[3, 4] = False
+    plane, line = Psf(values=CORNER, origin=(1, 1)), Psf(values=UNIFORM, origin=(3,))
+    kinds = [
+        type(make_solver(psf, shape, 0.01, None if seen is None else seen[: shape[0], : shape[1]]))
+        for psf, shape, seen in (
+            (plane, (20, 20), None), (plane, (40, 40), None), (line, (20, 20), mask), (line, (40, 40), mask),
+            (line, (20, 20), None),
+        )
+    ]  # fmt: skip
+    assert kinds == [DenseSolver, IterativeSolver, DenseSolver, IterativeSolver, LineSolver]
 
 
 def test_white_pixels_in_the_place_of_white_differences() -> None:
