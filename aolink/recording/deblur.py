@@ -107,6 +107,13 @@ def estimated_psfs(
         yield motion_psf_by_root(path, root, kernel, pixel_scale, shares)
 
 
+def scene_psf(rig: Rig, exposure: Exposure, estimate: Estimate) -> Psf:
+    """The PSF of a rig's picture sensor by an estimate, with its uncertainty."""
+    assert rig.scene is not None
+    mix = scene_motion(rig.n_outputs)
+    return next(estimated_psfs(exposure, estimate, [mix], rig.scene.kernel, rig.scene.pixel_scale))
+
+
 def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method = "tv") -> RestoredPictures:
     """Restore what an exposure's sensors saw, with the path of its estimate; intensities are cut at 0 and 1."""
     scene = spots = None
@@ -134,10 +141,7 @@ def _restored_scene(rig: Rig, exposure: Exposure, estimate: Estimate, method: Me
         raise RestorationError("the picture never came")
     counts = exposure.scene.pixels
     good = exposure.scene.mask & ~rig.scene.is_saturated(counts)
-    (psf,) = estimated_psfs(
-        exposure, estimate, [scene_motion(rig.n_outputs)], rig.scene.kernel, rig.scene.pixel_scale
-    )  # fmt: skip
-    return restore(rig.scene.to_intensity(counts), psf, method=method, mask=good)
+    return restore(rig.scene.to_intensity(counts), scene_psf(rig, exposure, estimate), method=method, mask=good)
 
 
 def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method) -> FloatArray:
