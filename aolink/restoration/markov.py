@@ -233,41 +233,51 @@ def plane_solver(
     taps, frame = _on_plane(psf, shape)
     reach = (taps.shape[0] - 1, taps.shape[1] - 1)
     rows, columns = size = (shape[0] + reach[0], shape[1] + reach[1])
+    # The blur goes round in a plane as large as the scene, or a little larger, where transforms are fast.
+    fast = (fft.next_fast_len(rows, real=True), fft.next_fast_len(columns, real=True))
     threads = _THREADS if rows * columns > _SMALL_FFT else 1
-    transfer = fft.rfft2(taps, size)
     fraction = 1.0 if seen is None else float(seen.mean())
-    y, x = fft.fftfreq(rows)[:, None], fft.rfftfreq(columns)[None]
-    rough = 4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2
-    # The frame's share of the scene, and a floor for the mean, which the differences do not hold.
+    # The frame's share of the scene.
     share = fraction * shape[0] * shape[1] / (rows * columns)
-    prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
-    inverse = 1 / (share * np.abs(transfer) ** 2 + kappa * prior)
 
-    def through(images: FloatArray, factor: NDArray[np.inexact[Any]]) -> FloatArray:
-        spectrum = fft.rfft2(images, size, workers=threads)
-        return np.asarray(fft.irfft2(spectrum * factor, size, workers=threads))
+    def spectra(plane: tuple[int, int]) -> tuple[NDArray[np.complexfloating[Any]], FloatArray]:
+        """Transfer function, and what is nearly the inverse."""
+        transfer = fft.rfft2(taps, plane)
+        y, x = fft.fftfreq(plane[0])[:, None], fft.rfftfreq(plane[1])[None]
+        rough = 4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2
+        # A floor for the mean, which the differences do not hold.
+        prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
+        return transfer, 1 / (share * np.abs(transfer) ** 2 + kappa * prior)
+
+    def through(images: FloatArray, factor: NDArray[np.inexact[Any]], plane: tuple[int, int] = fast) -> FloatArray:
+        spectrum = fft.rfft2(images, plane, workers=threads)
+        spectrum *= factor
+        return np.asarray(fft.irfft2(spectrum, plane, workers=threads, overwrite_x=True))[..., :rows, :columns]
+
+    transfer, inverse = spectra(fast)
+    backward = transfer.conj()
+
+    def placed(images: FloatArray) -> FloatArray:
+        padded = np.zeros((*images.shape[:-2], *size))
+        padded[..., reach[0] :, reach[1] :] = images
+        return padded
 
     def blur(scene: FloatArray) -> FloatArray:
         return through(scene, transfer)[..., reach[0] :, reach[1] :]
 
-    def blur_transposed(images: FloatArray) -> FloatArray:
-        padded = np.zeros((*images.shape[:-2], *size))
-        padded[..., reach[0] :, reach[1] :] = images
-        return through(padded, transfer.conj())
-
     def guess(images: FloatArray) -> FloatArray:
         """The periodic scene of images that go over from their last pixel to their first where nothing is known."""
-        padded = np.zeros((*images.shape[:-2], *size))
-        padded[..., reach[0] :, reach[1] :] = images
+        padded = placed(images)
         down = (np.arange(1, reach[0] + 1) / (reach[0] + 1))[:, None]
         padded[..., : reach[0], :] = (1 - down) * padded[..., -1:, :] + down * padded[..., reach[0], None, :]
         right = np.arange(1, reach[1] + 1) / (reach[1] + 1)
         padded[..., : reach[1]] = (1 - right) * padded[..., -1:] + right * padded[..., reach[1], None]
-        return through(padded, transfer.conj() * inverse)
+        round_it, its_inverse = spectra(size)
+        return through(padded, round_it.conj() * its_inverse, size)
 
     return IterativeSolver(
-        kappa=kappa, blur=blur, blur_transposed=blur_transposed, nearly=lambda r: through(r, inverse), guess=guess,
-        seen=seen, white=white, frame=frame,
+        kappa=kappa, blur=blur, blur_transposed=lambda y: through(placed(y), backward),
+        nearly=lambda r: through(r, inverse), guess=guess, seen=seen, white=white, frame=frame,
     )  # fmt: skip
 
 
