@@ -359,6 +359,23 @@ def test_all_spots_of_a_bench_are_restored() -> None:
     assert (after.max(axis=1) / after.sum(axis=1) > 1.5 * before.max(axis=1) / before.sum(axis=1)).all()
 
 
+def test_saturated_pixels_are_left_out(session: Path) -> None:
+    """As if they had never come, on both sensors."""
+    recording = Recording(session)
+    exposure, estimate = next(recording.exposures()), recording.estimates("o1")[0]
+    assert exposure.scene is not None
+    assert RIG.scene is not None
+    scene, spot = exposure.scene.pixels.copy(), exposure.pixels.copy()
+    scene[40:43, 60:64], spot[0, 20] = RIG.scene.full_scale, RIG.sensor.full_scale
+    seen, lit = exposure.scene.mask.copy(), exposure.mask.copy()
+    seen[40:43, 60:64] = lit[0, 20] = False
+    saturated = replace(exposure, pixels=spot, scene=replace(exposure.scene, pixels=scene))
+    absent = replace(saturated, mask=lit, scene=replace(exposure.scene, pixels=scene, mask=seen))
+    one, other = (deblur(RIG, each, estimate) for each in (saturated, absent))
+    np.testing.assert_array_equal(one.scene, other.scene)
+    np.testing.assert_array_equal(one.spots, other.spots)
+
+
 def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None:
     recording = Recording(session)
     exposure = next(recording.exposures())
@@ -399,7 +416,7 @@ def test_the_command(aolink: Run, session: Path, tmp_path: Path) -> None:
 def test_the_command_takes_a_recording_or_a_picture(wrong: list[str]) -> None:
     refused = CliRunner().invoke(app, ["deblur", *wrong, "-o", "c.mcap"])
     assert refused.exit_code == 2
-    assert "give a recording, or --image and --psf" in " ".join(refused.stderr.replace("│", " ").split())
+    assert "give a recording alone, or --image and --psf" in " ".join(refused.stderr.replace("│", " ").split())
 
 
 def test_a_method_that_does_not_exist(session: Path, tmp_path: Path) -> None:
