@@ -98,7 +98,8 @@ def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = F
     dtype = np.float32 if single else np.float64
     bands = normal_bands(taps, np.ones(shape[1]))
     bands[0] += 2 * kappa
-    bands[0, [0, -1]] -= kappa
+    bands[0, 0] -= kappa
+    bands[0, -1] -= kappa
     bands[1, :-1] -= kappa
     # NumPy's, not SciPy's: each of them has threads of its own, and those would be in the way of the products'.
     values, vectors = np.linalg.eigh(dense(bands))
@@ -219,8 +220,9 @@ def roughness(x: FloatArray) -> FloatArray:
 def differences_transposed(along: FloatArray, down: FloatArray) -> FloatArray:
     """Dx' along + Dy' down, from differences (.., rows, columns - 1) and (.., rows - 1, columns)."""
     out = np.empty((*along.shape[:-1], down.shape[-1]), along.dtype)
-    out[..., 0], out[..., -1] = -along[..., 0], along[..., -1]
-    np.subtract(along[..., :-1], along[..., 1:], out=out[..., 1:-1])
+    out[..., 0] = 0
+    out[..., 1:] = along
+    out[..., :-1] -= along
     out[..., 1:, :] += down
     out[..., :-1, :] -= down
     return out

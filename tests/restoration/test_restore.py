@@ -238,6 +238,22 @@ def test_a_picture_of_one_row(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", QUICK)
+@pytest.mark.parametrize("shape", [(1, 1), (5, 1), (1, 5), (2, 2), (8, 1), (1, 6), (6, 5)])
+def test_small_pictures_are_restored_or_refused(method: str, shape: tuple[int, int]) -> None:
+    """Of less than six pixels nothing tells the noise from the scene, nor how rough it is."""
+    image = np.random.default_rng(1).random(shape)
+    on_line = method in ("predictor", "filter", "lag", "smoother")
+    if (shape[1] if on_line else max(shape)) < 6:
+        with pytest.raises(RestorationError, match=f"{shape[0]} x {shape[1]} pixels are too few"):
+            restore(image, np.ones(1), method=method)
+        return
+    found = restore(image, np.ones(1), method=method, noise_sd=1e-6)
+    assert np.isfinite(found.image).all()
+    if method != "predictor":
+        assert abs(found.image - image).max() < 1e-2
+
+
+@pytest.mark.parametrize("method", QUICK)
 def test_an_even_picture_stays_as_it_is(method: str) -> None:
     mask = np.random.default_rng(1).random((12, 30)) > 0.4
     for seen in (None, mask):
