@@ -108,3 +108,15 @@ class Exposures(Sequence[Exposure]):
 
     def __len__(self) -> int:
         return len(self.items)
+
+
+def step_shares(n_steps: int, offset: float) -> NDArray[np.float64]:
+    """Share of an exposure in each of its fast steps, (n_steps,); and in the one after them if it starts late.
+
+    ``offset`` is `Exposure.start_offset`, f: the first step loses as much as the one after the last gains, f / n_steps.
+    """
+    shares = np.full(n_steps, 1 / n_steps)
+    if not offset:
+        return shares
+    shares[0] *= 1 - offset
+    return np.append(shares, offset / n_steps)

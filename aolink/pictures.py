@@ -38,6 +38,14 @@ def read_picture(path: Path) -> NDArray[Any]:
         ) from error
 
 
+def finite_pixels(picture: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """Where a picture (rows, columns, any colours) holds numbers, (rows, columns); None where it does everywhere."""
+    if picture.dtype.kind != "f" or picture.ndim not in (2, 3):
+        return None
+    finite = np.isfinite(picture).reshape(*picture.shape[:2], -1).all(axis=2)
+    return finite if not finite.all() and finite.any() else None
+
+
 def write_picture(path: Path, picture: NDArray[Any]) -> None:
     """Write what `read_picture` reads back.
 
@@ -53,10 +61,11 @@ def write_picture(path: Path, picture: NDArray[Any]) -> None:
             np.save(path, picture)
         else:
             Image.fromarray(picture).save(path)
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise RestorationError(
-            f"{path} cannot be written ({error}): a picture of type {picture.dtype} fits in a .npy file"
-        ) from error
+    except (ValueError, TypeError, KeyError, OSError) as error:
+        cure = f"a picture of type {picture.dtype} fits in a .npy file"
+        if isinstance(error, OSError) and error.errno is not None:
+            cure = "give a folder that exists and can be written"
+        raise RestorationError(f"{path} cannot be written ({error}): {cure}") from error
 
 
 def read_psf(path: Path) -> NDArray[np.float64]:

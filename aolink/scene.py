@@ -67,8 +67,6 @@ def read_scene(table: Table) -> SceneSensor:
     kernel_table = table.table("kernel")
     kernel = read_kernel(kernel_table)
     kernel_table.finish()
-    if kernel.matrix is not None:
-        raise RigError("scene.kernel.sigma is a matrix: give a number, a scene's kernel is round")
     rows, columns = table.integers("pixels", 2, "rows and columns", low=2, high=8192)
     sensor = SceneSensor(
         shape=(rows, columns),

@@ -24,13 +24,18 @@ def deblur(
         Path, typer.Option("--out", "-o", metavar="OUT", help="File to write: a recording, or a picture of its type.")
     ],
     file: Annotated[
-        Path | None, typer.Argument(metavar="[FILE]", help="A recording, of which every exposure is restored.")
+        Path | None, typer.Argument(metavar="FILE", help="A recording, of which every exposure is restored.")
     ] = None,
     estimator: Annotated[
         str, typer.Option("--estimator", "-e", help="Whose path; estimated again where the recording has none of it.")
     ] = "moments",
     image: Annotated[
-        Path | None, typer.Option("--image", metavar="IN.png", help="A blurred picture: .png, .tif, .jpg, .npy.")
+        Path | None,
+        typer.Option(
+            "--image",
+            metavar="IN.png",
+            help="A blurred picture: .png, .tif, .jpg, .npy. What is not a number in it is filled in.",
+        ),
     ] = None,
     psf: Annotated[
         Path | None,
@@ -57,7 +62,7 @@ def deblur(
     elif file is None and image is not None and psf is not None:
         _deblur_picture(image, psf, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
     else:
-        raise typer.BadParameter("give a recording, or --image and --psf")
+        raise typer.BadParameter("give a recording alone, or --image and --psf, which --noise-sd belongs to")
 
 
 def _deblur_recording(
@@ -84,16 +89,26 @@ def _deblur_recording(
 def _deblur_picture(
     image: Path, psf: Path, out: Path, method: str, noise_sd: float | None, *, overwrite: bool, as_json: bool
 ) -> None:
-    from aolink.pictures import read_picture, read_psf, write_picture
+    import numpy as np
+
+    from aolink.pictures import finite_pixels, read_picture, read_psf, write_picture
     from aolink.restoration import checked_method, restore
 
     if out.exists() and not overwrite:
         raise RestorationError(f"{out} exists: give --overwrite to replace it")
-    restored = restore(read_picture(image), read_psf(psf), method=checked_method(method), noise_sd=noise_sd)
-    write_picture(out, restored.image)
+    whole = read_picture(image)
+    # Transparency is no light: it stays as it is.
+    picture = whole[..., :3] if whole.ndim == 3 and whole.shape[2] == 4 else whole
+    seen = finite_pixels(picture)
+    missing = 0 if seen is None else int((~seen).sum())
+    restored = restore(picture, read_psf(psf), method=checked_method(method), noise_sd=noise_sd, mask=seen)
+    write_picture(out, restored.image if picture is whole else np.dstack([restored.image, whole[..., 3]]))
     if as_json:
         found = None if math.isnan(restored.noise_sd) else restored.noise_sd
-        print(json.dumps({"out": str(out), "method": method, "noise_sd": found, "direction": restored.direction}))
+        told = {"method": method, "noise_sd": found, "direction": restored.direction, "pixels_filled": missing}
+        print(json.dumps({"out": str(out), **told}))
     else:
         noise = "" if math.isnan(restored.noise_sd) else f", noise sd {restored.noise_sd:.3g}"
-        stdout.print(f"{out}: {method}{noise}", markup=False)
+        scanned = f", scanned {restored.direction}s" if method == "inverse" else ""
+        filled = f", {missing} pixels that are not numbers filled in" if missing else ""
+        stdout.print(f"{out}: {method}{noise}{scanned}{filled}", markup=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from aolink.errors import RestorationError
 from aolink.estimation import Estimate
-from aolink.exposure import Exposure
+from aolink.exposure import Exposure, step_shares
 from aolink.optics.camera import is_saturated, to_density
+from aolink.plant import psd_root
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.mcap_file import replacing
 from aolink.recording.reader import RawMessage, Recording, RestoredPictures
 from aolink.recording.reestimate import recorded_estimates, reestimated
-from aolink.restoration import Method, Psf, Restored, motion_psf, restore
+from aolink.restoration import Method, Psf, Restored, motion_psf_by_root, restore
 from aolink.rig import Rig
 from aolink.scene import SceneSensor, scene_motion
 from aolink.sensor import Kernel, SpotSensor
@@ -34,8 +35,6 @@ from aolink.workers import processes
 
 FloatArray = NDArray[np.float64]
 
-_MOST_SPOTS = 16
-"""More of them are not restored: each is a restoration of its own, of some tenth of a second."""
 _AHEAD = 4
 """Exposures for each worker that are handed out before the first of them is written."""
 
@@ -54,41 +53,65 @@ class Summary:
     psnr_restored: list[float] = field(default_factory=list)
 
 
-def motion(estimate: Estimate, mix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A sum of an estimate's outputs at each fast step, and its covariance.
+def coefficient_roots(estimate: Estimate) -> list[FloatArray]:
+    """Roots of the covariance of each axis's coefficients."""
+    return [psd_root(each) for each in estimate.coefficient_covariance]
+
+
+def motion(
+    estimate: Estimate, mix: FloatArray, roots: Sequence[FloatArray], *, after: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """A sum of an estimate's outputs at each fast step, and a root of its covariance.
 
     Parameters
     ----------
     mix:
         Weights of the outputs, (k, n_outputs).
+    roots:
+        The estimate's `coefficient_roots`.
+    after:
+        With the step after the last.
 
     Returns
     -------
-    (k, n_steps) and (k n_steps, k n_steps), slope units; the covariance without the path's share that the exposure's
-    basis leaves out.
+    (k, n_steps), and R of the covariance R R', (k n_steps, n), slope units; the covariance without the path's share
+    that the exposure's basis leaves out. With ``after`` n_steps is one more.
     """
-    covariance = estimate.coefficient_covariance
-    axes, count = covariance.shape[:2]
+    model, path = estimate.model, estimate.path
+    if after:
+        last = (model.plant.C @ estimate.end_state[..., None]).reshape(-1, 1)
+        path = np.concatenate([path, last], axis=1)
+    axes, count = estimate.coefficient_covariance.shape[:2]
     weights = mix.reshape(len(mix), axes, -1)
-    outputs, paths = estimate.model.factors
-    total = np.zeros((len(mix) * paths.shape[1],) * 2)
+    outputs, paths = model.factors
+    each = [np.zeros((len(mix) * path.shape[1], 0))]
     for axis in range(axes):
         if weights[:, axis].any():
             mixed = weights[:, axis] if outputs is None else weights[:, axis] @ outputs
-            rows = np.tensordot(mixed, paths[:, :, :count], axes=1).reshape(-1, count)
-            total += rows @ covariance[axis] @ rows.T
-    return mix @ estimate.path, total
+            rows = np.tensordot(mixed, paths[:, :, :count], axes=1)
+            if after:
+                end = weights[:, axis] @ model.plant.C @ model.end_rows[:, :count]
+                rows = np.concatenate([rows, end[:, None]], axis=1)
+            each.append(rows.reshape(-1, count) @ roots[axis])
+    return mix @ path, np.concatenate(each, axis=1)
 
 
-def scene_psf(rig: Rig, estimate: Estimate) -> Psf:
+def estimated_psfs(
+    exposure: Exposure, estimate: Estimate, mixes: Iterable[FloatArray], kernel: Kernel, pixel_scale: float
+) -> Iterator[Psf]:
+    """The PSF, with its uncertainty, of each of some sums of outputs: see `motion`."""
+    roots, offset = coefficient_roots(estimate), exposure.start_offset
+    shares = step_shares(exposure.n_steps, offset)
+    for mix in mixes:
+        path, root = motion(estimate, mix, roots, after=offset > 0)
+        yield motion_psf_by_root(path, root, kernel, pixel_scale, shares)
+
+
+def scene_psf(rig: Rig, exposure: Exposure, estimate: Estimate) -> Psf:
     """The PSF of a rig's picture sensor by an estimate, with its uncertainty."""
     assert rig.scene is not None
-    return _psf(estimate, scene_motion(rig.n_outputs), rig.scene.kernel, rig.scene.pixel_scale)
-
-
-def _psf(estimate: Estimate, mix: FloatArray, kernel: Kernel, pixel_scale: float) -> Psf:
-    path, covariance = motion(estimate, mix)
-    return motion_psf(path, covariance, kernel, pixel_scale)
+    mix = scene_motion(rig.n_outputs)
+    return next(estimated_psfs(exposure, estimate, [mix], rig.scene.kernel, rig.scene.pixel_scale))
 
 
 def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method = "tv") -> RestoredPictures:
@@ -118,23 +141,21 @@ def _restored_scene(rig: Rig, exposure: Exposure, estimate: Estimate, method: Me
         raise RestorationError("the picture never came")
     counts = exposure.scene.pixels
     good = exposure.scene.mask & ~rig.scene.is_saturated(counts)
-    return restore(rig.scene.to_intensity(counts), scene_psf(rig, estimate), method=method, mask=good)
+    return restore(rig.scene.to_intensity(counts), scene_psf(rig, exposure, estimate), method=method, mask=good)
 
 
 def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method) -> FloatArray:
     sensor = rig.sensor
     share = to_density(sensor, exposure.pixels) * sensor.pixel_size
     good = exposure.mask & ~is_saturated(sensor, exposure.pixels)
+    mixes = np.eye(rig.n_outputs).reshape(-1, 2 if isinstance(sensor, SpotSensor) else 1, rig.n_outputs)
+    psfs = estimated_psfs(exposure, estimate, mixes, sensor.kernel, sensor.pixel_width)
     if not isinstance(sensor, SpotSensor):
-        psf = _psf(estimate, np.eye(1), sensor.kernel, sensor.pixel_width)
-        return np.asarray(restore(share, psf, method=method, mask=good).image)
-    if sensor.spots > _MOST_SPOTS:
-        raise RestorationError(f"{sensor.spots} spots are not restored, at most {_MOST_SPOTS} are")
+        return np.asarray(restore(share, next(psfs), method=method, mask=good).image)
     out, (height, width) = np.zeros_like(share), sensor.window
-    for spot, place in enumerate(sensor.lit):
+    for psf, place in zip(psfs, sensor.lit, strict=False):
         row, column = divmod(int(place), sensor.grid[1])
         window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
-        psf = _psf(estimate, np.eye(rig.n_outputs)[2 * spot : 2 * spot + 2], sensor.kernel, sensor.pixel_width)
         out[window] = restore(share[window], psf, method=method, mask=good[window]).image
     return out
 

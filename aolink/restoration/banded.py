@@ -6,8 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from aolink.restoration.psf import line_matrix
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+# From so many lines on, products of blocks are faster than solving line by line.
+_MANY_LINES = 64
+# Smallest block, pixels; and multiplications in one product of blocks: linear algebra's own threads would wait for
+# each other longer than a smaller one takes.
+_BLOCK, _PRODUCT = 16, 250_000
 
 
 def smooth_lines(
@@ -44,22 +52,25 @@ def smooth_lines(
     n_lines, columns = lines.shape
     m = values.shape[-1] - 1
     taps = np.broadcast_to(values, (columns, m + 1))
-    out = np.empty((n_lines, columns + m))
     if seen is None:
         groups = [(np.arange(n_lines), np.ones(columns))]
     else:
+        lines = np.where(seen, lines, 0.0)
         masks, group = np.unique(seen, axis=0, return_inverse=True)
         groups = [(np.flatnonzero(group.ravel() == g), mask.astype(np.float64)) for g, mask in enumerate(masks)]
+    right = _blur_transposed(lines, taps)
+    right /= noise_variance
     for rows, weight in groups:
         bands = _prior(columns + m, correlation, variance, max(m, 1))
-        _add_blur(bands, taps, weight / noise_variance)
-        right = _blur_transposed(np.where(weight > 0, lines[rows], 0.0) / noise_variance, taps)
+        bands += normal_bands(taps, weight / noise_variance)
+        some = slice(None) if len(rows) == n_lines else rows
         if known is not None and m:
-            start = np.broadcast_to(known, (n_lines, m))[rows]
-            out[rows, :m], out[rows, m:] = start, _given_start(bands, right, start)
+            start = np.broadcast_to(known, (n_lines, m))[some]
+            right[some, m:] = _given_start(bands, right[some], start)
+            right[some, :m] = start
         else:
-            out[rows] = linalg.solveh_banded(bands, right.T, lower=True, overwrite_ab=True, check_finite=False).T
-    return out
+            right[some] = _solved(bands, right[some])
+    return right
 
 
 def _prior(size: int, correlation: float, variance: float, reach: int) -> FloatArray:
@@ -72,23 +83,68 @@ def _prior(size: int, correlation: float, variance: float, reach: int) -> FloatA
     return bands
 
 
-def _add_blur(bands: FloatArray, taps: FloatArray, weight: FloatArray) -> None:
-    """Add C' diag(weight) C. Element (i + d, i) has all products of taps that lie d apart."""
+def normal_bands(taps: FloatArray, weight: FloatArray) -> FloatArray:
+    """C' diag(weight) C in the lower form of `solveh_banded`, (taps or 2, size), from taps (columns, taps).
+
+    Element (i + d, i) has all products of taps that lie d apart.
+    """
     columns, m = taps.shape[0], taps.shape[1] - 1
+    bands = np.zeros((max(m, 1) + 1, columns + m))
     weighted = taps * weight[:, None]
     for d in range(m + 1):
         for j in range(d, m + 1):
             first = m - j
             bands[d, first : first + columns] += weighted[:, j] * taps[:, j - d]
+    return bands
+
+
+def dense(bands: FloatArray) -> FloatArray:
+    """The whole symmetric matrix of its lower bands."""
+    n = bands.shape[1]
+    out, i = np.zeros((n, n)), np.arange(n)
+    for d, band in enumerate(bands[:n]):
+        out[i[d:], i[: n - d]] = out[i[: n - d], i[d:]] = band[: n - d]
+    return out
 
 
 def _blur_transposed(lines: FloatArray, taps: FloatArray) -> FloatArray:
     """C' applied to lines, (lines, columns + m)."""
     columns, m = taps.shape[0], taps.shape[1] - 1
-    out = np.zeros((len(lines), columns + m))
-    for j in range(m + 1):
-        out[:, m - j : m - j + columns] += lines * taps[:, j]
+    C, width = line_matrix(taps, columns), max(m, _BLOCK)
+    out = np.empty((len(lines), columns + m))
+    for rows in _row_blocks(len(lines), width * (width + m)):
+        for k in range(0, columns + m, width):
+            met = slice(max(k - m, 0), min(k + width, columns))
+            np.matmul(lines[rows, met], C[met, k : k + width], out=out[rows, k : k + width])
     return out
+
+
+def _row_blocks(n_lines: int, one: int) -> list[slice]:
+    step = max(1, _PRODUCT // one)
+    return [slice(k, k + step) for k in range(0, n_lines, step)]
+
+
+def _solved(bands: FloatArray, right: FloatArray) -> FloatArray:
+    """x with A x = right for each line (lines, size); it may be written into ``right``."""
+    if len(right) < _MANY_LINES:
+        return np.asarray(linalg.solveh_banded(bands, right.T, lower=True, check_finite=False).T)
+    # A is block tridiagonal: D_0, D_1, .. and below them E_0, E_1, ..; eliminated from the first on,
+    # S_i+1 = D_i+1 - G_i E_i', G_i = E_i S_i^-1.
+    A, width, n = dense(bands), max(len(bands) - 1, _BLOCK), bands.shape[1]
+    parts = [slice(k, min(k + width, n)) for k in range(0, n, width)]
+    S, inverses, ratios = A[parts[0], parts[0]], [], []
+    for here, after in zip(parts, [*parts[1:], slice(n, n)], strict=True):
+        inverses.append(linalg.cho_solve((linalg.cholesky(S, lower=True), True), np.eye(len(S))))
+        ratios.append(A[after, here] @ inverses[-1])
+        S = A[after, after] - ratios[-1] @ A[after, here].T
+    for rows in _row_blocks(len(right), width * width):
+        x = right[rows]
+        for here, after, G in zip(parts, parts[1:], ratios, strict=False):
+            x[:, after] -= x[:, here] @ G.T
+        x[:, parts[-1]] = x[:, parts[-1]] @ inverses[-1]
+        for here, after, inverse, G in reversed(list(zip(parts, parts[1:], inverses, ratios, strict=False))):
+            x[:, here] = x[:, here] @ inverse - x[:, after] @ G
+    return right
 
 
 def _given_start(bands: FloatArray, right: FloatArray, start: FloatArray) -> FloatArray:
@@ -98,4 +154,4 @@ def _given_start(bands: FloatArray, right: FloatArray, start: FloatArray) -> Flo
     for i in range(m):
         for d in range(m - i, len(bands)):
             rest[:, i + d - m] -= bands[d, i] * start[:, i]
-    return np.asarray(linalg.solveh_banded(bands[:, m:], rest.T, lower=True, check_finite=False).T)
+    return _solved(bands[:, m:], rest)

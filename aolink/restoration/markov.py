@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
 
+from aolink.restoration.banded import dense, normal_bands
 from aolink.restoration.psf import Psf, line_matrix
 
 FloatArray = NDArray[np.floating[Any]]
@@ -23,6 +24,12 @@ BoolArray = NDArray[np.bool_]
 _THREADS = 2
 _MOST_STEPS = 400
 _TOLERANCE = 1e-4
+# Above this kappa, in squares of the PSF's sum, single precision is wrong by far less than the noise; its error grows
+# with one over kappa.
+_SINGLE = 1e-3
+# Scenes of so many pixels are solved by one dense factorisation, which conjugate gradients do not come up to; FFTs of
+# less than this gain nothing by a second thread.
+_SMALL_SCENE, _SMALL_FFT = 1200, 40_000
 
 
 class Solver(Protocol):
@@ -41,8 +48,8 @@ class Solver(Protocol):
         """The scene x with (H'WH + kappa L) x = right; an error is measured against the root of kappa x'L x."""
         ...
 
-    def gauss_markov(self, images: FloatArray, tolerance: float = _TOLERANCE) -> FloatArray:
-        """The scene of images, which hold something likely where they were not measured."""
+    def guess(self, images: FloatArray) -> FloatArray | None:
+        """A scene to start from, of images that hold something likely where they were not measured, if it helps."""
         ...
 
 
@@ -71,31 +78,92 @@ class LineSolver:
     def project(self, images: FloatArray) -> FloatArray:
         return np.asarray(images.astype(self.C.dtype, copy=False) @ self.C)
 
+    def guess(self, images: FloatArray) -> None:
+        """It needs none."""
+
     def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
-        z = fft.dct(right, axis=-2, norm="ortho", workers=_THREADS) @ self.vectors
+        # A second thread for the cosines would cost more than it saves: that of the products is still awake.
+        z = fft.dct(right, axis=-2, norm="ortho") @ self.vectors
         z *= self.inverse
-        return np.asarray(fft.idct(z @ self.vectors.T, axis=-2, norm="ortho", workers=_THREADS, overwrite_x=True))
-
-    def gauss_markov(self, images: FloatArray, tolerance: float = 0.0) -> FloatArray:
-        return self.solve(self.project(images))
+        return np.asarray(fft.idct(z @ self.vectors.T, axis=-2, norm="ortho", overwrite_x=True))
 
 
-def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, dtype: type = np.float64) -> LineSolver:
-    """The exact solver of a PSF along the rows, which may differ from pixel to pixel."""
-    C = line_matrix(psf.values, shape[1])
-    normal = C.T @ C
-    size = len(normal)
-    i = np.arange(size)
-    normal[i, i] += 2 * kappa
-    normal[[0, -1], [0, -1]] -= kappa
-    normal[i[1:], i[:-1]] -= kappa
-    normal[i[:-1], i[1:]] -= kappa
-    values, vectors = linalg.eigh(normal, driver="evd", overwrite_a=True, check_finite=False)
+def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = False) -> LineSolver:
+    """The exact solver of a PSF along the rows, which may differ from pixel to pixel; in single precision if allowed.
+
+    It is the latter where that costs nothing that shows.
+    """
+    taps = np.broadcast_to(psf.values, (shape[1], psf.values.shape[-1]))
+    single = single and kappa >= _SINGLE * float(taps.sum(axis=1).max()) ** 2
+    dtype = np.float32 if single else np.float64
+    bands = normal_bands(taps, np.ones(shape[1]))
+    bands[0] += 2 * kappa
+    bands[0, 0] -= kappa
+    bands[0, -1] -= kappa
+    bands[1, :-1] -= kappa
+    # NumPy's, not SciPy's: each of them has threads of its own, and those would be in the way of the products'.
+    values, vectors = np.linalg.eigh(dense(bands))
     return LineSolver(
-        C=C.astype(dtype), vectors=vectors.astype(dtype),
+        C=line_matrix(taps, shape[1]).astype(dtype), vectors=vectors.astype(dtype),
         inverse=(1 / (values + kappa * difference_spectrum(shape[0])[:, None])).astype(dtype),
-        first=psf.values.shape[-1] - 1 - psf.origin[0],
+        first=taps.shape[1] - 1 - psf.origin[0],
     )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DenseSolver:
+    """Any blur on the plane and any mask of a small frame: exact, by the Cholesky factor of the whole matrix."""
+
+    H: FloatArray
+    """Blurs a scene, zero where nothing was measured, (pixels, scene's pixels)."""
+    factor: FloatArray
+    """Lower one of (H'WH + kappa L), (scene's pixels, scene's pixels)."""
+    shape: tuple[int, int]
+    """Of the scene."""
+    frame: tuple[slice, slice]
+
+    def project(self, images: FloatArray) -> FloatArray:
+        return np.asarray(images.reshape(len(images), -1) @ self.H).reshape(-1, *self.shape)
+
+    def guess(self, images: FloatArray) -> None:
+        """It needs none."""
+
+    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
+        flat = right.reshape(len(right), -1).T
+        return np.asarray(linalg.cho_solve((self.factor, True), flat, check_finite=False)).T.reshape(right.shape)
+
+
+def dense_solver(psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None) -> DenseSolver:
+    """The exact solver of a PSF on the plane, or along all rows alike, for a small frame."""
+    taps, frame = _on_plane(psf, shape)
+    (rows, columns), (high, wide) = shape, (shape[0] + taps.shape[0] - 1, shape[1] + taps.shape[1] - 1)
+    H = np.zeros((rows, columns, high, wide))
+    each = np.lib.stride_tricks.as_strided(
+        H, (rows, columns, *taps.shape), (H.strides[0] + H.strides[2], H.strides[1] + H.strides[3], *H.strides[2:])
+    )
+    each[...] = taps[::-1, ::-1]
+    if seen is not None:
+        H *= seen[:, :, None, None]
+    flat = H.reshape(rows * columns, high * wide)
+    A = (flat.T @ flat).reshape(high, wide, high, wide)
+    r, c = np.arange(high), np.arange(wide)
+    A[r, :, r, :] += kappa * _differences_squared(wide)
+    A[:, c, :, c] += kappa * _differences_squared(high)
+    factor = linalg.cholesky(A.reshape(high * wide, -1), lower=True, overwrite_a=True, check_finite=False)
+    return DenseSolver(H=flat, factor=factor, shape=(high, wide), frame=frame)
+
+
+def _differences_squared(n: int) -> NDArray[np.float64]:
+    """D'D for n pixels in a row, (n, n)."""
+    D = np.diff(np.eye(n), axis=0)
+    return np.asarray(D.T @ D)
+
+
+def _on_plane(psf: Psf, shape: tuple[int, int]) -> tuple[NDArray[np.float64], tuple[slice, slice]]:
+    """Taps on the plane, and where a frame lies in its scene."""
+    taps, origin = np.atleast_2d(psf.values), (0, *psf.origin)[-2:]
+    top, left = (n - 1 - o for n, o in zip(taps.shape, origin, strict=True))
+    return taps, (slice(top, top + shape[0]), slice(left, left + shape[1]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +176,6 @@ class IterativeSolver:
     nearly: Callable[[FloatArray], FloatArray]
     """A symmetric positive definite operator near the inverse."""
     guess: Callable[[FloatArray], FloatArray]
-    """A scene to start from, of images without holes."""
     seen: BoolArray | None
     frame: tuple[slice, slice]
     white: bool = False
@@ -116,9 +183,6 @@ class IterativeSolver:
 
     def project(self, images: FloatArray) -> FloatArray:
         return self.blur_transposed(images if self.seen is None else np.where(self.seen, images, 0.0))
-
-    def gauss_markov(self, images: FloatArray, tolerance: float = _TOLERANCE) -> FloatArray:
-        return self.solve(self.project(images), self.guess(images), tolerance)
 
     def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
         x = self.nearly(right) if start is None else start.copy()
@@ -156,8 +220,9 @@ def roughness(x: FloatArray) -> FloatArray:
 def differences_transposed(along: FloatArray, down: FloatArray) -> FloatArray:
     """Dx' along + Dy' down, from differences (.., rows, columns - 1) and (.., rows - 1, columns)."""
     out = np.empty((*along.shape[:-1], down.shape[-1]), along.dtype)
-    out[..., 0], out[..., -1] = -along[..., 0], along[..., -1]
-    np.subtract(along[..., :-1], along[..., 1:], out=out[..., 1:-1])
+    out[..., 0] = 0
+    out[..., 1:] = along
+    out[..., :-1] -= along
     out[..., 1:, :] += down
     out[..., :-1, :] -= down
     return out
@@ -167,45 +232,54 @@ def plane_solver(
     psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, white: bool = False
 ) -> IterativeSolver:
     """The solver of a PSF on the plane (or along all rows alike), starting from its periodic one."""
-    taps, origin = np.atleast_2d(psf.values), (0, *psf.origin)[-2:]
+    taps, frame = _on_plane(psf, shape)
     reach = (taps.shape[0] - 1, taps.shape[1] - 1)
     rows, columns = size = (shape[0] + reach[0], shape[1] + reach[1])
-    transfer = fft.rfft2(taps, size)
+    # The blur goes round in a plane as large as the scene, or a little larger, where transforms are fast.
+    fast = (fft.next_fast_len(rows, real=True), fft.next_fast_len(columns, real=True))
+    threads = _THREADS if rows * columns > _SMALL_FFT else 1
     fraction = 1.0 if seen is None else float(seen.mean())
-    y, x = fft.fftfreq(rows)[:, None], fft.rfftfreq(columns)[None]
-    rough = 4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2
-    # The frame's share of the scene, and a floor for the mean, which the differences do not hold.
+    # The frame's share of the scene.
     share = fraction * shape[0] * shape[1] / (rows * columns)
-    prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
-    inverse = 1 / (share * np.abs(transfer) ** 2 + kappa * prior)
 
-    def through(images: FloatArray, factor: NDArray[np.inexact[Any]]) -> FloatArray:
-        spectrum = fft.rfft2(images, size, workers=_THREADS)
-        return np.asarray(fft.irfft2(spectrum * factor, size, workers=_THREADS))
+    def spectra(plane: tuple[int, int]) -> tuple[NDArray[np.complexfloating[Any]], FloatArray]:
+        """Transfer function, and what is nearly the inverse."""
+        transfer = fft.rfft2(taps, plane)
+        y, x = fft.fftfreq(plane[0])[:, None], fft.rfftfreq(plane[1])[None]
+        rough = 4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2
+        # A floor for the mean, which the differences do not hold.
+        prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
+        return transfer, 1 / (share * np.abs(transfer) ** 2 + kappa * prior)
+
+    def through(images: FloatArray, factor: NDArray[np.inexact[Any]], plane: tuple[int, int] = fast) -> FloatArray:
+        spectrum = fft.rfft2(images, plane, workers=threads)
+        spectrum *= factor
+        return np.asarray(fft.irfft2(spectrum, plane, workers=threads, overwrite_x=True))[..., :rows, :columns]
+
+    transfer, inverse = spectra(fast)
+    backward = transfer.conj()
+
+    def placed(images: FloatArray) -> FloatArray:
+        padded = np.zeros((*images.shape[:-2], *size))
+        padded[..., reach[0] :, reach[1] :] = images
+        return padded
 
     def blur(scene: FloatArray) -> FloatArray:
         return through(scene, transfer)[..., reach[0] :, reach[1] :]
 
-    def blur_transposed(images: FloatArray) -> FloatArray:
-        padded = np.zeros((*images.shape[:-2], *size))
-        padded[..., reach[0] :, reach[1] :] = images
-        return through(padded, transfer.conj())
-
     def guess(images: FloatArray) -> FloatArray:
         """The periodic scene of images that go over from their last pixel to their first where nothing is known."""
-        padded = np.zeros((*images.shape[:-2], *size))
-        padded[..., reach[0] :, reach[1] :] = images
+        padded = placed(images)
         down = (np.arange(1, reach[0] + 1) / (reach[0] + 1))[:, None]
         padded[..., : reach[0], :] = (1 - down) * padded[..., -1:, :] + down * padded[..., reach[0], None, :]
         right = np.arange(1, reach[1] + 1) / (reach[1] + 1)
         padded[..., : reach[1]] = (1 - right) * padded[..., -1:] + right * padded[..., reach[1], None]
-        return through(padded, transfer.conj() * inverse)
+        round_it, its_inverse = spectra(size)
+        return through(padded, round_it.conj() * its_inverse, size)
 
-    first = [m - o for m, o in zip(reach, origin, strict=True)]
     return IterativeSolver(
-        kappa=kappa, blur=blur, blur_transposed=blur_transposed, nearly=lambda r: through(r, inverse), guess=guess,
-        seen=seen, white=white,
-        frame=(slice(first[0], first[0] + shape[0]), slice(first[1], first[1] + shape[1])),
+        kappa=kappa, blur=blur, blur_transposed=lambda y: through(placed(y), backward),
+        nearly=lambda r: through(r, inverse), guess=guess, seen=seen, white=white, frame=frame,
     )  # fmt: skip
 
 
@@ -214,16 +288,23 @@ def masked_line_solver(psf: Psf, seen: BoolArray, kappa: float) -> IterativeSolv
     exact = line_solver(psf, (seen.shape[0], seen.shape[1]), kappa)
     return IterativeSolver(
         kappa=kappa, blur=lambda x: np.asarray(x @ exact.C.T), blur_transposed=lambda y: np.asarray(y @ exact.C),
-        nearly=exact.solve, guess=exact.gauss_markov, seen=seen, frame=exact.frame,
+        nearly=exact.solve, guess=lambda y: exact.solve(exact.project(y)), seen=seen, frame=exact.frame,
     )  # fmt: skip
 
 
 def make_solver(
-    psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, dtype: type = np.float64
+    psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, single: bool = False
 ) -> Solver:
-    """The solver for a PSF, a frame's shape, kappa, and a mask (rows, columns), False where nothing was measured."""
-    if not psf.on_line:
-        return plane_solver(psf, shape, kappa, seen)
-    if seen is None:
-        return line_solver(psf, shape, kappa, dtype)
-    return masked_line_solver(psf, seen, kappa)
+    """The solver for a PSF, a frame's shape, kappa, and a mask (rows, columns), False where nothing was measured.
+
+    ``single`` allows single precision, where it costs nothing that shows.
+    """
+    if psf.on_line and seen is None:
+        return line_solver(psf, shape, kappa, single)
+    if not psf.varies:
+        taps = np.atleast_2d(psf.values).shape
+        if (shape[0] + taps[0] - 1) * (shape[1] + taps[1] - 1) <= _SMALL_SCENE:
+            return dense_solver(psf, shape, kappa, seen)
+    if psf.on_line and seen is not None:
+        return masked_line_solver(psf, seen, kappa)
+    return plane_solver(psf, shape, kappa, seen)

@@ -26,6 +26,10 @@ FloatArray = NDArray[np.float64]
 # Light beyond so many standard deviations of the kernel is left out, as are taps below this share of the largest.
 _REACH = 5.0
 _NEGLIGIBLE = 1e-5
+# Correlation of x and y in one step's light that is left out, and points to integrate over it where it is not: so many,
+# and so many more by its ratio to what is not correlated.
+_UNCORRELATED = 1e-3
+_POINTS, _MORE_POINTS, _MOST_POINTS = 6, 8, 256
 # Modes of the PSF's error that together hold less than this share of its variance are left out.
 _MODES_LEFT_OUT = 1e-4
 # A path is straight for the line methods if its light strays from the line by less than this, rms, pixels.
@@ -105,7 +109,13 @@ def as_psf(psf: Psf | ArrayLike) -> Psf:
     return Psf(values=values, origin=origin)
 
 
-def motion_psf(path: ArrayLike, path_covariance: ArrayLike | None, kernel: Kernel, pixel_scale: float) -> Psf:
+def motion_psf(
+    path: ArrayLike,
+    path_covariance: ArrayLike | None,
+    kernel: Kernel,
+    pixel_scale: float,
+    shares: ArrayLike | None = None,
+) -> Psf:
     """The PSF that a path gives: its histogram convolved with the image kernel, integrated over pixels.
 
     Parameters
@@ -120,11 +130,13 @@ def motion_psf(path: ArrayLike, path_covariance: ArrayLike | None, kernel: Kerne
         The picture's image kernel.
     pixel_scale:
         Width of one pixel of the picture, slope units.
+    shares:
+        Of the exposure in each step, (n_steps,), see `aolink.exposure.step_shares`; None where all have the same.
 
     Returns
     -------
-    The expected PSF (a kernel widened by each step's own variance, exact for Gaussian errors; on the plane the
-    correlation of x with y in one step goes into the modes only), and its error to first order in the path's.
+    The expected PSF (a kernel widened by each step's own covariance, exact for Gaussian errors), and its error to first
+    order in the path's.
 
     Raises
     ------
@@ -135,6 +147,14 @@ def motion_psf(path: ArrayLike, path_covariance: ArrayLike | None, kernel: Kerne
     ----------
     Mishra & Wen (2), (3); Shahin (5).
     """
+    root = None if path_covariance is None else _path_root(path_covariance, np.size(path))
+    return motion_psf_by_root(path, root, kernel, pixel_scale, shares)
+
+
+def motion_psf_by_root(
+    path: ArrayLike, root: FloatArray | None, kernel: Kernel, pixel_scale: float, shares: ArrayLike | None = None
+) -> Psf:
+    """`motion_psf` with R of the path's covariance R R', (n_steps or 2 n_steps, any), where that is known."""
     steps = np.asarray(path, dtype=np.float64)
     on_line = steps.ndim == 1 or (steps.ndim == 2 and len(steps) == 1)
     steps = np.atleast_2d(steps)
@@ -144,22 +164,55 @@ def motion_psf(path: ArrayLike, path_covariance: ArrayLike | None, kernel: Kerne
         )
     if not (math.isfinite(pixel_scale) and pixel_scale > 0):
         raise RestorationError(f"the pixel scale is {pixel_scale}: expected the width of a pixel, above zero")
-    steps = steps / pixel_scale
-    root = _path_root(path_covariance, steps.size) / pixel_scale
-    variance = (root**2).sum(axis=1).reshape(steps.shape)
-    width = np.sqrt((kernel.sigma / pixel_scale) ** 2 + 2 * variance)
-    masses, slopes, origin = zip(*(_axis(p, w) for p, w in zip(steps, width, strict=True)), strict=True)
-    n = steps.shape[1]
+    axes, n = steps.shape
+    share = _checked_shares(shares, n)
+    error = (np.zeros((steps.size, 1)) if root is None else root).reshape(axes, n, -1) / pixel_scale
+    # Of where light of each step lies, (n_steps, axes, axes).
+    spread = np.einsum("aim,bim->iab", error, error) + kernel.covariance[:axes, :axes] / pixel_scale**2
+    together, points, weights = _correlated_part(spread)
+    width = np.sqrt(2 * (spread[:, range(axes), range(axes)].T - together**2))
+    places = (steps / pixel_scale)[:, :, None] + together[:, :, None] * points
+    mass, slope, origin = zip(*(_axis(p, w) for p, w in zip(places, width, strict=True)), strict=True)
     if on_line:
-        values = masses[0].mean(axis=0)
-        modes = (root.T @ slopes[0]) / n
+        values = share @ mass[0][:, 0]
+        modes = (error[0].T * share) @ slope[0][:, 0]
     else:
-        values = masses[1].T @ masses[0] / n
-        modes = np.einsum("mi,ir,ic->mrc", root[:n].T, masses[1], slopes[0], optimize=True)
-        modes += np.einsum("mi,ir,ic->mrc", root[n:].T, slopes[1], masses[0], optimize=True)
-        modes /= n
-        origin = origin[::-1]
-    return _trimmed(values, modes, origin)
+        (along, down), (along_slope, down_slope) = mass, slope
+        down, down_slope = ((each * weights[:, None]).swapaxes(1, 2) for each in (down, down_slope))
+        values = np.tensordot(share, down @ along, axes=1)
+        modes = np.tensordot(error[0].T * share, down @ along_slope, axes=1)
+        modes += np.tensordot(error[1].T * share, down_slope @ along, axes=1)
+    return _trimmed(values, modes, origin[::-1])
+
+
+def _checked_shares(shares: ArrayLike | None, n: int) -> FloatArray:
+    if shares is None:
+        return np.full(n, 1 / n)
+    found = np.asarray(shares, dtype=np.float64)
+    if found.shape != (n,) or not np.isfinite(found).all() or found.min() < 0 or found.sum() <= 0:
+        raise RestorationError(
+            f"the shares have shape {found.shape}: expected {n}, of which none is negative, and some not zero"
+        )
+    return np.asarray(found / found.sum())
+
+
+def _correlated_part(spread: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Covariances (n_steps, axes, axes) as c c' and a rest in which x and y are independent.
+
+    Returns
+    -------
+    c, (axes, n_steps), and points and weights by which a mean over a normal distribution along c is taken.
+    """
+    n, axes, _ = spread.shape
+    xx, xy, yy = spread[:, 0, 0], spread[:, 0, -1], spread[:, -1, -1]
+    largest = float((abs(xy) / np.sqrt(xx * yy)).max()) if axes == 2 else 0.0
+    if largest < _UNCORRELATED:
+        return np.zeros((axes, n)), np.zeros(1), np.ones(1)
+    more = math.ceil(min(_MORE_POINTS * largest / max(1 - largest, 1e-9), _MOST_POINTS))
+    points, weights = np.polynomial.hermite_e.hermegauss(min(_POINTS + more, _MOST_POINTS))
+    near = abs(points) < _REACH
+    c = np.sqrt(abs(xy)) * np.stack([(xx / yy) ** 0.25, np.sign(xy) * (yy / xx) ** 0.25])
+    return c, points[near], weights[near] / weights[near].sum()
 
 
 def _path_root(covariance: ArrayLike | None, size: int) -> FloatArray:
@@ -174,13 +227,16 @@ def _path_root(covariance: ArrayLike | None, size: int) -> FloatArray:
 
 
 def _axis(positions: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-    """Masses in pixels and their slopes by the position, (n_steps, pixels), and the pixel of no displacement."""
+    """Masses in pixels and their slopes by the position, (n_steps, points, pixels), and the pixel of no displacement.
+
+    Positions (n_steps, points), widths (n_steps,).
+    """
     reach = _REACH * float(width.max()) / math.sqrt(2)
     low = min(0, math.floor(positions.min() - reach))
     high = max(0, math.ceil(positions.max() + reach))
-    u = (np.arange(low, high + 2) - 0.5 - positions[:, None]) / width[:, None]
-    mass = np.diff(erf(u) / 2, axis=1)
-    slope = -np.diff(np.exp(-u * u), axis=1) / (width[:, None] * math.sqrt(math.pi))
+    u = (np.arange(low, high + 2) - 0.5 - positions[..., None]) / width[:, None, None]
+    mass = np.diff(erf(u) / 2, axis=2)
+    slope = -np.diff(np.exp(-u * u), axis=2) / (width[:, None, None] * math.sqrt(math.pi))
     return mass, slope, -low
 
 

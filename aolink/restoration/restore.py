@@ -239,12 +239,12 @@ def _on_plane(
         total = max(total, _SMALLEST_RATIO / weight)
     if method == "gauss_markov":
         solver = make_solver(psf, shape, weight * total, good)
-        scene = solver.gauss_markov(whole)
+        scene = solver.solve(solver.project(whole), solver.guess(whole))
     else:
         # Total variation does not need the last digits; half of them take half of the time.
         level = whole.mean()
         scene, solver = total_variation(
-            lambda kappa: make_solver(psf, shape, kappa, good, np.float32), whole - level, total, weight
+            lambda kappa: make_solver(psf, shape, kappa, good, single=True), whole - level, total, weight
         )
         scene = scene.astype(np.float64) + level
     if method == "pnp":

@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, optimize
 
+from aolink.errors import RestorationError
+
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 # Share of the frequencies, those where blur and scene leave least, that hold nothing but noise.
 _DARK_SHARE = 0.02
 # Frequencies below this many periods an image are the taper's, not the scene's.
 _LOWEST = 2.5
+_FEWEST = 6
 _SMALLEST_RATIO, _LARGEST_RATIO = 1e-7, 1e2
 
 
@@ -39,6 +43,13 @@ def _taper(n: int) -> FloatArray:
     return np.asarray(taper / math.sqrt(float((taper**2).mean())))
 
 
+def _check_enough(usable: BoolArray, rows: int, columns: int, where: str) -> None:
+    if not usable.any():
+        raise RestorationError(
+            f"{rows} x {columns} pixels are too few to find noise and weights in: expected {_FEWEST} or more {where}"
+        )
+
+
 def plane_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
     """Of pictures (batch, rows, columns), for a scene whose differences along both axes are white."""
     _, rows, columns = images.shape
@@ -49,6 +60,7 @@ def plane_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
     roughness = 4 * np.sin(math.pi * y) ** 2 + 4 * np.sin(math.pi * x) ** 2
     transfer = np.abs(fft.rfft2(psf.reshape(-1, psf.shape[-1]), (rows, columns))) ** 2
     usable = np.hypot(y * rows, x * columns) > _LOWEST
+    _check_enough(usable, rows, columns, "along one side")
     return Spectrum(power=power[usable], transfer=transfer[usable], roughness=roughness[usable])
 
 
@@ -60,6 +72,7 @@ def line_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
     power = (np.abs(fft.rfft(centred * taper)) ** 2).mean(axis=(0, 1)) / columns
     x = fft.rfftfreq(columns)
     usable = x * columns > _LOWEST
+    _check_enough(usable, images.shape[1], columns, "on a line")
     transfer = np.abs(fft.rfft(psf, columns)) ** 2
     return Spectrum(power=power[usable], transfer=transfer[usable], roughness=4 * np.sin(math.pi * x[usable]) ** 2)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.exposure import Exposure, Picture, Truth
+from aolink.exposure import Exposure, Picture, Truth, step_shares
 from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.frame import frame_density
 from aolink.plant import psd_root
@@ -160,12 +160,10 @@ class RigModel:
         With an offset so much of the first step is not in the exposure, but in the step after its last.
         """
         n_steps, offset = path.shape[1], self.rig.timing.exposure_offset
-        weights = np.full(n_steps, 1 / n_steps)
         if not offset or self._light.kind == "still":
-            return path, weights
-        weights[0] *= 1 - offset
+            return path, step_shares(n_steps, 0.0)
         after = (self.rig.plant.C @ end_state[..., None]).reshape(-1, 1)
-        return np.concatenate([path, after], axis=1), np.append(weights, offset / n_steps)
+        return np.concatenate([path, after], axis=1), step_shares(n_steps, offset)
 
 
 def simulate(

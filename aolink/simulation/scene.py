@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from aolink.rig import Rig
 from aolink.scene import framed, framed_columns, framed_rows, read_scene_picture, scene_motion
+from aolink.sensor import Kernel
 
 FloatArray = NDArray[np.float64]
 
@@ -30,9 +31,7 @@ class SceneCamera:
         self._shape = picture.shape
         self._scale = rig.scene.picture_pixels / rig.scene.pixel_scale
         self._fy, self._fx = np.fft.fftfreq(picture.shape[0])[:, None], np.fft.rfftfreq(picture.shape[1])[:, None]
-        width = math.pi * rig.scene.kernel.sigma * self._scale
-        kernel = np.exp(-((width * self._fy) ** 2)) * np.exp(-((width * self._fx.T) ** 2))
-        self._spectrum = np.fft.rfft2(picture) * kernel
+        self._spectrum = np.fft.rfft2(picture) * self._kernel(rig.scene.kernel)
         self._along_x = rig.n_outputs == 1
         if self._along_x:  # what happens to the rows is always the same
             rows = framed_rows(rig.scene, np.fft.irfft2(self._spectrum, picture.shape))
@@ -60,6 +59,15 @@ class SceneCamera:
             else:
                 intensity = framed(sensor, np.fft.irfft2(spectrum, self._shape))
         return sensor.to_counts(intensity + sensor.noise_sd * self._rng.standard_normal(sensor.shape))
+
+    def _kernel(self, kernel: Kernel) -> FloatArray:
+        """Transform of the sensor's kernel, (rows, columns // 2 + 1)."""
+        x, y = self._fx.T, self._fy
+        if kernel.matrix is None:
+            width = math.pi * kernel.sigma * self._scale
+            return np.asarray(np.exp(-((width * y) ** 2)) * np.exp(-((width * x) ** 2)))
+        (xx, xy), (_, yy) = kernel.covariance * (math.pi * self._scale) ** 2
+        return np.asarray(np.exp(-2 * (xx * x * x + 2 * xy * x * y + yy * y * y)))
 
     def _motion(self, path: FloatArray, weights: FloatArray) -> NDArray[np.complex128]:
         """Transform of the path's histogram, (rows or 1, columns // 2 + 1); the path in the picture's pixels."""

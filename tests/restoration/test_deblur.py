@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
+from aolink.cli import app
 from aolink.errors import RestorationError
 from aolink.pictures import read_picture, read_psf, write_picture
 from aolink.restoration import restore
@@ -32,7 +34,7 @@ def picture(tmp_path: Path) -> np.ndarray:
 def test_a_picture_is_deblurred(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
     done = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png", "--json")
     assert done.returncode == 0, done.stderr
-    told, expected = json.loads(done.stdout), restore(picture, UNIFORM)
+    told, expected = json.loads(done.stdout), restore(picture, np.full(7, 2.0))
     assert told["noise_sd"] == pytest.approx(expected.noise_sd)
     assert (read_picture(tmp_path / "out.png") == expected.image).all()
     again = aolink("deblur", "--image", "in.png", "--psf", "psf.csv", "-o", "out.png")
@@ -47,6 +49,49 @@ def test_bad_files_are_one_line(aolink: Run, tmp_path: Path, picture: np.ndarray
     assert done.stderr.count("\n") == 1
     assert "cannot be read as a PSF" in done.stderr
     assert not (tmp_path / "out.png").exists()
+
+
+def test_what_is_not_a_number_is_filled_in(aolink: Run, tmp_path: Path, picture: np.ndarray) -> None:
+    holed = picture.astype(np.float32)
+    holed[10:13, 20:24] = np.nan
+    np.save(tmp_path / "in.npy", holed)
+    done = aolink("deblur", "--image", "in.npy", "--psf", "psf.csv", "-o", "out.npy")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith(", 12 pixels that are not numbers filled in\n")
+    whole = restore(picture.astype(np.float32), UNIFORM).image
+    assert abs(read_picture(tmp_path / "out.npy") - whole).max() < 0.2 * np.ptp(whole)
+    np.save(tmp_path / "in.npy", np.full_like(holed, np.nan))
+    none = aolink("deblur", "--image", "in.npy", "--psf", "psf.csv", "-o", "b.npy")
+    assert none.returncode == 10
+    assert "2400 of the picture's 2400 pixels are not finite" in none.stderr
+
+
+def test_transparency_is_no_light(tmp_path: Path, picture: np.ndarray) -> None:
+    grey = (picture // 200).astype(np.uint8)
+    colours = np.dstack([grey, grey[::-1], grey[:, ::-1]])
+    alpha = np.random.default_rng(1).integers(0, 255, grey.shape, dtype=np.uint8)
+    Image.fromarray(np.dstack([colours, alpha])).save(tmp_path / "in.png")
+    (tmp_path / "psf.csv").write_text(",".join(["1"] * 7))
+    out = tmp_path / "out.png"
+    told = CliRunner().invoke(
+        app, ["deblur", "--image", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv"), "-o", str(out)]
+    )
+    assert told.exit_code == 0, told.output
+    found = read_picture(out)
+    assert (found[..., 3] == alpha).all()
+    assert (found[..., :3] == restore(colours, np.ones(7)).image).all()
+
+
+def test_the_inverse_says_how_it_scanned(tmp_path: Path, picture: np.ndarray) -> None:
+    (tmp_path / "psf.csv").write_text("0.2 0.5 1")
+    files = ["--image", str(tmp_path / "in.png"), "--psf", str(tmp_path / "psf.csv")]
+    told = CliRunner().invoke(app, ["deblur", *files, "-o", str(tmp_path / "o.png"), "--method", "inverse"])
+    assert told.output.endswith(": inverse, scanned backwards\n")
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(RestorationError, match="give a folder that exists and can be written"):
+        write_picture(tmp_path / "none" / "a.png", np.zeros((4, 4), np.uint8))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])

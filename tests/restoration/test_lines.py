@@ -12,7 +12,7 @@ from scipy import linalg
 
 from aolink.errors import RestorationError
 from aolink.restoration import Scanner, first_order, from_correlation, measured_correlation
-from aolink.restoration.banded import smooth_lines
+from aolink.restoration.banded import _MANY_LINES, smooth_lines
 from aolink.restoration.kalman import kalman, line_model, scene_from_states, smooth
 from aolink.restoration.psf import line_matrix
 from tests.restoration.scenes import DECAYING, LOPSIDED, UNIFORM
@@ -101,12 +101,16 @@ def test_predictor_filter_and_lag_are_conditional_expectations(scanner: Scanner)
 @pytest.mark.parametrize("values", [UNIFORM, DECAYING, DECAYING[::-1], LOPSIDED, np.ones(1)], ids=len)
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("varying", [False, True])
-def test_smoother_banded_solve_and_dense_least_squares_agree(values: FloatArray, masked: bool, varying: bool) -> None:
+@pytest.mark.parametrize("count", [3, _MANY_LINES + 1])
+def test_smoother_banded_solve_and_dense_least_squares_agree(
+    values: FloatArray, masked: bool, varying: bool, count: int
+) -> None:
     rng, m = np.random.default_rng(5), len(values) - 1
     if varying:
         values = values * rng.uniform(0.5, 1.5, (COLUMNS, m + 1))
-    lines = make_lines(values)
-    seen = rng.random(lines.shape) > 0.2 if masked else None
+    lines = make_lines(values, n=count)
+    # Some of the lines have the same mask.
+    seen = np.repeat(rng.random((2, COLUMNS)) > 0.2, [1, count - 1], axis=0) if masked else None
     model = line_model(values, COLUMNS, FIRST)
     states = smooth(model, kalman(model, lines, NOISE, seen, keep=True))
     kalmans = scene_from_states(model, states, pixels(m))
@@ -130,9 +134,10 @@ def test_a_pixel_that_was_not_seen_is_not_looked_at() -> None:
     ).all()
 
 
+@pytest.mark.parametrize("count", [3, _MANY_LINES + 1])
 @pytest.mark.parametrize("scanner", [FIRST, THIRD], ids=["first", "third"])
-def test_known_pixels_before_the_line(scanner: Scanner) -> None:
-    lines, m = make_lines(LOPSIDED, scanner), len(LOPSIDED) - 1
+def test_known_pixels_before_the_line(scanner: Scanner, count: int) -> None:
+    lines, m = make_lines(LOPSIDED, scanner, count), len(LOPSIDED) - 1
     known = np.random.default_rng(2).standard_normal((len(lines), m))
     # Dense: the known pixels as measured without noise.
     C = np.vstack([np.eye(m, COLUMNS + m), line_matrix(LOPSIDED, COLUMNS)])

@@ -7,8 +7,20 @@ import pytest
 from numpy.typing import NDArray
 
 from aolink.restoration import Psf, non_local_means
-from aolink.restoration.markov import differences_transposed, line_solver, make_solver, plane_solver, roughness
-from aolink.restoration.tv import WEIGHT, total_variation
+from aolink.restoration.markov import (
+    DenseSolver,
+    IterativeSolver,
+    LineSolver,
+    Solver,
+    dense_solver,
+    differences_transposed,
+    line_solver,
+    make_solver,
+    masked_line_solver,
+    plane_solver,
+    roughness,
+)
+from aolink.restoration.tv import ITERATIONS, WEIGHT, total_variation
 from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, psnr, roughness_matrix
 
 FloatArray = NDArray[np.float64]
@@ -37,16 +49,38 @@ def test_along_lines_it_is_dense_least_squares(values: FloatArray, kappa: float)
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("line", [False, True])
-def test_on_the_plane_and_masked_it_is_dense_least_squares(line: bool, masked: bool) -> None:
+@pytest.mark.parametrize("iterative", [False, True])
+def test_on_the_plane_and_masked_it_is_dense_least_squares(line: bool, masked: bool, iterative: bool) -> None:
+    """Solved directly where the frame is as small as here, and by conjugate gradients."""
     rng = np.random.default_rng(2)
-    psf = Psf(values=UNIFORM, origin=(3,)) if line else Psf(values=CORNER, origin=(1, 1))
+    psf = Psf(values=LOPSIDED, origin=(3,)) if line else Psf(values=CORNER, origin=(1, 1))
     images = rng.standard_normal((2, *SHAPE))
     seen = rng.random(SHAPE) > 0.15 if masked else None
-    solver = make_solver(psf, SHAPE, 0.01, seen)
-    found = solver.solve(solver.project(images), None, 1e-12)
+    solver: Solver = dense_solver(psf, SHAPE, 0.01, seen)
+    if iterative and line and seen is not None:
+        solver = masked_line_solver(psf, seen, 0.01)
+    elif iterative:
+        solver = plane_solver(psf, SHAPE, 0.01, seen)
+    found = solver.solve(solver.project(images), solver.guess(images), 1e-12)
     assert abs(found - dense(psf, images, 0.01, seen)).max() < 1e-8
-    expected = (slice(None), slice(3, 17)) if line else (slice(1, 12), slice(1, 15))
-    assert np.empty(found.shape[1:])[solver.frame].shape == np.empty(found.shape[1:])[expected].shape == SHAPE
+    expected = (slice(1, 12), slice(1, 15)) if not line else (slice(0, 11), slice(1, 15))
+    rows, columns = np.indices(found.shape[1:])
+    assert (rows[solver.frame] == rows[expected]).all()
+    assert (columns[solver.frame] == columns[expected]).all()
+
+
+def test_small_frames_are_solved_directly_and_large_ones_are_not() -> None:
+    mask = np.ones((40, 40), bool)
+    mask[3, 4] = False
+    plane, line = Psf(values=CORNER, origin=(1, 1)), Psf(values=UNIFORM, origin=(3,))
+    kinds = [
+        type(make_solver(psf, shape, 0.01, None if seen is None else seen[: shape[0], : shape[1]]))
+        for psf, shape, seen in (
+            (plane, (20, 20), None), (plane, (40, 40), None), (line, (20, 20), mask), (line, (40, 40), mask),
+            (line, (20, 20), None),
+        )
+    ]  # fmt: skip
+    assert kinds == [DenseSolver, IterativeSolver, DenseSolver, IterativeSolver, LineSolver]
 
 
 def test_white_pixels_in_the_place_of_white_differences() -> None:
@@ -98,13 +132,13 @@ def test_total_variation_meets_its_dual() -> None:
 
 
 @pytest.mark.parametrize("values", [UNIFORM, CORNER], ids=["line", "plane"])
-def test_ten_iterations_are_enough(values: FloatArray) -> None:
+def test_few_iterations_are_enough(values: FloatArray) -> None:
     origin = tuple(n // 2 for n in values.shape)
     image, inside = blurred(blocks(60, 90), values, origin)
     image = image + 0.01 * np.random.default_rng(6).standard_normal(image.shape)
     psf = Psf(values=values, origin=origin)
     found = []
-    for iterations in (10, 200):
+    for iterations in (ITERATIONS, 200):
         x, solver = total_variation(
             lambda kappa: make_solver(psf, image.shape, kappa), image[None], 1e-4, 60.0, iterations
         )
@@ -117,11 +151,24 @@ def test_single_precision_is_enough_for_total_variation() -> None:
     image, _ = blurred(blocks(40, 80), UNIFORM, (3,))
     psf = Psf(values=UNIFORM, origin=(3,))
     one, two = (
-        total_variation(lambda kappa, t=t: make_solver(psf, image.shape, kappa, dtype=t), image[None], 1e-4, 60.0)[0]
-        for t in (np.float32, np.float64)
+        total_variation(lambda kappa, t=t: make_solver(psf, image.shape, kappa, single=t), image[None], 1e-4, 60.0)[0]
+        for t in (True, False)
     )
     assert one.dtype == np.float32
     assert abs(one - two).max() < 1e-3
+
+
+@pytest.mark.parametrize("noise_sd", [1e-2, 1e-3, 1e-4, 1e-5])
+def test_single_precision_is_wrong_by_less_than_the_noise(noise_sd: float) -> None:
+    """Its error grows with one over kappa: where the noise is small, it is not used."""
+    image, _ = blurred(blocks(40, 80), LOPSIDED, (3,))
+    image = image + noise_sd * np.random.default_rng(1).standard_normal(image.shape)
+    psf = Psf(values=LOPSIDED, origin=(3,))
+    one, two = (
+        total_variation(lambda k, t=t: make_solver(psf, image.shape, k, single=t), image[None], noise_sd**2, 60.0)[0]
+        for t in (True, False)
+    )
+    assert np.std(one - two) < 0.1 * noise_sd
 
 
 def test_one_plane_solver_is_the_other() -> None:

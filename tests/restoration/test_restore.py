@@ -194,6 +194,15 @@ def test_less_noise_is_no_worse(method: str, noise_sd: float) -> None:
         assert psnr(found.image, inside) > psnr(image, inside) + gain
 
 
+def test_almost_no_noise_is_more_than_conjugate_gradients_can_bear() -> None:
+    """They are told of more: with what there is they would end far from the scene."""
+    turn = np.linspace(0, math.pi, 200)
+    psf = motion_psf(np.stack([8 * np.cos(turn), 8 * np.sin(turn)]), None, SMALL, 1.0)
+    image, inside = picture(psf.values, psf.origin, (128, 128))
+    image = image - NOISE * (1 - 1e-3) * np.random.default_rng(1).standard_normal(image.shape)
+    assert psnr(restore(image, psf, method="tv", noise_sd=1e-3 * NOISE).image, inside) > 40
+
+
 def test_the_scanner_may_be_any() -> None:
     image, inside = picture(UNIFORM, (3,))
     fitted = restore(image, UNIFORM, method="smoother", noise_sd=NOISE)
@@ -229,9 +238,27 @@ def test_a_picture_of_one_row(method: str) -> None:
 
 
 @pytest.mark.parametrize("method", QUICK)
+@pytest.mark.parametrize("shape", [(1, 1), (5, 1), (1, 5), (2, 2), (8, 1), (1, 6), (6, 5)])
+def test_small_pictures_are_restored_or_refused(method: str, shape: tuple[int, int]) -> None:
+    """Of less than six pixels nothing tells the noise from the scene, nor how rough it is."""
+    image = np.random.default_rng(1).random(shape)
+    on_line = method in ("predictor", "filter", "lag", "smoother")
+    if (shape[1] if on_line else max(shape)) < 6:
+        with pytest.raises(RestorationError, match=f"{shape[0]} x {shape[1]} pixels are too few"):
+            restore(image, np.ones(1), method=method)
+        return
+    found = restore(image, np.ones(1), method=method, noise_sd=1e-6)
+    assert np.isfinite(found.image).all()
+    if method != "predictor":
+        assert abs(found.image - image).max() < 1e-2
+
+
+@pytest.mark.parametrize("method", QUICK)
 def test_an_even_picture_stays_as_it_is(method: str) -> None:
-    found = restore(np.full((12, 30), 7.0), UNIFORM, method=method)
-    assert abs(found.image - 7).max() < 1e-3
+    mask = np.random.default_rng(1).random((12, 30)) > 0.4
+    for seen in (None, mask):
+        found = restore(np.full((12, 30), 7.0), UNIFORM, method=method, mask=seen)
+        assert abs(found.image - 7).max() < 1e-3
 
 
 @pytest.mark.parametrize(

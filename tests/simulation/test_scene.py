@@ -14,6 +14,7 @@ from aolink.errors import RigError
 from aolink.restoration import motion_psf
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.scene import SceneSensor, framed, read_scene_picture
+from aolink.sensor import Kernel
 from aolink.simulation.model import RigModel, simulate
 from aolink.simulation.scene import SceneCamera
 
@@ -56,11 +57,17 @@ def test_it_is_the_mean_of_the_picture_moved_step_by_step(small: tuple[Rig, Scen
     np.testing.assert_allclose(intensity(rig, path), framed(sensor, smooth), atol=2e-3)
 
 
-def test_it_is_what_restoration_takes_it_for(tmp_path: Path) -> None:
+SLANTED = Kernel(shape="gaussian", sigma=0.2, matrix=((0.24, 0.12), (0.12, 0.09)))
+
+
+@pytest.mark.parametrize("kernel", [RIG.scene.kernel, SLANTED], ids=["round", "slanted"])
+def test_it_is_what_restoration_takes_it_for(tmp_path: Path, kernel: Kernel) -> None:
     """The direction of a positive slope, the place of no displacement and the scale are those of `motion_psf`."""
     smooth = ndimage.gaussian_filter(PICTURE, 2.5, mode="wrap")
-    rig, sensor = rig_with(smooth, tmp_path, shape=(60, 64), pixel_scale=0.05, picture_pixels=1)
-    for path in (np.linspace(0.1, 0.4, 50)[None], np.stack([np.linspace(0, 0.3, 50), np.linspace(0.2, -0.1, 50)])):
+    rig, sensor = rig_with(smooth, tmp_path, shape=(60, 64), pixel_scale=0.05, picture_pixels=1, kernel=kernel)
+    line, plane = np.linspace(0.1, 0.4, 50)[None], np.stack([np.linspace(0, 0.3, 50), np.linspace(0.2, -0.1, 50)])
+    # Along a line a kernel's width across it is no part of the PSF.
+    for path in (line, plane) if kernel.matrix is None else (plane,):
         spread = path if len(path) == 1 else np.concatenate([path - 0.1, path + 0.1])  # two spots, their mean counts
         seen = intensity(rig, spread)
         psf = motion_psf(path, None, sensor.kernel, sensor.pixel_scale)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from skimage import restoration
 
 from aolink.restoration import restore
+from aolink.restoration.markov import line_solver
 from bench_rows.pictures import NOISE_SD, Case, psnr
 
 FloatArray = NDArray[np.float64]
@@ -83,8 +84,13 @@ def bm3d_padded(case: Case) -> FloatArray:
 
 
 def bm3d_filled(case: Case) -> FloatArray:
-    """Beyond the frame, what the scene that gauss_markov finds would have left there."""
-    scene = _padded(restore(case.image, case.psf, method="gauss_markov").image)
+    """Beyond the frame, what the scene that gauss_markov finds, which goes on there, would have left."""
+    found = restore(case.image, case.psf, method="gauss_markov")
+    solver = line_solver(case.psf, case.image.shape, found.difference_weight * found.noise_sd**2)
+    scene = solver.solve(solver.project(case.image[None]))[0]
+    frame = solver.frame[1]
+    sides = (_PAD - frame.start, _PAD - (scene.shape[1] - frame.stop))
+    scene = np.pad(scene, ((_PAD, _PAD), sides), mode="reflect")
     taps, (origin,) = case.psf.values, case.psf.origin
     kernel = np.zeros(scene.shape[1])
     kernel[: len(taps)] = taps

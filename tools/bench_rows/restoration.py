@@ -36,9 +36,11 @@ def restoration_quality() -> list[Row]:
             f"{best_name} {best:.1f}; goal {goal:g}" if goal else f"{best_name} {best:.1f}",
             found.whole / (goal or best), 1 if goal else 0))  # fmt: skip
     fresh = {n: quality([(f(c), c.scene) for c in cases(FRESH)]).whole for n, f in peers.PADDED.items()}
-    top = max(fresh, key=lambda name: fresh[name])
     for method in _GOALS:
         found = quality([(restore(c.image, c.psf, method=method).image, c.scene) for c in cases(FRESH)])
+        # A linear method beside the linear ones, one that keeps edges beside all.
+        same_kind = {n: v for n, v in fresh.items() if "Wiener" in n or method in ("tv", "pnp")}
+        top = max(same_kind, key=lambda name: fresh[name])
         rows.append(Row(f"restore {method}: {', '.join(FRESH)}, not tuned on", str(found), f"{top} {fresh[top]:.2f} dB",
             found.whole / fresh[top], 1))  # fmt: skip
     return rows
@@ -79,8 +81,7 @@ def restoration_time() -> list[Row]:
 
     def tv() -> None:
         total_variation(
-            lambda kappa: make_solver(psf, (512, 512), kappa, dtype=np.float32), image[None].astype(np.float32),
-            variance, weight,
+            lambda kappa: make_solver(psf, (512, 512), kappa, single=True), image[None], variance, weight
         )  # fmt: skip
 
     ours = {
