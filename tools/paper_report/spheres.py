@@ -138,8 +138,8 @@ def film_section(found: Sequence[Film]) -> list[Block]:
             "Not the paper's: a film of six spheres that diffuse in water, along x and y"
             " (tests/data/diffusing_spheres.md). The mean of some frames is an exposure, what a tracker saw in the"
             " single frames its path; kernel and noise are those of single frames, the plant is a random walk. The"
-            " model is not known to be right: what counts is the ratio to o1. RMSE of the path, pixels, with the standard"
-            " error over the twelve axes:"
+            " model is not known to be right: what counts is the ratio to o1. RMSE of the path, pixels, with the"
+            " standard error over the twelve axes:"
         ),
         Table(["estimator", *across], [[name, *(str(each.path[name]) for each in found)] for name in names]),
         Text("Over o1's, with the 95 % interval of a bootstrap over the axes:"),
