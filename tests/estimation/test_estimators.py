@@ -17,8 +17,9 @@ from aolink.estimation import (
     score,
 )
 from aolink.estimation.estimate import COMPARED
-from aolink.estimation.estimators import Options, measure
+from aolink.estimation.measuring import measure
 from aolink.estimation.observation import PathMoments
+from aolink.estimation.options import Options
 from aolink.plant import lift
 from aolink.recording.reestimate import first_difference
 from aolink.rig import load_rig
