@@ -10,8 +10,8 @@ from aolink.estimation.exposure_model import ExposureModel, InputResponse, expos
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 
-# Exposures together, and numbers in them: some megabytes.
-_AT_ONCE = 256
+# Exposures together, and numbers in them: some megabytes. What a block costs whatever its size is nothing beside them.
+_AT_ONCE = 512
 _NUMBERS_AT_ONCE = 1_000_000
 
 

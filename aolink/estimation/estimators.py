@@ -111,9 +111,11 @@ class Estimator:
     def _believed(self, block: Block, first: int, done: Run) -> Iterator[Estimate]:
         """Estimates of a run of exposures."""
         assert block.model is not None
-        n = self.rig.plant.n_states
-        for k, exposure in enumerate(block.exposures[first : first + len(done.nis)]):
-            coefficients, covariance = done.coefficients[k], done.covariance[k]
+        exposures = block.exposures[first : first + len(done.nis)]
+        for exposure, state, covariance, end, end_covariance, innovation, S, nis in zip(
+            exposures, done.coefficients, done.covariance, done.end, done.end_covariance, done.innovation,
+            done.innovation_covariance, done.nis, strict=True,
+        ):  # fmt: skip
             yield Estimate(
                 estimator=self.name,
                 frame_id=exposure.frame_id,
@@ -121,17 +123,17 @@ class Estimator:
                 n_steps=exposure.n_steps,
                 status=Status.OK,
                 reason="",
-                start_state=coefficients[:, :n],
-                start_covariance=covariance[:, :n, :n],
-                end_state=done.end[k],
-                end_covariance=done.end_covariance[k],
-                coefficients=coefficients,
+                start_state=state,
+                start_covariance=covariance,
+                end_state=end,
+                end_covariance=end_covariance,
+                coefficients=state,
                 coefficient_covariance=covariance,
                 inputs=exposure.inputs,
                 model=block.model,
-                innovation=done.innovation[k],
-                innovation_covariance=done.innovation_covariance[k],
-                nis=done.nis[k],
+                innovation=innovation,
+                innovation_covariance=S,
+                nis=nis,
             )
 
     def _stepped(self, block: Block, k: int, measured: Measured) -> Estimate:

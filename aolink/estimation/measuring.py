@@ -42,7 +42,8 @@ class Measurements:
         sensor = rig.sensor
         if not (isinstance(sensor, Sensor) and sensor.shape[0] == 1 and isinstance(observation, PathMoments)):
             return
-        sized = [k for k, each in enumerate(exposures) if each.pixels.shape == sensor.shape == each.mask.shape]
+        shape = sensor.shape
+        sized = [k for k, each in enumerate(exposures) if each.pixels.shape == shape == each.mask.shape]
         if not sized:
             return
         pixels = np.concatenate([exposures[k].pixels for k in sized])

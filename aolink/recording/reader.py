@@ -162,15 +162,19 @@ class Recording:
         an index, the rest of the file is not read.
         """
         for raw in self.raw_messages(*wanted, start_ns=start_ns, end_ns=end_ns):
-            kind = topics.SCHEMAS.get(raw.schema)
-            if kind is None:
-                continue
-            try:
-                message = kind.FromString(raw.data)
-            except DecodeError:
-                self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
-                continue
-            yield RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
+            if (message := self.decoded(raw)) is not None:
+                yield RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
+
+    def decoded(self, raw: RawMessage) -> Message | None:
+        """What a message's bytes say; None if aolink does not know its kind, or if it is not of its kind: a loss."""
+        kind = topics.SCHEMAS.get(raw.schema)
+        if kind is None:
+            return None
+        try:
+            return kind.FromString(raw.data)
+        except DecodeError:
+            self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
+            return None
 
     def raw_messages(
         self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None
@@ -190,47 +194,29 @@ class Recording:
         Of ``others`` all topics if none is named, besides those that make exposures. Exposures that were
         still incomplete when the recording ended come last, with None.
         """
-        assembler = Assembler(self.rig)
-        info: schemas_pb2.ExposureInfo | None = None
+        assembly = _Assembly(self.rig)
         for recorded in self.messages(*({*others, *_ASSEMBLED} if others else ())):
-            message, exposures = recorded.message, list[Exposure]()
-            if isinstance(message, wire.CommandBlock):
-                assembler.add_command(message)
-            elif isinstance(message, wire.Applied):
-                exposures = assembler.add_applied(message)
-            elif recorded.topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-                info = message
-            elif recorded.topic == topics.IMAGE and isinstance(message, RawImage) and info is not None:
-                exposures = assembler.add_frame(convert.frame_from_messages(info, message))
-                info = None
-            yield recorded, exposures
-        yield None, assembler.flush()
+            yield recorded, assembly.take(recorded.topic, recorded.message)
+        yield None, assembly.flush()
 
     def exposures(self) -> Iterator[Exposure]:
         """The exposures in order, with their truth and their scene where the file has them."""
-        truths: dict[int, Truth] = {}
-        scenes: dict[int, Picture] = {}
-        kept: list[tuple[str, dict[int, Any]]] = [(topics.TRUTH, truths), (topics.SCENE, scenes)]
-        expected = [found for topic, found in kept if topic in self.counts]
-        waiting: deque[Exposure] = deque()
-        info: schemas_pb2.ExposureInfo | None = None
-        for recorded, exposures in self.assembled(topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE):
-            message = recorded.message if recorded is not None else None
-            if isinstance(message, wire.Truth):
-                truths[message.frame_id] = convert.truth_from_message(message)
-            elif recorded and recorded.topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-                info = message
-            elif recorded and recorded.topic == topics.SCENE and isinstance(message, RawImage) and info is not None:
-                frame = convert.frame_from_messages(info, message)
-                scenes[frame.frame_id], info = Picture(pixels=frame.pixels, mask=frame.mask), None
-            waiting.extend(exposures)
-            # They may come after their exposure, but not after the next one.
-            while waiting and (len(waiting) > 1 or all(waiting[0].frame_id in found for found in expected)):
-                exposure = waiting.popleft()
-                truth, scene = truths.pop(exposure.frame_id, None), scenes.pop(exposure.frame_id, None)
-                yield replace(exposure, truth=truth, scene=scene)
-        for exposure in waiting:
-            yield replace(exposure, truth=truths.get(exposure.frame_id), scene=scenes.get(exposure.frame_id))
+        assembly, beside = _Assembly(self.rig), _Beside(self.counts)
+        for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE):
+            if (message := self.decoded(raw)) is None:
+                continue
+            if raw.topic in _BESIDE:
+                beside.take(raw.topic, message)
+            elif completed := assembly.take(raw.topic, message):
+                beside.waiting.extend(completed)
+            elif not beside.waiting:
+                continue
+            # What is beside an exposure may come after it, but not after the next one.
+            while beside.has_next:
+                yield beside.next()
+        beside.waiting.extend(assembly.flush())
+        while beside.waiting:
+            yield beside.next()
 
     @property
     def true_scene(self) -> NDArray[np.uint16] | None:
@@ -368,6 +354,65 @@ class Recording:
         self._losses.setdefault(loss.offset, loss)
 
 
+class _Assembly:
+    """Messages become exposures, as they did in the session."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._assembler = Assembler(rig)
+        self._info: schemas_pb2.ExposureInfo | None = None
+
+    def take(self, topic: str, message: Message) -> list[Exposure]:
+        """Take any message; gives the exposures that are complete with it."""
+        if isinstance(message, wire.Applied):
+            return self._assembler.add_applied(message)
+        if isinstance(message, wire.CommandBlock):
+            self._assembler.add_command(message)
+        elif topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
+            self._info = message
+        elif topic == topics.IMAGE and isinstance(message, RawImage) and self._info is not None:
+            info, self._info = self._info, None
+            return self._assembler.add_frame(convert.frame_from_messages(info, message))
+        return []
+
+    def flush(self) -> list[Exposure]:
+        """Exposures that were still incomplete when the recording ended."""
+        return self._assembler.flush()
+
+
+class _Beside:
+    """Exposures that wait for what is recorded beside them: truth and scene."""
+
+    def __init__(self, counts: Container[str]) -> None:
+        self.waiting: deque[Exposure] = deque()
+        self._truths: dict[int, Truth] = {}
+        self._scenes: dict[int, Picture] = {}
+        kept: list[tuple[str, dict[int, Any]]] = [(topics.TRUTH, self._truths), (topics.SCENE, self._scenes)]
+        self._expected = [found for topic, found in kept if topic in counts]
+        self._info: schemas_pb2.ExposureInfo | None = None
+
+    @property
+    def has_next(self) -> bool:
+        """Whether the next exposure has all that it will get."""
+        waiting = self.waiting
+        return bool(waiting) and (len(waiting) > 1 or all(waiting[0].frame_id in found for found in self._expected))
+
+    def next(self) -> Exposure:
+        """The next exposure, with what came for it."""
+        exposure = self.waiting.popleft()
+        truth, scene = self._truths.pop(exposure.frame_id, None), self._scenes.pop(exposure.frame_id, None)
+        return replace(exposure, truth=truth, scene=scene) if truth or scene else exposure
+
+    def take(self, topic: str, message: Message) -> None:
+        """Take a message that belongs to an exposure."""
+        if isinstance(message, wire.Truth):
+            self._truths[message.frame_id] = convert.truth_from_message(message)
+        elif topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
+            self._info = message
+        elif topic == topics.SCENE and isinstance(message, RawImage) and self._info is not None:
+            frame = convert.frame_from_messages(self._info, message)
+            self._scenes[frame.frame_id], self._info = Picture(pixels=frame.pixels, mask=frame.mask), None
+
+
 def _restored(info: schemas_pb2.Restoration, pictures: dict[str, NDArray[np.float32]]) -> RestoredPictures:
     return RestoredPictures(info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS))
 
@@ -392,3 +437,4 @@ def _scene_shape(rig: Rig) -> tuple[int, int]:
 
 
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
+_BESIDE = (topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE)
