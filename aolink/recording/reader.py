@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-from collections import deque
 from collections.abc import Container, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -17,14 +16,13 @@ from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, 
 from mcap.records import Message as McapMessage
 from numpy.typing import NDArray
 
-from aolink.assembly import Assembler
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel
-from aolink.exposure import Exposure, Picture, Truth
+from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
-from aolink.wire import messages_pb2 as wire
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,14 +192,14 @@ class Recording:
         Of ``others`` all topics if none is named, besides those that make exposures. Exposures that were
         still incomplete when the recording ended come last, with None.
         """
-        assembly = _Assembly(self.rig)
+        assembly = ExposureAssembly(self.rig)
         for recorded in self.messages(*({*others, *_ASSEMBLED} if others else ())):
             yield recorded, assembly.take(recorded.topic, recorded.message)
         yield None, assembly.flush()
 
     def exposures(self) -> Iterator[Exposure]:
         """The exposures in order, with their truth and their scene where the file has them."""
-        assembly, beside = _Assembly(self.rig), _Beside(self.counts)
+        assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
         for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE):
             if (message := self.decoded(raw)) is None:
                 continue
@@ -352,65 +350,6 @@ class Recording:
 
     def _lose(self, loss: Loss) -> None:
         self._losses.setdefault(loss.offset, loss)
-
-
-class _Assembly:
-    """Messages become exposures, as they did in the session."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._assembler = Assembler(rig)
-        self._info: schemas_pb2.ExposureInfo | None = None
-
-    def take(self, topic: str, message: Message) -> list[Exposure]:
-        """Take any message; gives the exposures that are complete with it."""
-        if isinstance(message, wire.Applied):
-            return self._assembler.add_applied(message)
-        if isinstance(message, wire.CommandBlock):
-            self._assembler.add_command(message)
-        elif topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-            self._info = message
-        elif topic == topics.IMAGE and isinstance(message, RawImage) and self._info is not None:
-            info, self._info = self._info, None
-            return self._assembler.add_frame(convert.frame_from_messages(info, message))
-        return []
-
-    def flush(self) -> list[Exposure]:
-        """Exposures that were still incomplete when the recording ended."""
-        return self._assembler.flush()
-
-
-class _Beside:
-    """Exposures that wait for what is recorded beside them: truth and scene."""
-
-    def __init__(self, counts: Container[str]) -> None:
-        self.waiting: deque[Exposure] = deque()
-        self._truths: dict[int, Truth] = {}
-        self._scenes: dict[int, Picture] = {}
-        kept: list[tuple[str, dict[int, Any]]] = [(topics.TRUTH, self._truths), (topics.SCENE, self._scenes)]
-        self._expected = [found for topic, found in kept if topic in counts]
-        self._info: schemas_pb2.ExposureInfo | None = None
-
-    @property
-    def has_next(self) -> bool:
-        """Whether the next exposure has all that it will get."""
-        waiting = self.waiting
-        return bool(waiting) and (len(waiting) > 1 or all(waiting[0].frame_id in found for found in self._expected))
-
-    def next(self) -> Exposure:
-        """The next exposure, with what came for it."""
-        exposure = self.waiting.popleft()
-        truth, scene = self._truths.pop(exposure.frame_id, None), self._scenes.pop(exposure.frame_id, None)
-        return replace(exposure, truth=truth, scene=scene) if truth or scene else exposure
-
-    def take(self, topic: str, message: Message) -> None:
-        """Take a message that belongs to an exposure."""
-        if isinstance(message, wire.Truth):
-            self._truths[message.frame_id] = convert.truth_from_message(message)
-        elif topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-            self._info = message
-        elif topic == topics.SCENE and isinstance(message, RawImage) and self._info is not None:
-            frame = convert.frame_from_messages(self._info, message)
-            self._scenes[frame.frame_id], self._info = Picture(pixels=frame.pixels, mask=frame.mask), None
 
 
 def _restored(info: schemas_pb2.Restoration, pictures: dict[str, NDArray[np.float32]]) -> RestoredPictures:
