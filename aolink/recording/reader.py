@@ -100,6 +100,8 @@ class Recording:
         """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
         """By name, as they are in the file."""
+        self.encodings: dict[str, str] = {}
+        """What the messages of a topic are encoded as, where the file says it."""
         self._index: list[ChunkIndex] | None = None
         rig_text = self._survey(check=check)
         if rig_text is None:
@@ -134,12 +136,6 @@ class Recording:
     def complete(self) -> bool:
         """Whether the file ends as a recording should."""
         return not self.damage
-
-    @property
-    def foreign(self) -> list[str]:
-        """Topics whose messages are of a kind that aolink does not know."""
-        known = {topic for topic, schema in self._channels.values() if schema in topics.SCHEMAS}
-        return [topic for topic in self.counts if topic not in known]
 
     @property
     def estimators(self) -> list[str]:
@@ -279,6 +275,7 @@ class Recording:
                 for channel in summary.channels.values():
                     known = summary.schemas.get(channel.schema_id)
                     self._channels[channel.id] = (channel.topic, known.name if known else "")
+                    self.encodings[channel.topic] = channel.message_encoding
                 statistics = summary.statistics
                 for channel_id, count in sorted(statistics.channel_message_counts.items()):
                     if channel_id in self._channels:
@@ -304,6 +301,7 @@ class Recording:
                 if sure or before is None:  # its schema may have been in a chunk that is lost
                     kind = ids.get(record.schema_id, before[1] if before else "")
                     self._channels[record.id] = (record.topic, kind)
+                    self.encodings[record.topic] = record.message_encoding
             else:
                 self._note(record, rig_texts)
         self.start_ns = first_ns or 0
