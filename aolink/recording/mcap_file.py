@@ -25,7 +25,7 @@ COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none"
 class WriteOptions:
     """How a recording is cut into chunks, and when they reach the disk.
 
-    Defaults as measured by ``tools/bench --only recording``: LZ4 keeps the longest single write call under a
+    Defaults as measured by ``tools/bench recording``: LZ4 keeps the longest single write call under a
     millisecond, and a killed process loses no more than twice ``flush_s``.
     """
 
