@@ -65,7 +65,7 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
 """What is looked into; message indexes and other records are stepped over."""
 
 # What the mcap library and the decompressors raise on content that is damaged.
-_DAMAGE = (McapError, struct.error, RuntimeError, ValueError, EOFError, KeyError, zstandard.ZstdError)
+_DAMAGE = (McapError, struct.error, RuntimeError, ValueError, OverflowError, EOFError, KeyError, zstandard.ZstdError)
 
 
 @dataclass(frozen=True, slots=True)
