@@ -84,7 +84,7 @@ def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> l
         exposures = read(exposures)
     series = exposures if isinstance(exposures, Exposures) else exposures.exposures()
     driver = Driver(exposures.rig, [estimator])
-    return [result for exposure in series for result in driver.step(exposure)]
+    return [result for _, (result,) in driver.steps(series)]
 
 
 def smooth(exposures: Exposures | Recording | str | Path, estimates: list[Estimate]) -> list[Estimate]:

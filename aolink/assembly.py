@@ -192,9 +192,9 @@ class _InputHistory:
         self._add(self._commanded, message)
 
     def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock) -> None:
-        if message.n_steps and len(message.u) == message.n_steps * self._n_inputs:
-            u = np.array(message.u, dtype=np.float64).reshape(message.n_steps, self._n_inputs)
-            blocks.append((message.first_step, u))
+        n_steps, u = message.n_steps, np.array(message.u, dtype=np.float64)
+        if n_steps and u.size == n_steps * self._n_inputs:
+            blocks.append((message.first_step, u.reshape(n_steps, self._n_inputs)))
 
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
         """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
@@ -202,18 +202,35 @@ class _InputHistory:
         The last word on a step counts; one that nothing is known of holds the input of the step before.
         """
         n = max(0, end - first)
+        if n and self._reports_exactly(first, n):
+            (_, rows), *self._applied = self._applied
+            self._commanded = _after(end, self._commanded)
+            self._last = rows[-1]
+            return rows, 0
         rows, told, reported = np.empty((n, self._n_inputs)), np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for blocks, known in ((self._commanded, told), (self._applied, reported)):
             for start, u in blocks:
                 some = slice(max(start - first, 0), max(start + len(u) - first, 0))
                 rows[some] = u[max(first - start, 0) :][: len(rows[some])]
                 known[some] = True
-            blocks[:] = [(max(start, end), u[max(end - start, 0) :]) for start, u in blocks if start + len(u) > end]
+            blocks[:] = _after(end, blocks)
         for k in np.flatnonzero(~(told | reported)):
             rows[k] = rows[k - 1] if k else self._last
         if n:
             self._last = rows[-1].copy()
         return rows, n - int(np.count_nonzero(reported))
+
+    def _reports_exactly(self, first: int, n_steps: int) -> bool:
+        """Whether one report is of these steps and no other report is of any of them: no command matters then."""
+        if not self._applied:
+            return False
+        (start, u), *others = self._applied
+        return start == first and len(u) == n_steps and all(other >= first + n_steps for other, _ in others)
+
+
+def _after(end: int, blocks: _Blocks) -> _Blocks:
+    """What of runs of steps is not before ``end``."""
+    return [(max(start, end), u[max(end - start, 0) :]) for start, u in blocks if start + len(u) > end]
 
 
 _MOST_LEAD_STEPS = 100_000
@@ -225,6 +242,7 @@ class Assembler:
 
     def __init__(self, rig: Rig) -> None:
         self._history = _InputHistory(rig.n_inputs, rig.mirror.park)
+        self._no_lead = np.empty((0, rig.n_inputs))
         self._fast_step_ns = rig.timing.fast_step_ns
         self._frames: deque[Frame] = deque()
         self._end: int | None = None
@@ -258,7 +276,9 @@ class Assembler:
     def _expose(self, frame: Frame) -> Exposure:
         lead_start = frame.first_step if self._end is None else min(self._end, frame.first_step)
         lead_start = max(lead_start, frame.first_step - _MOST_LEAD_STEPS)
-        lead, lead_assumed = self._history.take(lead_start, frame.first_step)
+        lead, lead_assumed = self._no_lead, 0
+        if lead_start < frame.first_step:
+            lead, lead_assumed = self._history.take(lead_start, frame.first_step)
         inputs, assumed = self._history.take(frame.first_step, frame.last_step + 1)
         self._end = frame.last_step + 1
         return Exposure(

@@ -10,9 +10,10 @@ import pytest
 from aolink.errors import RigError
 from aolink.estimation import make_estimator, run
 from aolink.estimation.centroids import centroid_covariance
-from aolink.estimation.estimators import Options, measure
 from aolink.estimation.exposure_scan import exposure_scan
+from aolink.estimation.measuring import measure
 from aolink.estimation.observation import PathMoments
+from aolink.estimation.options import Options
 from aolink.estimation.score import score
 from aolink.optics.camera import to_density
 from aolink.optics.frame import frame_density, spot_windows

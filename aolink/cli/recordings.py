@@ -216,9 +216,8 @@ def compare(
     from aolink.recording.reestimate import write_reestimated
 
     one = open_recording(first)
-    if accept and (topic or one.foreign):
-        what = f"messages on {', '.join(one.foreign)} that aolink does not know" if one.foreign else "other topics"
-        raise typer.BadParameter(f"--accept would replace the whole of {first}, {what} too: it cannot be used here")
+    if accept and topic:
+        raise typer.BadParameter(f"--accept would replace the whole of {first}, other topics too: leave --topic out")
     if second is None and not one.estimators:
         raise RecordingError(f"{first} holds no estimates to make again: give a second recording")
     with TemporaryDirectory(prefix="aolink-") as folder:

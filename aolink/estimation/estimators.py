@@ -1,40 +1,35 @@
-"""The estimators by name, and the driver that live sessions, replays and batches share."""
+"""The estimators by name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
+from aolink.estimation.block import Block
 from aolink.estimation.centroids import centroid_covariance
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.exposure_model import InputResponse, exposure_model
+from aolink.estimation.exposure_model import exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
 from aolink.estimation.filterpy_engine import FilterpyMoments
-from aolink.estimation.moments import (
-    Flux,
-    Measurement,
-    least_significance,
-    measure_moments,
-    spot_significance,
-)
+from aolink.estimation.measuring import Measured, Measurements
+from aolink.estimation.moments import Flux
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
-from aolink.estimation.spots import measure_spots
-from aolink.estimation.windowed import Basis, Profile, WindowedMoments
-from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
+from aolink.estimation.options import Engine, Options
+from aolink.estimation.two_states import Run
+from aolink.estimation.windowed import Basis, WindowedMoments
+from aolink.estimation.windowed_spots import WindowedSpots
 from aolink.exposure import Exposure
-from aolink.optics.camera import is_saturated, to_density
-from aolink.rig import Rig, Sensor, SpotSensor
+from aolink.rig import Rig, SpotSensor
 
 if TYPE_CHECKING:
     from aolink.estimation.hypothesis_filter import HypothesisFilter
 
 FloatArray = NDArray[np.float64]
-Engine = Literal["aolink", "filterpy"]
 
 _PAPER_ORDERS: dict[str, tuple[int, ...]] = {"o1": (1,), "o2": (2,), "o3": (1, 2)}
 _OF_PIXELS = ("profile", "mixture", "sampled")
@@ -44,38 +39,6 @@ ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments", *_OF
 _HIGHEST_ORDER = 8
 # Of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
-# Share of the pixels that `moments` can do with.
-_LEAST_USABLE = 0.5
-# Exposures together, and numbers in them.
-_AT_ONCE = 64
-_NUMBERS_AT_ONCE = 1_000_000
-
-Measured = tuple[Measurement | Profile | SpotWindows | None, str]
-"""What an observation takes of an exposure, or nothing; and what there is to say about it."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """Choices that the paper leaves open."""
-
-    gain: str = "steady-state"
-    """Of o1: "steady-state", or "time-varying", which a plant without a steady-state gain always gets."""
-    process_noise: Noise = "lifted"
-    """Noise that an exposure adds to the state: "lifted", or "printed" for the paper's B_w W B_w'."""
-    flux: Flux = "known"
-    """"known": the light of a frame sums to one; "measured": moments are divided by what it sums to."""
-    gate: bool = True
-    """Whether measurements that cannot be believed are left out."""
-    engine: Engine = "aolink"
-    """What o1 to o3 run on: "aolink", or "filterpy", for one axis."""
-    orders: tuple[int, ...] = (0, 1, 2, 3)
-    """Of `moments`: which functions of the basis; 0 is the light in the window."""
-    basis: Basis = "monomial"
-    """Of `moments`: "monomial", "legendre" or "fourier"."""
-    particles: int = 3000
-    """Of `sampled`."""
-    seed: int = 0
-    """Of `sampled`: the same one gives the same estimates, bit for bit."""
 
 
 class Estimator:
@@ -104,18 +67,78 @@ class Estimator:
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
 
-    def step(
-        self, exposure: Exposure, response: InputResponse | None = None, measured: Measured | None = None
-    ) -> Estimate:
-        """The estimate of an exposure, from it and from all that came before.
+    def step(self, exposure: Exposure) -> Estimate:
+        """The estimate of an exposure, from it and from all that came before."""
+        (estimate,) = self.steps(Block(self.rig, [exposure]))
+        return estimate
 
-        ``response``, to the exposure's inputs, and ``measured``, of `measure_all`, save computing them again.
-        """
-        model = exposure_model(self.rig.plant, exposure.n_steps, exposure.start_offset)
+    def steps(self, block: Block) -> Iterator[Estimate]:
+        """The estimates of exposures one after the other, to the same bits."""
+        measured = Measurements(self.rig, block.exposures, self._observation, self.options)
+        k = 0
+        while k < len(block.exposures):
+            done = self._run(block, measured, k)
+            if done is None:
+                yield self._stepped(block, k, measured[k])
+                k += 1
+                continue
+            count = len(done.nis)
+            last = block.exposures[k + count - 1]
+            self._next_step, self._last_input = last.first_step + last.n_steps, last.inputs[-1]
+            yield from self._believed(block, k, done)
+            k += count
+
+    def _run(self, block: Block, measured: Measurements, first: int) -> Run | None:
+        """What the filter makes of exposures from ``first`` on between which there is no gap, and that have no flaw."""
+        row, moments = measured.rows[first], measured.moments
+        if not isinstance(self._filter, BlurFilter) or block.model is None or moments is None or row < 0:
+            return None
+        end, next_step = first, self._next_step
+        for exposure in block.exposures[first:]:
+            follows = next_step in (None, exposure.first_step) and not len(exposure.lead_inputs)
+            if not (follows and block.finite[end] and measured.rows[end] == row + end - first):
+                break
+            end, next_step = end + 1, exposure.first_step + exposure.n_steps
+        if end == first:
+            return None
+        axes = self.rig.plant.axes
+        responses = block.responses.of(slice(first * axes, end * axes))
+        return self._filter.run(block.model, responses, measured.some(row, row + end - first))
+
+    def _believed(self, block: Block, first: int, done: Run) -> Iterator[Estimate]:
+        """Estimates of a run of exposures."""
+        assert block.model is not None
+        exposures = block.exposures[first : first + len(done.nis)]
+        for exposure, state, covariance, end, end_covariance, innovation, S, nis in zip(
+            exposures, done.coefficients, done.covariance, done.end, done.end_covariance, done.innovation,
+            done.innovation_covariance, done.nis, strict=True,
+        ):  # fmt: skip
+            yield Estimate(
+                estimator=self.name,
+                frame_id=exposure.frame_id,
+                first_step=exposure.first_step,
+                n_steps=exposure.n_steps,
+                status=Status.OK,
+                reason="",
+                start_state=state,
+                start_covariance=covariance,
+                end_state=end,
+                end_covariance=end_covariance,
+                coefficients=state,
+                coefficient_covariance=covariance,
+                inputs=exposure.inputs,
+                model=block.model,
+                innovation=innovation,
+                innovation_covariance=S,
+                nis=nis,
+            )
+
+    def _stepped(self, block: Block, k: int, measured: Measured) -> Estimate:
+        """The estimate of exposure k, whatever it is like."""
+        exposure, model = block.exposures[k], block.model_of(k)
         reasons = self._bridge(exposure)
-        response = response or model.response(exposure.inputs)
-        taken, remark = measured or self.measure_all([exposure])[0]
-        posterior = self._filter.step(model, response, taken)  # type: ignore[arg-type] # what it measured itself
+        taken, remark = measured
+        posterior = self._filter.step(model, block.response_to(k), taken)  # type: ignore[arg-type] # it measured it
         self.several = posterior.several
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
@@ -139,10 +162,6 @@ class Estimator:
             nis=posterior.nis,
         )
 
-    def measure_all(self, exposures: Sequence[Exposure]) -> list[Measured]:
-        """What it takes of each exposure; it does not matter what came before."""
-        return measure_all(self.rig, exposures, self._observation, self.options)
-
     def _bridge(self, exposure: Exposure) -> list[str]:
         """Predict to the start of an exposure; what there is to say about it."""
         lead, reasons = exposure.lead_inputs, []
@@ -159,66 +178,6 @@ class Estimator:
         self._next_step = exposure.first_step + exposure.n_steps
         self._last_input = exposure.inputs[-1]
         return reasons
-
-
-def measure_all(
-    rig: Rig, exposures: Sequence[Exposure], observation: Observation[Any] | None, options: Options
-) -> list[Measured]:
-    """`measure` of many exposures, each to the same bits: line-sensor frames without a flaw all at once."""
-    sensor, found = rig.sensor, dict[int, Measured]()
-    many = len(exposures) > 1 and sensor.shape[0] == 1
-    if many and isinstance(sensor, Sensor) and isinstance(observation, PathMoments):
-        whole = [k for k, each in enumerate(exposures) if each.pixels.shape == sensor.shape and each.complete]
-        pixels = np.concatenate([np.empty(sensor.shape, np.uint16)[:0], *(exposures[k].pixels for k in whole)])
-        lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
-        good = np.flatnonzero(lit & ~is_saturated(sensor, pixels).any(axis=1))
-        moments = measure_moments(sensor, pixels[good], observation.orders, options.flux) if len(good) else ""
-        if not isinstance(moments, str):
-            for i, k in enumerate(good):
-                own = Measurement(value=moments.value[i : i + 1], covariance=moments.covariance[i : i + 1])
-                found[whole[k]] = (own, "")
-    return [found.get(k) or measure(rig, each, observation, options) for k, each in enumerate(exposures)]
-
-
-def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options) -> Measured:
-    """What an observation takes of an exposure, or nothing; and what there is to say about it."""
-    if observation is None:
-        return None, ""
-    sensor, pixels = rig.sensor, exposure.pixels
-    if pixels.shape != sensor.shape:
-        return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
-    if isinstance(sensor, SpotSensor):
-        orders = observation.orders if isinstance(observation, PathMoments) else None
-        return measure_spots(
-            sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
-            least_usable=_LEAST_USABLE, least_significance=_least_significance(sensor),
-        )  # fmt: skip
-    sensor = sensor.profile
-    saturated = is_saturated(sensor, pixels) & exposure.mask
-    usable = exposure.mask & ~saturated
-    remark = ""
-    if not usable.all():
-        remark = f"{int((~exposure.mask).sum())} of {pixels.size} pixels are missing"
-        if saturated.any():
-            remark = f"{int(saturated.sum())} of {pixels.size} pixels are at an end of the scale"
-        if isinstance(observation, PathMoments) or usable.sum() < _LEAST_USABLE * pixels.size:
-            return None, remark
-        remark += ": left out"
-    density = np.where(usable, to_density(sensor, pixels), 0.0)
-    significance = spot_significance(sensor, density)[0]
-    if significance < least_significance(sensor):
-        return None, f"no spot: the brightest stretch is {significance:.1f} standard deviations of noise"
-    rows = (rig.plant.axes, -1)
-    if not isinstance(observation, PathMoments):
-        return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
-    moments = measure_moments(sensor, pixels.reshape(rows), observation.orders, options.flux)
-    return (None, moments) if isinstance(moments, str) else (moments, "")
-
-
-def _least_significance(sensor: SpotSensor) -> FloatArray:
-    """`least_significance` of each profile, (n_outputs,), or of all."""
-    light = 1.0 if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)
-    return least_significance(sensor.profile, light)
 
 
 def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
@@ -271,54 +230,6 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f" {rig.name} has {rig.plant.n_outputs // 2}; use o3"
         )
     return Estimator(rig, name, chosen)
-
-
-class Driver:
-    """Several estimators side by side, exposure by exposure, on one engine."""
-
-    def __init__(self, rig: Rig, names: Sequence[str], engine: Engine = "aolink") -> None:
-        self.rig = rig
-        self.estimators = [make_estimator(rig, name, engine=engine) for name in names]
-
-    def step(self, exposure: Exposure) -> list[Estimate]:
-        """What each of them says about an exposure, in the order of the names."""
-        model = exposure_model(self.rig.plant, exposure.n_steps, exposure.start_offset)
-        response = model.response(exposure.inputs)
-        return [estimator.step(exposure, response) for estimator in self.estimators]
-
-    def steps(self, exposures: Iterable[Exposure]) -> Iterator[tuple[Exposure, list[Estimate]]]:
-        """The same for a series, to the same bits; what knows no recursion is done for many exposures at once."""
-        for some in _batches(exposures):
-            models = {(each.n_steps, each.start_offset) for each in some}
-            responses: Sequence[InputResponse | None] = [None] * len(some)
-            if len(models) == 1:
-                responses = exposure_model(self.rig.plant, *models.pop()).responses([each.inputs for each in some])
-            measured = [estimator.measure_all(some) for estimator in self.estimators]
-            for k, exposure in enumerate(some):
-                each = zip(self.estimators, measured, strict=True)
-                yield exposure, [estimator.step(exposure, responses[k], own[k]) for estimator, own in each]
-
-
-def run(rig: Rig, exposures: Iterable[Exposure], names: Sequence[str]) -> dict[str, list[Estimate]]:
-    """Estimates of a series of exposures, by the estimators' names."""
-    driver = Driver(rig, names)
-    estimates: dict[str, list[Estimate]] = {name: [] for name in names}
-    for _, each in driver.steps(exposures):
-        for estimate in each:
-            estimates[estimate.estimator].append(estimate)
-    return estimates
-
-
-def _batches(exposures: Iterable[Exposure]) -> Iterator[list[Exposure]]:
-    """Some exposures at a time, a few megabytes of them."""
-    batch: list[Exposure] = []
-    for exposure in exposures:
-        batch.append(exposure)
-        if len(batch) >= min(_AT_ONCE, _NUMBERS_AT_ONCE // (1 + exposure.inputs.size + exposure.pixels.size)):
-            yield batch
-            batch = []
-    if batch:
-        yield batch
 
 
 def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | None:

@@ -14,7 +14,6 @@ of whole steps.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -49,6 +48,13 @@ class InputResponse:
     """b, mean of C A^i weighted with c_i, (axes, n_outputs, n_states)."""
     square: FloatArray
     """s, mean of c squared, (axes, n_outputs)."""
+
+    def of(self, some: slice) -> InputResponse:
+        """That of some of the axes."""
+        return InputResponse(
+            path=self.path[some], end=self.end[some], mean=self.mean[some], slope=self.slope[some],
+            square=self.square[some],
+        )  # fmt: skip
 
 
 class ExposureModel:
@@ -155,11 +161,14 @@ class ExposureModel:
 
     def response(self, inputs: FloatArray) -> InputResponse:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
-        return self.responses([inputs])[0]
+        return self.responses(inputs[None])
 
-    def responses(self, inputs: Sequence[FloatArray]) -> list[InputResponse]:
-        """`response` of many exposures, each to the same bits, for a fraction of the calls."""
-        path, end = input_response(self.plant, np.concatenate([by_axis(self.plant, each) for each in inputs]))
+    def responses(self, inputs: FloatArray) -> InputResponse:
+        """`response` of many exposures, (exposures, n_steps, axes * n_inputs), the axes of one after those of another.
+
+        Each is to the same bits as alone, for a fraction of the calls.
+        """
+        path, end = input_response(self.plant, by_axis(self.plant, inputs))
         mean, square = stacked.mean_over_path(path), stacked.mean_over_path(path * path)
         if self._few is self.plant:
             # Column by column, so that the products lie in memory as they are summed.
@@ -172,12 +181,7 @@ class ExposureModel:
             late = self.moved * self.last_response(end)
             mean, square = mean + late, square + late * late / self.moved
             slope = slope + late[..., None] * self.last_rows
-        end = stacked.batch_last(end)
-        axes = self.plant.axes
-        return [
-            InputResponse(path=path[own], end=end[own], mean=mean[own], slope=slope[own], square=square[own])
-            for own in (slice(k * axes, (k + 1) * axes) for k in range(len(inputs)))
-        ]
+        return InputResponse(path=path, end=stacked.batch_last(end), mean=mean, slope=slope, square=square)
 
     def last_response(self, end: FloatArray) -> FloatArray:
         """c_N, response of the outputs in the step after the last to that of the end state, (axes, n_outputs)."""
@@ -248,10 +252,12 @@ def _made_once(plant: Plant, n_steps: int, offset: float) -> ExposureModel:
 def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:
     """Inputs of the rig as each copy of the plant has them, (k, axes * n_inputs) -> (axes, k, n_inputs).
 
-    What is not a number is taken as zero: it must not poison every estimate that follows.
+    Of several exposures, (exposures, k, axes * n_inputs) -> (exposures * axes, k, n_inputs). What is not a number is
+    taken as zero: it must not poison every estimate that follows.
     """
     finite = np.where(np.isfinite(inputs), inputs, 0.0)
-    return finite.reshape(len(inputs), plant.axes, plant.n_inputs).transpose(1, 0, 2)
+    split = finite.reshape(-1, inputs.shape[-2], plant.axes, plant.n_inputs).transpose(0, 2, 1, 3)
+    return split.reshape(-1, inputs.shape[-2], plant.n_inputs)
 
 
 def path_from_coefficients(

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation import entries, stacked
+from aolink.estimation import entries, stacked, two_states
 from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
-from aolink.estimation.observation import MOST_COVARIANCES, Belief, Correction, Observation
+from aolink.estimation.moments import Measurement
+from aolink.estimation.observation import MOST_COVARIANCES, Belief, Correction, Observation, PathMoments
 from aolink.plant import input_response, lift
 from aolink.rig import Plant
 
@@ -93,6 +94,7 @@ class BlurFilter:
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
+        self._written_out = predict is None and plant.axes == 1 and _is_two_states(plant, observation)
         self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
 
     def bridge(self, inputs: FloatArray) -> None:
@@ -134,6 +136,35 @@ class BlurFilter:
             nis=_numbers(done.nis),
         )
 
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
+        """`step` for exposures without a gap between them, all at once and to the same bits, as far as they can be
+        believed; None where that is none.
+
+        Parameters
+        ----------
+        responses, measured:
+            One row for each exposure.
+        """
+        if not self._written_out or self._missed[0]:
+            return None
+        noise, belief = added_noise(model, self._process_noise), self.belief
+        state, covariance = belief.mean[0], belief.covariance[0]
+        done = two_states.run(
+            model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
+        )
+        count = len(done.nis)
+        if not count:
+            return None
+        self.belief = Belief(done.end[-1], done.end_covariance[-1])
+        settled = None if self._settled_under is model.transition else _SETTLED
+        before = self._unseen
+        mean, covariance, is_settled = two_states.unseen(
+            model, before.mean[0], before.covariance[0], responses.end[:count], settled
+        )
+        self._unseen = Belief(mean[None], covariance[None])
+        self._settled_under = model.transition if is_settled else None
+        return done
+
     def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
         """Carry on what would be believed without a camera; a covariance that has settled is not computed again."""
         before = self._unseen
@@ -167,6 +198,16 @@ class BlurFilter:
             status[~usable] = Status.INPUT_INVALID
             self._missed = np.where(usable, self._missed, missed)
         return _where(refused, prior, after), status
+
+
+def _is_two_states(plant: Plant, observation: Observation[Any] | None) -> bool:
+    """Whether it is what `two_states` has written out."""
+    return (
+        type(observation) is PathMoments
+        and (plant.n_states, plant.n_outputs) == (2, 1)
+        and observation.orders == (1, 2)
+        and observation.gain is None
+    )
 
 
 def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:

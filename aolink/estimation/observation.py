@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from aolink.estimation import entries, stacked
+from aolink.estimation import entries, stacked, two_states
 from aolink.estimation.entries import Entry
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.moments import Measurement
@@ -262,45 +262,16 @@ def _corrected_small(
 
 
 def _corrected_two(prior: Belief, innovation: list[Entry], H: entries.Matrix, R: FloatArray) -> Correction:
-    """`corrected` for two states and two measurements, with the optimal gain.
-
-    With G = H' R^-1 H, (P^-1 + G)^-1 = (P + |P| adj G) |R| / |S|, |S| = |R| (1 + tr PG + |P| |G|): three quarters of
-    the arithmetic of Joseph's form, and as sure to be positive semidefinite, for nothing is subtracted from P.
-    """
-    dot, axes = entries.dot, len(prior.mean)
+    """`corrected` for two states and two measurements, with the optimal gain."""
+    axes = len(prior.mean)
     (p, q), (_, r) = entries.unpack(prior.covariance)
-    (noise, shared), (_, rest) = entries.unpack(R)
-    (f, g), (d, e) = H, innovation
-    together = bool(np.any(shared))
-    share = shared / noise if together else 0.0
-    if together:
-        # The second measurement without what its noise shares with the first's: G is then the sum of two dyads.
-        g = [second - share * first for first, second in zip(f, g, strict=True)]
-        e, rest = e - share * d, rest - share * shared
-    Pf, Pg = ([dot([p, q], h), dot([q, r], h)] for h in (f, g))
-    s, t, both = dot(f, Pf), dot(g, Pg) + rest, dot(f, Pg)
-    # Rounding may make it a little less than zero.
-    determinant: Entry = abs(p * r - q * q)  # type: ignore[assignment] # of either it is its own kind
-    root = f[0] * g[1] - f[1] * g[0]
-    inverse = entries.reciprocal(noise * t + s * rest + determinant * root * root)  # 1 / |S|
-    s = s + noise
-
-    rest_f, noise_g = [rest * each for each in f], [noise * each for each in g]
-    adjoint = [f[1] * rest_f[1] + g[1] * noise_g[1], -f[0] * rest_f[1] - g[0] * noise_g[1]]
-    adjoint.append(f[0] * rest_f[0] + g[0] * noise_g[0])
-    size, determinant = noise * rest * inverse, determinant * inverse
-    p, q, r = (size * old + determinant * each for old, each in zip((p, q, r), adjoint, strict=True))
-
-    # S^-1 and the gain P H' S^-1
-    s_inverse, t_inverse, off = t * inverse, s * inverse, both * inverse
-    gain = [[a * s_inverse - b * off, b * t_inverse - a * off] for a, b in zip(Pf, Pg, strict=True)]
-    mean = [x + dot(row, [d, e]) for x, row in zip(entries.columns(prior.mean), gain, strict=True)]
-    nis = d * (s_inverse * d - 2.0 * (off * e)) + e * (t_inverse * e)
-    if together:
-        both, t = both + share * s, t + share * (2.0 * both + share * s)
-    S = [[s, both], [both, t]]
-    after = Belief(entries.pack_vector(mean, axes), entries.pack([[p, q], [q, r]], axes))
-    return Correction(after, entries.pack_vector(innovation, axes), entries.pack(S, axes), entries.pack_one(nis, axes))
+    (first, shared), (_, rest) = entries.unpack(R)
+    x, v, p, q, r, s, both, t, nis = two_states.corrected(
+        entries.columns(prior.mean), (p, q, r), innovation, H, (first, shared, rest), together=bool(np.any(shared))
+    )
+    after = Belief(entries.pack_vector([x, v], axes), entries.pack([[p, q], [q, r]], axes))
+    S = entries.pack([[s, both], [both, t]], axes)
+    return Correction(after, entries.pack_vector(innovation, axes), S, entries.pack_one(nis, axes))
 
 
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 from google.protobuf.message import DecodeError, Message
@@ -18,6 +20,10 @@ from aolink.wire import messages_pb2 as wire
 RELATIVE = 1e-9
 """Default tolerance: what another machine's arithmetic may change."""
 ABSOLUTE = 1e-12
+_BYTES_KEPT = 32 << 20
+"""Of messages whose counterpart has not come yet; more of them are in a temporary file."""
+_Key = tuple[str, object]
+"""Topic, and what a message is of."""
 
 
 class Difference(NamedTuple):
@@ -56,6 +62,15 @@ class TopicComparison:
     first_added: str = ""
     fields: dict[str, FieldDifference] = field(default_factory=dict)
 
+    def count_alone(self, *, is_first: bool, text: str) -> None:
+        """Count a message that is in one of them only, with what it is called."""
+        if is_first:
+            self.missing += 1
+            self.first_missing = self.first_missing or text
+        else:
+            self.added += 1
+            self.first_added = self.first_added or text
+
     @property
     def same(self) -> bool:
         """Whether nothing differs."""
@@ -83,44 +98,89 @@ def compare(
     only:
         Topics to look at; all if none is given. One that ends with "/" means all that begin with it.
     relative_to_start:
-        Count exposures and fast steps from the first of each recording: those of two sessions of one rig go on.
+        Count exposures and fast steps from the first of each recording, and leave clock times out: those of two
+        sessions of one rig go on.
 
     Raises
     ------
     RecordingError
         Neither recording has any of the topics.
     """
-    result: dict[str, TopicComparison] = {}
-    waiting: dict[tuple[str, object], tuple[bool, Message, int | None]] = {}
     names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, only)}
     if not names:
         asked = f" of {', '.join(only)}" if only else ""
         raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")
-    for number, (is_first, key, message, frame_id) in enumerate(
-        _alternating(first, second, sorted(names), relative_to_start), 1
-    ):
-        topic = key[0]
-        found = result.setdefault(topic, TopicComparison())
-        other = waiting.get(key)
-        if other is None or other[0] == is_first:
-            waiting[key] = (is_first, message, frame_id)
+    result = {name: TopicComparison() for name in sorted(names)}
+    in_both = {name for name in names if name in first.counts and name in second.counts}
+    with _Waiting() as waiting:
+        each = _alternating(first, second, sorted(names), relative_to_start)
+        for number, (is_first, key, message, frame_id) in enumerate(each, 1):
+            found = result[key[0]]
+            if key[0] not in in_both:
+                found.count_alone(is_first=is_first, text=_called(key, frame_id))
+            elif (other := waiting.partner(key, is_first=is_first)) is None:
+                waiting.put(key, message, frame_id, is_first=is_first)
+            else:
+                found.compared += 1
+                pair = (message, other) if is_first else (other, message)
+                if pair[0] != pair[1]:
+                    _compare_messages(found, *pair, frame_id, relative, absolute, times=not relative_to_start)
+            progress(number)
+        for key, is_first, frame_id in waiting.left():
+            result[key[0]].count_alone(is_first=is_first, text=_called(key, frame_id))
+    return result
+
+
+def _called(key: _Key, frame_id: int | None) -> str:
+    return f"frame {frame_id}" if frame_id is not None else str(key[1])
+
+
+class _Waiting:
+    """Messages whose counterpart has not come yet: the first megabytes in memory, what is more in a file."""
+
+    def __init__(self) -> None:
+        self._kept: dict[_Key, tuple[bool, int | None, type[Message], bytes | tuple[int, int]]] = {}
+        self._bytes = 0
+        self._file: IO[bytes] | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def put(self, key: _Key, message: Message, frame_id: int | None, *, is_first: bool) -> None:
+        """Keep a message."""
+        data = message.SerializeToString()
+        place: bytes | tuple[int, int] = data
+        if self._bytes + len(data) > _BYTES_KEPT:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115 # it lives as long as this
+            place = (self._file.seek(0, os.SEEK_END), len(data))
+            self._file.write(data)
         else:
-            del waiting[key]
-            found.compared += 1
-            pair = (message, other[1]) if is_first else (other[1], message)
-            if pair[0] != pair[1]:
-                _compare_messages(found, *pair, frame_id, relative, absolute)
-        progress(number)
-    for (topic, name), (is_first, _, frame_id) in waiting.items():
-        found = result[topic]
-        text = f"frame {frame_id}" if frame_id is not None else str(name)
-        if is_first:
-            found.missing += 1
-            found.first_missing = found.first_missing or text
-        else:
-            found.added += 1
-            found.first_added = found.first_added or text
-    return dict(sorted(result.items()))
+            self._bytes += len(data)
+        self._kept[key] = (is_first, frame_id, type(message), place)
+
+    def partner(self, key: _Key, *, is_first: bool) -> Message | None:
+        """Take out what the other recording has under a name; None if it has not come."""
+        kept = self._kept.get(key)
+        if kept is None or kept[0] == is_first:
+            return None
+        del self._kept[key]
+        _, _, kind, data = kept
+        if isinstance(data, bytes):
+            self._bytes -= len(data)
+            return kind.FromString(data)
+        assert self._file is not None
+        self._file.seek(data[0])
+        return kind.FromString(self._file.read(data[1]))
+
+    def left(self) -> Iterator[tuple[_Key, bool, int | None]]:
+        """What has no counterpart: its name, whether it is in the first recording, its exposure."""
+        for key, (is_first, frame_id, _, _) in self._kept.items():
+            yield key, is_first, frame_id
 
 
 def _is_wanted(topic: str, only: Sequence[str]) -> bool:
@@ -192,9 +252,12 @@ def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[tuple[str,
 
 
 def _compare_messages(
-    found: TopicComparison, a: Message, b: Message, frame_id: int | None, relative: float, absolute: float
-) -> None:
+    found: TopicComparison, a: Message, b: Message, frame_id: int | None, relative: float, absolute: float,
+    *, times: bool,
+) -> None:  # fmt: skip
     for name in sorted({each.name for each in (*a.DESCRIPTOR.fields, *b.DESCRIPTOR.fields)}):
+        if not times and _is_time(name):
+            continue
         x, y = getattr(a, name, None), getattr(b, name, None)
         largest = largest_relative = 0.0
         if isinstance(x, float) or (_is_numbers(x) and _is_numbers(y)):
@@ -210,6 +273,11 @@ def _compare_messages(
         difference.messages += 1
         difference.largest = max(difference.largest, largest)
         difference.largest_relative = max(difference.largest_relative, largest_relative)
+
+
+def _is_time(field: str) -> bool:
+    """Whether a field is a time on some clock, or says how well that is known."""
+    return (field.endswith("_ns") and field != "exposure_offset_ns") or field == "timestamp"
 
 
 def _is_numbers(value: Any) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from aolink.exposure import Exposure, Truth
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
 
+_COUNTS = np.dtype("<u2")
 _MOST_STEPS = 1_000_000
 """Fast steps of an exposure; more is damage, not data."""
 
@@ -62,22 +65,29 @@ def picture_from_float_image(image: RawImage) -> NDArray[np.float32]:
 
 
 def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
-    """Inverse of `frame_messages`. Raises RecordingError for a picture that is not what it says."""
-    size = image.width * image.height
-    if image.encoding != "mono16" or len(image.data) != 2 * size or not _is_exposure(info):
+    """Inverse of `frame_messages`; its arrays are not to be written into, others may have them too.
+
+    Raises RecordingError for a picture that is not what it says.
+    """
+    shape, data = (image.height, image.width), image.data
+    first, last, lost, lengths = info.first_step, info.last_step, info.missing_offset, info.missing_length
+    whole_picture = image.encoding == "mono16" and len(data) == 2 * shape[0] * shape[1]
+    if not (whole_picture and len(lost) == len(lengths) and 0 <= last - first < _MOST_STEPS):
         raise RecordingError(
             f"the picture of frame {info.frame_id} is damaged or not mono16: run `aolink info` on the file"
         )
-    mask = np.ones(size, dtype=bool)
-    for offset, length in zip(info.missing_offset, info.missing_length, strict=True):
-        mask[offset // 2 : (offset + length + 1) // 2] = False
-    shape = (image.height, image.width)
+    mask = _whole(shape)
+    if lost:
+        mask = np.ones(len(data) // 2, dtype=bool)
+        for offset, length in zip(lost, lengths, strict=True):
+            mask[offset // 2 : (offset + length + 1) // 2] = False
+        mask = mask.reshape(shape)
     return Frame(
         frame_id=info.frame_id,
-        first_step=info.first_step,
-        last_step=info.last_step,
-        pixels=np.frombuffer(image.data, dtype="<u2").astype(np.uint16).reshape(shape),
-        mask=mask.reshape(shape),
+        first_step=first,
+        last_step=last,
+        pixels=np.frombuffer(data, _COUNTS).astype(np.uint16, copy=False).reshape(shape),
+        mask=mask,
         chunks_lost=info.chunks_lost,
         frames_lost_before=info.frames_lost_before,
         device_start_ns=info.device_start_ns,
@@ -90,9 +100,12 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
     )
 
 
-def _is_exposure(info: pb.ExposureInfo) -> bool:
-    whole_runs = len(info.missing_offset) == len(info.missing_length)
-    return whole_runs and 0 <= info.last_step - info.first_step < _MOST_STEPS
+@lru_cache(maxsize=8)
+def _whole(shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """The mask of every frame of which nothing is missing."""
+    mask = np.ones(shape, dtype=bool)
+    mask.flags.writeable = False
+    return mask
 
 
 def estimate_message(estimate: Estimate) -> pb.Estimate:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Schema
+from mcap.well_known import MessageEncoding
 
 from aolink.errors import RecordingError
 from aolink.recording import topics
@@ -46,19 +47,24 @@ class RecordingCopy:
 
     def __init__(self, source: Recording, path: Path, notes: dict[str, str]) -> None:
         self.result = Edited(path)
-        self._schemas = source.schemas
+        self._foreign, self._encodings = source.schemas, source.encodings
+        self._schemas: dict[str, Schema] = {}
         self._file = McapFile(path, WriteOptions(), overwrite=True)
         begin_recording(self._file, source.rig, notes, source.start_ns, source.attachments)
 
     def add(self, message: RawMessage) -> None:
-        known = topics.SCHEMAS.get(message.schema)
-        schema = schema_of(known) if known is not None else self._schemas.get(message.schema)
-        if schema is None:
-            schema = Schema(id=0, name=message.schema, encoding="", data=b"")
-        self._schemas = self._schemas | {message.schema: schema}
+        schema = self._schemas.get(message.schema) or self._schema(message.schema)
         self.result.messages += 1
         self.result.exposures += message.topic == topics.EXPOSURE
-        self._file.add(message.topic, schema, message.data, message.log_time_ns, self.result.messages)
+        encoding = self._encodings.get(message.topic, MessageEncoding.Protobuf)
+        self._file.add(message.topic, schema, message.data, message.log_time_ns, self.result.messages, encoding)
+
+    def _schema(self, name: str) -> Schema:
+        """That of this aolink, or of a kind that it does not know the source's."""
+        known = topics.SCHEMAS.get(name)
+        schema = schema_of(known) if known is not None else self._foreign.get(name)
+        self._schemas[name] = schema = schema or Schema(id=0, name=name, encoding="", data=b"")
+        return schema
 
     def finish(self, losses: list[Loss], end: dict[str, str] | None = None) -> Edited:
         """Write the index, and ``end`` as facts from the session's end."""

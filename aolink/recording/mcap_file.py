@@ -25,7 +25,7 @@ COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none"
 class WriteOptions:
     """How a recording is cut into chunks, and when they reach the disk.
 
-    Defaults as measured by ``tools/bench --only recording``: LZ4 keeps the longest single write call under a
+    Defaults as measured by ``tools/bench recording``: LZ4 keeps the longest single write call under a
     millisecond, and a killed process loses no more than twice ``flush_s``.
     """
 
@@ -172,11 +172,14 @@ class McapFile:
         self._writer.add_metadata(name, values)
         self._whole = self.size
 
-    def add(self, topic: str, schema: Schema, data: bytes, log_time_ns: int, sequence: int) -> None:
+    def add(
+        self, topic: str, schema: Schema, data: bytes, log_time_ns: int, sequence: int,
+        encoding: str = MessageEncoding.Protobuf,
+    ) -> None:  # fmt: skip
         """Add a message; the chunk before it goes to the file if it is old enough by the messages' own times."""
         channel = self._channels.get(topic)
         if channel is None:
-            channel = self._channels[topic] = self._register(topic, schema)
+            channel = self._channels[topic] = self._register(topic, schema, encoding)
         if self._chunk_start_ns is None:
             self._chunk_start_ns = log_time_ns
         elif log_time_ns - self._chunk_start_ns >= self._flush_ns:
@@ -184,10 +187,10 @@ class McapFile:
             self._chunk_start_ns = log_time_ns
         self._writer.add_message(channel, log_time_ns, data, log_time_ns, sequence & 0xFFFFFFFF)
 
-    def _register(self, topic: str, schema: Schema) -> int:
+    def _register(self, topic: str, schema: Schema, encoding: str) -> int:
         if schema.name not in self._schemas:
             self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
-        channel = self._writer.register_channel(topic, MessageEncoding.Protobuf, self._schemas[schema.name])
+        channel = self._writer.register_channel(topic, encoding, self._schemas[schema.name])
         # The channel itself is in the chunk. Were that chunk damaged, later ones could not be read: say it twice.
         self._writer.add_metadata(topics.CHANNEL_METADATA, {"id": str(channel), "topic": topic, "schema": schema.name})
         return channel

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import io
-from collections import deque
 from collections.abc import Container, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -17,14 +16,13 @@ from mcap.records import Attachment, Channel, ChunkIndex, McapRecord, Metadata, 
 from mcap.records import Message as McapMessage
 from numpy.typing import NDArray
 
-from aolink.assembly import Assembler
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel
-from aolink.exposure import Exposure, Picture, Truth
+from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
-from aolink.wire import messages_pb2 as wire
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +100,8 @@ class Recording:
         """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
         """By name, as they are in the file."""
+        self.encodings: dict[str, str] = {}
+        """What the messages of a topic are encoded as, where the file says it."""
         self._index: list[ChunkIndex] | None = None
         rig_text = self._survey(check=check)
         if rig_text is None:
@@ -138,12 +138,6 @@ class Recording:
         return not self.damage
 
     @property
-    def foreign(self) -> list[str]:
-        """Topics whose messages are of a kind that aolink does not know."""
-        known = {topic for topic, schema in self._channels.values() if schema in topics.SCHEMAS}
-        return [topic for topic in self.counts if topic not in known]
-
-    @property
     def estimators(self) -> list[str]:
         """Names of the estimators whose results are in the file."""
         return [name.removeprefix(topics.ESTIMATE) for name in self.counts if name.startswith(topics.ESTIMATE)]
@@ -162,15 +156,19 @@ class Recording:
         an index, the rest of the file is not read.
         """
         for raw in self.raw_messages(*wanted, start_ns=start_ns, end_ns=end_ns):
-            kind = topics.SCHEMAS.get(raw.schema)
-            if kind is None:
-                continue
-            try:
-                message = kind.FromString(raw.data)
-            except DecodeError:
-                self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
-                continue
-            yield RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
+            if (message := self.decoded(raw)) is not None:
+                yield RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
+
+    def decoded(self, raw: RawMessage) -> Message | None:
+        """What a message's bytes say; None if aolink does not know its kind, or if it is not of its kind: a loss."""
+        kind = topics.SCHEMAS.get(raw.schema)
+        if kind is None:
+            return None
+        try:
+            return kind.FromString(raw.data)
+        except DecodeError:
+            self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
+            return None
 
     def raw_messages(
         self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None
@@ -190,47 +188,29 @@ class Recording:
         Of ``others`` all topics if none is named, besides those that make exposures. Exposures that were
         still incomplete when the recording ended come last, with None.
         """
-        assembler = Assembler(self.rig)
-        info: schemas_pb2.ExposureInfo | None = None
+        assembly = ExposureAssembly(self.rig)
         for recorded in self.messages(*({*others, *_ASSEMBLED} if others else ())):
-            message, exposures = recorded.message, list[Exposure]()
-            if isinstance(message, wire.CommandBlock):
-                assembler.add_command(message)
-            elif isinstance(message, wire.Applied):
-                exposures = assembler.add_applied(message)
-            elif recorded.topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-                info = message
-            elif recorded.topic == topics.IMAGE and isinstance(message, RawImage) and info is not None:
-                exposures = assembler.add_frame(convert.frame_from_messages(info, message))
-                info = None
-            yield recorded, exposures
-        yield None, assembler.flush()
+            yield recorded, assembly.take(recorded.topic, recorded.message)
+        yield None, assembly.flush()
 
     def exposures(self) -> Iterator[Exposure]:
         """The exposures in order, with their truth and their scene where the file has them."""
-        truths: dict[int, Truth] = {}
-        scenes: dict[int, Picture] = {}
-        kept: list[tuple[str, dict[int, Any]]] = [(topics.TRUTH, truths), (topics.SCENE, scenes)]
-        expected = [found for topic, found in kept if topic in self.counts]
-        waiting: deque[Exposure] = deque()
-        info: schemas_pb2.ExposureInfo | None = None
-        for recorded, exposures in self.assembled(topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE):
-            message = recorded.message if recorded is not None else None
-            if isinstance(message, wire.Truth):
-                truths[message.frame_id] = convert.truth_from_message(message)
-            elif recorded and recorded.topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-                info = message
-            elif recorded and recorded.topic == topics.SCENE and isinstance(message, RawImage) and info is not None:
-                frame = convert.frame_from_messages(info, message)
-                scenes[frame.frame_id], info = Picture(pixels=frame.pixels, mask=frame.mask), None
-            waiting.extend(exposures)
-            # They may come after their exposure, but not after the next one.
-            while waiting and (len(waiting) > 1 or all(waiting[0].frame_id in found for found in expected)):
-                exposure = waiting.popleft()
-                truth, scene = truths.pop(exposure.frame_id, None), scenes.pop(exposure.frame_id, None)
-                yield replace(exposure, truth=truth, scene=scene)
-        for exposure in waiting:
-            yield replace(exposure, truth=truths.get(exposure.frame_id), scene=scenes.get(exposure.frame_id))
+        assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
+        for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE):
+            if (message := self.decoded(raw)) is None:
+                continue
+            if raw.topic in _BESIDE:
+                beside.take(raw.topic, message)
+            elif completed := assembly.take(raw.topic, message):
+                beside.waiting.extend(completed)
+            elif not beside.waiting:
+                continue
+            # What is beside an exposure may come after it, but not after the next one.
+            while beside.has_next:
+                yield beside.next()
+        beside.waiting.extend(assembly.flush())
+        while beside.waiting:
+            yield beside.next()
 
     @property
     def true_scene(self) -> NDArray[np.uint16] | None:
@@ -295,6 +275,7 @@ class Recording:
                 for channel in summary.channels.values():
                     known = summary.schemas.get(channel.schema_id)
                     self._channels[channel.id] = (channel.topic, known.name if known else "")
+                    self.encodings[channel.topic] = channel.message_encoding
                 statistics = summary.statistics
                 for channel_id, count in sorted(statistics.channel_message_counts.items()):
                     if channel_id in self._channels:
@@ -320,6 +301,7 @@ class Recording:
                 if sure or before is None:  # its schema may have been in a chunk that is lost
                     kind = ids.get(record.schema_id, before[1] if before else "")
                     self._channels[record.id] = (record.topic, kind)
+                    self.encodings[record.topic] = record.message_encoding
             else:
                 self._note(record, rig_texts)
         self.start_ns = first_ns or 0
@@ -392,3 +374,4 @@ def _scene_shape(rig: Rig) -> tuple[int, int]:
 
 
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
+_BESIDE = (topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE)

@@ -13,9 +13,15 @@ from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.editing import RecordingCopy
+from aolink.recording.exposures import ExposureAssembly
 from aolink.recording.mcap_file import replacing
-from aolink.recording.reader import Recording
-from aolink.recording.writer import RecordingWriter
+from aolink.recording.reader import RawMessage, Recording
+
+_AT_ONCE = 512
+"""Exposures that are estimated together, ..."""
+_BYTES_AT_ONCE = 4 << 20
+"""... and bytes of messages that wait for them."""
 
 
 def reestimate(
@@ -95,42 +101,68 @@ def write_reestimated(
 ) -> None:
     """Copy a recording with new estimates in the place of those that it has.
 
-    The same recording and the same version of aolink give the same bytes.
+    Messages of other software come along as they are. The same recording and the same version of aolink give the
+    same bytes.
 
     Raises
     ------
     RecordingError
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
-    driver, done = Driver(recording.rig, names, engine), 0
-    metadata = recording.metadata | {
+    notes = recording.metadata | {
         "aolink_version": version("aolink"),
         "estimators": " ".join(names),
         "estimated_from": recording.path.name,
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
     if engine != "aolink":
-        metadata["engine"] = engine
-    with (
-        replacing(Path(path), [recording.path], overwrite=overwrite) as partial,
-        RecordingWriter(
-            partial, recording.rig, metadata, recording.start_ns, overwrite=True, deterministic=True,
-            attachments=recording.attachments,
-        ) as writer,
-    ):  # fmt: skip
-        last_ns = recording.start_ns
-        for recorded, exposures in recording.assembled():
-            if recorded is not None and not recorded.topic.startswith((topics.ESTIMATE, topics.RESTORED)):
-                writer.write(recorded.topic, recorded.message, recorded.log_time_ns)
-                last_ns = recorded.log_time_ns
-            for exposure in exposures:
-                for estimate in driver.step(exposure):
-                    message = convert.estimate_message(estimate)
-                    writer.write(topics.estimate_topic(estimate.estimator), message, last_ns)
-                done += 1
-                progress(done)
-        if recording.damage:
-            writer.close({"damage": recording.damage})
+        notes["engine"] = engine
+    with replacing(Path(path), [recording.path], overwrite=overwrite) as partial:
+        copy = RecordingCopy(recording, partial, notes)
+        try:
+            done = 0
+            for some in _with_estimates(recording, Driver(recording.rig, names, engine)):
+                copy.add(some)
+                if done < copy.result.exposures:
+                    progress(done := copy.result.exposures)
+            copy.finish(recording.losses)
+        except BaseException:
+            copy.give_up()
+            raise
+
+
+def _with_estimates(recording: Recording, driver: Driver) -> Iterator[RawMessage]:
+    """The messages of a recording, without estimates and restored pictures, and new estimates after their exposures."""
+    assembly = ExposureAssembly(recording.rig)
+    waiting: list[tuple[RawMessage, list[Exposure]]] = []
+    exposures = size = 0
+    for raw in recording.raw_messages():
+        if raw.topic.startswith((topics.ESTIMATE, topics.RESTORED)):
+            continue
+        message = recording.decoded(raw)
+        if message is None and raw.schema in topics.SCHEMAS:
+            continue  # it is among the losses
+        completed = assembly.take(raw.topic, message) if message is not None else []
+        waiting.append((raw, completed))
+        exposures, size = exposures + len(completed), size + len(raw.data)
+        if exposures >= _AT_ONCE or size >= _BYTES_AT_ONCE:
+            yield from _estimated(driver, waiting)
+            waiting, exposures, size = [], 0, 0
+    if waiting:
+        waiting[-1][1].extend(assembly.flush())
+        yield from _estimated(driver, waiting)
+
+
+def _estimated(driver: Driver, messages: Sequence[tuple[RawMessage, list[Exposure]]]) -> Iterator[RawMessage]:
+    """Messages, and estimates of the exposures that each completes; none of these is made before the one before it."""
+    made = driver.steps(exposure for _, completed in messages for exposure in completed)
+    for raw, completed in messages:
+        yield raw
+        for _ in completed:
+            for estimate in next(made)[1]:
+                message = convert.estimate_message(estimate)
+                topic, kind = topics.estimate_topic(estimate.estimator), message.DESCRIPTOR.full_name
+                yield RawMessage(topic, kind, raw.log_time_ns, 0, message.SerializeToString(deterministic=True))
 
 
 def first_difference(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> str | None:

@@ -1,15 +1,14 @@
-"""Reads an MCAP file record by record, and finds its way again where the file is damaged.
+"""Reads an MCAP file record by record, as far as it is whole.
 
 A recording is a sequence of records, [opcode u8 | length u64 | content]; messages are in chunks, which
-have a checksum each. Damage costs the chunk that it is in: where a length is damaged, the scan goes on at
-the next bytes that can only be a chunk or the end of the data. Nothing in the file is believed about
-sizes, so a hostile file costs no memory, and no more time than a few readings of it.
+have a checksum each. Damage costs the chunk that it is in: where a length is damaged, the scan goes on where
+`aolink.recording.search` finds the next record. Nothing in the file is believed about sizes, so a hostile file
+costs no memory, and no more time than a few readings of it.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import stat
 import struct
 import zlib
@@ -41,25 +40,14 @@ from mcap.records import (
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
+from aolink.recording.search import HEAD, MAX_RECORD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
 
-MAX_RECORD = 256 << 20
-"""Bytes; a larger record is damage, not data."""
 MAX_CHUNK = 128 << 20
 """Bytes without compression: the largest that is written, 64 MiB, and the message that it ends with."""
 _MOST_READINGS = 4
 """How many times the file's size is read, at most, of records that turn out to be none."""
 _MAGIC = b"\x89MCAP0\r\n"
-_HEAD = struct.Struct("<BQ")
-_CHUNK_HEAD = struct.Struct("<QQQII")
-"""First and last log time, size and CRC without compression, length of the compression's name."""
-_FOOTER_BYTES = _HEAD.size + 20 + len(_MAGIC)
-_SEARCH_BYTES = 1 << 20
-_LOOK_BYTES = 320
-"""Of a record's first bytes; the name of metadata of ours is shorter than 256."""
-_BEFORE_INDEX = (Opcode.CHUNK, Opcode.MESSAGE_INDEX)
-_COMPRESSIONS = (b"lz4", b"zstd", b"")
-_CANDIDATE = re.compile(rb"[\x06\x0f].{4}\x00{4}|\x0c.{4}\x00{4}.\x00{3}aolink", re.DOTALL)
-"""A chunk (6), the end of the data (15) or metadata of ours (12), with a length below 4 GiB."""
+_FOOTER_BYTES = HEAD.size + 20 + len(_MAGIC)
 
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.HEADER: Header.read,
@@ -75,14 +63,9 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.FOOTER: Footer.read,
 }
 """What is looked into; message indexes and other records are stepped over."""
-_MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""Channel, sequence, log time and publish time."""
-_LENGTHS: dict[int, int] = {Opcode.FOOTER: 20, Opcode.SUMMARY_OFFSET: 17, Opcode.DATA_END: 4}
-"""Content that is of one length always."""
-_KNOWN = {*_PARSERS, *_LENGTHS, Opcode.MESSAGE}
 
 # What the mcap library and the decompressors raise on content that is damaged.
-_DAMAGE = (McapError, struct.error, RuntimeError, ValueError, EOFError, KeyError, zstandard.ZstdError)
+_DAMAGE = (McapError, struct.error, RuntimeError, ValueError, OverflowError, EOFError, KeyError, zstandard.ZstdError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +127,7 @@ def open_recording(path: Path) -> IO[bytes]:
         if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
             raise RecordingError(f"{path} is a pipe or a device: a recording must be a file, copy it into one")
         file = path.open("rb")
-        head = file.read(len(_MAGIC) + _HEAD.size)
+        head = file.read(len(_MAGIC) + HEAD.size)
     except OSError as error:
         raise RecordingError(f"cannot read {path}: {os.strerror(error.errno or 0).lower()}") from None
     if len(head) < len(_MAGIC):
@@ -167,8 +150,8 @@ def read_summary(file: IO[bytes]) -> Summary | None:
         return None
     file.seek(size - _FOOTER_BYTES)
     tail = file.read(_FOOTER_BYTES)
-    opcode, length = _HEAD.unpack_from(tail)
-    start, _, crc = struct.unpack_from("<QQI", tail, _HEAD.size)
+    opcode, length = HEAD.unpack_from(tail)
+    start, _, crc = struct.unpack_from("<QQI", tail, HEAD.size)
     end = size - _FOOTER_BYTES
     if not tail.endswith(_MAGIC) or (opcode, length) != (Opcode.FOOTER, 20) or start > end:
         return None
@@ -177,7 +160,7 @@ def read_summary(file: IO[bytes]) -> Summary | None:
         return None
     file.seek(start)
     data = file.read(end - start)
-    if crc and zlib.crc32(tail[: _HEAD.size + 16], zlib.crc32(data)) != crc:
+    if crc and zlib.crc32(tail[: HEAD.size + 16], zlib.crc32(data)) != crc:
         return None
     return _parse_summary(data)
 
@@ -188,8 +171,8 @@ def _parse_summary(data: bytes) -> Summary | None:
     position = 0
     try:
         while position < len(data):
-            opcode, length = _HEAD.unpack_from(data, position)
-            position += _HEAD.size
+            opcode, length = HEAD.unpack_from(data, position)
+            position += HEAD.size
             if opcode in _PARSERS:
                 records.append(_PARSERS[opcode](ReadDataStream(BytesIO(data[position : position + length]))))
             position += length
@@ -220,16 +203,16 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
     if file.read(len(_MAGIC)) != _MAGIC:
         on_loss(Loss(0, len(_MAGIC), "the first bytes are damaged"))
     position = len(_MAGIC)
-    search, before = _Search(file, size), 0
+    search, before = Search(file, size), 0
     whole_end: bool | None = None
     readings = _MOST_READINGS * size
     while position < size:
         file.seek(position)
-        head = file.read(_HEAD.size)
-        length = _HEAD.unpack(head)[1] if len(head) == _HEAD.size else 0
-        end = position + _HEAD.size + length
-        if len(head) < _HEAD.size or end > size or not _is_plausible(head[0], length, file, before):
-            found = end if _begins_a_record(file, end, size) else search.next(position + 1)
+        head = file.read(HEAD.size)
+        length = HEAD.unpack(head)[1] if len(head) == HEAD.size else 0
+        end = position + HEAD.size + length
+        if len(head) < HEAD.size or end > size or not is_plausible(head[0], length, file, before):
+            found = end if begins_a_record(file, end, size) else search.next(position + 1)
             if found is None:
                 what = f"it was cut off: it ends at byte {size}, in the middle of a record"
                 on_loss(Loss(position, size - position, what))
@@ -265,8 +248,8 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
 def chunk_at(file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None]) -> Iterator[McapRecord]:
     """What is in a chunk that the summary names; nothing if it is damaged."""
     file.seek(index.chunk_start_offset)
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size or head[0] != Opcode.CHUNK or _HEAD.unpack(head)[1] > MAX_RECORD:
+    head = file.read(HEAD.size)
+    if len(head) < HEAD.size or head[0] != Opcode.CHUNK or HEAD.unpack(head)[1] > MAX_RECORD:
         on_loss(_chunk_loss(index.chunk_start_offset, index.chunk_length, index))
         return
     record = _record_at(file, index.chunk_start_offset, on_loss)
@@ -277,8 +260,8 @@ def chunk_at(file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None]
 def record_at(file: IO[bytes], offset: int) -> McapRecord | None:
     """A record that the summary names; None if it is damaged."""
     file.seek(offset)
-    head = file.read(_HEAD.size)
-    if len(head) < _HEAD.size or _HEAD.unpack(head)[1] > MAX_RECORD:
+    head = file.read(HEAD.size)
+    if len(head) < HEAD.size or HEAD.unpack(head)[1] > MAX_RECORD:
         return None
     return _record_at(file, offset, lambda loss: None)
 
@@ -292,10 +275,10 @@ def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None]) -> Ite
         for opcode, at, length in _heads(data):
             if opcode != Opcode.MESSAGE:
                 _parsed(opcode, data[at : at + length])
-            elif length < _MESSAGE_HEAD.size:
+            elif length < MESSAGE_HEAD.size:
                 raise ValueError("a message without its times")
     except _DAMAGE:
-        on_loss(_chunk_loss(offset, _HEAD.size + len(chunk.data), chunk))
+        on_loss(_chunk_loss(offset, HEAD.size + len(chunk.data), chunk))
         return
     for opcode, at, length in _heads(data):
         yield _parsed(opcode, data[at : at + length])
@@ -305,8 +288,8 @@ def _heads(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Opcode, first byte and length of the content of each record of a chunk that is looked into."""
     position = 0
     while position < len(data):
-        opcode, length = _HEAD.unpack_from(data, position)
-        position += _HEAD.size
+        opcode, length = HEAD.unpack_from(data, position)
+        position += HEAD.size
         if length > len(data) - position:
             raise ValueError("a record that goes beyond its chunk")
         if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
@@ -317,8 +300,8 @@ def _heads(data: bytes) -> Iterator[tuple[int, int, int]]:
 def _parsed(opcode: int, content: bytes) -> McapRecord:
     """A record; raises one of `_DAMAGE` if its content is not of its kind and length."""
     if opcode == Opcode.MESSAGE:
-        channel, sequence, log_time, publish_time = _MESSAGE_HEAD.unpack_from(content)
-        return McapMessage(channel, log_time, content[_MESSAGE_HEAD.size :], publish_time, sequence)
+        channel, sequence, log_time, publish_time = MESSAGE_HEAD.unpack_from(content)
+        return McapMessage(channel, log_time, content[MESSAGE_HEAD.size :], publish_time, sequence)
     stream = ReadDataStream(BytesIO(content))
     record = _PARSERS[opcode](stream)
     if stream.count != len(content):
@@ -335,7 +318,7 @@ def _chunk_loss(offset: int, length: int, chunk: Chunk | ChunkIndex) -> Loss:
 def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> McapRecord | None:
     """The record at a position, whose length is known to be possible; None if it is damaged or of no interest."""
     file.seek(position)
-    opcode, length = _HEAD.unpack(file.read(_HEAD.size))
+    opcode, length = HEAD.unpack(file.read(HEAD.size))
     if opcode not in _PARSERS and opcode != Opcode.MESSAGE:
         return None
     content = file.read(length)
@@ -345,87 +328,9 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
             raise ValueError("checksum")
     except _DAMAGE:
         kind = Opcode(opcode).name.lower().replace("_", " ")
-        on_loss(Loss(position, _HEAD.size + length, f"the {kind} at byte {position} is damaged"))
+        on_loss(Loss(position, HEAD.size + length, f"the {kind} at byte {position} is damaged"))
         return None
     return record
-
-
-def _is_plausible(opcode: int, length: int, file: IO[bytes], before: int) -> bool:
-    """Whether a record can be what it says, behind one of the kind ``before`` (0: not known).
-
-    One flipped bit makes a chunk another kind, which would be skipped, or an index of messages a message.
-    """
-    if opcode == Opcode.MESSAGE_INDEX or (opcode == Opcode.MESSAGE and before in _BEFORE_INDEX):
-        rest = file.read(6)
-        is_index = len(rest) == 6 and length == 6 + struct.unpack_from("<I", rest, 2)[0]
-        return is_index is (opcode == Opcode.MESSAGE_INDEX)
-    if opcode == Opcode.MESSAGE:
-        return _MESSAGE_HEAD.size <= length <= MAX_RECORD
-    return opcode in _KNOWN and length <= MAX_RECORD and _LENGTHS.get(opcode, length) == length
-
-
-def _begins_a_record(file: IO[bytes], position: int, size: int) -> bool:
-    """Whether what stands at a position can be the next record: only its kind is damaged then, not its length."""
-    file.seek(min(position, size))
-    head = file.read(_HEAD.size)
-    return len(head) == _HEAD.size and _is_plausible(head[0], _HEAD.unpack(head)[1], file, 0)
-
-
-class _Search:
-    """Looks through a file from its start to its end for what can be a record, once."""
-
-    def __init__(self, file: IO[bytes], size: int) -> None:
-        self._file, self._size = file, size
-        self._start, self._data = 0, b""
-
-    def next(self, position: int, before: int | None = None) -> int | None:
-        """Where the next whole chunk, metadata or the end of the data begins; None if not ``before`` a byte.
-
-        Positions are asked for in ascending order.
-        """
-        before = self._size if before is None else before
-        while position < before:
-            if position + _LOOK_BYTES > self._start + len(self._data) and self._start + len(self._data) < self._size:
-                self._file.seek(position)
-                self._start, self._data = position, self._file.read(_SEARCH_BYTES)
-            match = _CANDIDATE.search(self._data, position - self._start)
-            at = self._start + (match.start() if match else len(self._data))
-            if match is None or at + _LOOK_BYTES > self._start + len(self._data) < self._size:
-                # Not here, or too near the edge to be looked at.
-                position = max(position + 1, min(at, self._start + len(self._data) - _LOOK_BYTES))
-                if self._start + len(self._data) >= self._size:
-                    return None
-            elif at >= before:
-                return None
-            elif self._is_record(at):
-                return at
-            else:
-                position = at + 1
-        return None
-
-    def _is_record(self, position: int) -> bool:
-        """Whether the bytes there can be what they say."""
-        data = self._data[position - self._start :][:_LOOK_BYTES]
-        opcode, length = _HEAD.unpack_from(data)
-        if position + _HEAD.size + length > self._size or length > MAX_RECORD:
-            return False
-        if opcode == Opcode.METADATA:
-            (name_length,) = struct.unpack_from("<I", data, _HEAD.size)
-            at = _HEAD.size + 4 + name_length
-            return len(data) >= at + 4 and bool(length == 4 + name_length + 4 + struct.unpack_from("<I", data, at)[0])
-        return bool(length == 4) if opcode == Opcode.DATA_END else _is_chunk_head(data, length)
-
-
-def _is_chunk_head(data: bytes, length: int) -> bool:
-    """Whether these are the first bytes of a chunk of this length: its fields must agree with each other."""
-    if len(data) < _HEAD.size + _CHUNK_HEAD.size + 12:
-        return False
-    start, end, _, _, name_length = _CHUNK_HEAD.unpack_from(data, _HEAD.size)
-    at = _HEAD.size + _CHUNK_HEAD.size
-    if start > end or name_length > 4 or data[at : at + name_length] not in _COMPRESSIONS:
-        return False
-    (held,) = struct.unpack_from("<Q", data, at + name_length)
-    return bool(length == _CHUNK_HEAD.size + name_length + 8 + held)
 
 
 def _decompressed(chunk: Chunk) -> bytes:

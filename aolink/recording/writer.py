@@ -35,6 +35,10 @@ _POLL_S = 0.005
 """How often the thread looks for what is queued: woken for each message, it would cost more than the writing."""
 _STALL_S = 5.0
 """A disk that takes longer over one write stops the session."""
+_LOOK_BYTES = 16 << 10
+"""Bytes that go to the file between two looks at the clock: it tells of a stalled disk, and when to synchronise."""
+_MESSAGE_BYTES = 64
+"""What a message is on top of its data, at least."""
 _LARGEST_BASIS = 32 << 20
 """Bytes of an exposure basis that are kept whole."""
 
@@ -139,15 +143,23 @@ class RecordingWriter:
         """Record a message. Raises RecordingError if the file can no longer be written."""
         if self._error:
             raise self._error
-        data = message.SerializeToString(deterministic=True)
-        while self._is_stalled() or self._put_bytes - self._taken_bytes > _QUEUE_BYTES:
+        data = message.SerializeToString()  # fields by their numbers: without maps always the same bytes
+        since = self._busy_since  # `_is_stalled`, for less: most messages come this way
+        if (since is not None and time.monotonic() - since > _STALL_S) or self._is_full():
+            self._wait_for_room()
+        self._put_bytes += len(data)
+        self._queue.append((topic, message, data, log_time_ns))
+
+    def _wait_for_room(self) -> None:
+        while self._is_stalled() or self._is_full():
             if self._error:
                 raise self._error
             if self._is_stalled() or not self._deterministic:  # who has time to wait, waits
                 raise RecordingError(f"the disk of {self.path} is too slow for this session: record to a faster one")
             time.sleep(0.01)
-        self._put_bytes += len(data)
-        self._queue.append((topic, message, data, log_time_ns))
+
+    def _is_full(self) -> bool:
+        return self._put_bytes - self._taken_bytes > _QUEUE_BYTES
 
     def _is_stalled(self) -> bool:
         since = self._busy_since
@@ -210,9 +222,7 @@ class RecordingWriter:
             self._busy_since = now = time.monotonic()
             try:
                 while self._queue:
-                    item = self._queue.popleft()
-                    self._add(*item)
-                    self._taken_bytes += len(item[2])
+                    self._write_some()
                     self._busy_since = last_write = time.monotonic()
                     if not self._deterministic and last_write - last_sync > options.fsync_s:
                         self._file.flush()
@@ -234,18 +244,29 @@ class RecordingWriter:
                 self._busy_since = None
             self._ending.wait(_POLL_S)
 
-    def _add(self, topic: str, message: Message, data: bytes, log_time_ns: int) -> None:
-        if self._lead is not None:
-            if topic == topics.EXPOSURE and self._part_is_full(log_time_ns):
-                self._finish({"ended": "goes on in the next part"})
-                self._begin(log_time_ns)
-                for lead_topic, each, time_ns, sequence in self._lead.messages():
-                    lead_data = each.SerializeToString(deterministic=True)
-                    self._file.add(lead_topic, self._schema(type(each)), lead_data, time_ns, sequence)
-            self._lead.add(topic, message, log_time_ns, self._sequence + 1)
-        # Streams may share a log time: the sequence is the order.
-        self._sequence += 1
-        self._file.add(topic, self._schema(type(message)), data, log_time_ns, self._sequence)
+    def _write_some(self) -> None:
+        """Add what is queued to the file, up to where the clock is to be looked at."""
+        queue, schemas, taken = self._queue, self._schemas, 0
+        while queue and taken < _LOOK_BYTES:
+            topic, message, data, log_time_ns = queue.popleft()
+            if self._lead is not None:
+                self._lead_in(self._lead, topic, message, log_time_ns)
+            # Streams may share a log time: the sequence is the order.
+            self._sequence += 1
+            schema = schemas.get(type(message)) or self._schema(type(message))
+            self._file.add(topic, schema, data, log_time_ns, self._sequence)
+            taken += _MESSAGE_BYTES + len(data)
+            self._taken_bytes += len(data)
+
+    def _lead_in(self, lead: Lead, topic: str, message: Message, log_time_ns: int) -> None:
+        """Begin the next part if this one is full, with what it needs of this; keep what the one after may need."""
+        if topic == topics.EXPOSURE and self._part_is_full(log_time_ns):
+            self._finish({"ended": "goes on in the next part"})
+            self._begin(log_time_ns)
+            for lead_topic, each, time_ns, sequence in lead.messages():
+                lead_data = each.SerializeToString()
+                self._file.add(lead_topic, self._schema(type(each)), lead_data, time_ns, sequence)
+        lead.add(topic, message, log_time_ns, self._sequence + 1)
 
     def _part_is_full(self, now_ns: int) -> bool:
         size, seconds = self._options.split_bytes, self._options.split_s

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -223,6 +224,12 @@ def _visible(exposures: Sequence[Exposure], j: int) -> list[tuple[int, int]]:
     return [(k, row) for k, row in rows if 0 <= row < HISTORY]
 
 
+@lru_cache(maxsize=8)
+def _points_in_row(n_steps: int) -> NDArray[np.int64]:
+    """Which steps of a path are drawn in its row of the history."""
+    return np.unique(np.linspace(0, n_steps - 1, min(_POINTS_IN_ROW, n_steps)).astype(np.int64))
+
+
 def _log_history_path(
     stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
     by_frame: Mapping[int, FloatArray], shown: range,
@@ -230,7 +237,7 @@ def _log_history_path(
     drawn: dict[int, NDArray[np.float32]] = {}
     for k, exposure in enumerate(exposures):
         if (path := by_frame.get(exposure.frame_id)) is not None:
-            some = np.unique(np.linspace(0, len(path) - 1, min(_POINTS_IN_ROW, len(path))).astype(int))
+            some = _points_in_row(len(path))
             x = np.clip((path[some] - sensor.field[0]) / sensor.pixel_width, 0, sensor.pixels)
             drawn[k] = np.stack([x, (some + 0.5) / len(path)], axis=1).astype(np.float32)
     strips = [
@@ -262,7 +269,8 @@ def _send_strips(
     if not flat:
         return
     stream.log(path, rr.LineStrips2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius)), static=True)
-    columns = rr.LineStrips2D.columns(strips=flat).partition([len(group) for group in strips])
+    alike = len({strip.shape for strip in flat}) == 1  # as one array it is packed at once, not strip by strip
+    columns = rr.LineStrips2D.columns(strips=np.array(flat) if alike else flat).partition([len(g) for g in strips])
     _send_at_starts(stream, path, timebase, exposures, columns)
 
 

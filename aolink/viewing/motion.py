@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from aolink.estimation.estimate import Estimate
 from aolink.exposure import Exposure, Truth
@@ -101,10 +102,12 @@ def log_errors(
         send_axes(stream, f"error/end/x{i + 1}/{name}", ends, column, style)
 
 
+@lru_cache(maxsize=64)
 def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
     """Between which a consistent estimator's NIS lies in `NIS_COVERAGE` of the exposures (two-sided)."""
     tail = (1 - NIS_COVERAGE) / 2
-    return float(stats.chi2.ppf(tail, degrees_of_freedom)), float(stats.chi2.ppf(1 - tail, degrees_of_freedom))
+    low, high = 2 * special.gammaincinv(degrees_of_freedom / 2, [tail, 1 - tail])  # of chi-square
+    return float(low), float(high)
 
 
 def _log_nis(stream: rr.RecordingStream, timebase: Timebase, estimates: Sequence[Estimate]) -> None:

@@ -17,8 +17,9 @@ from aolink.estimation import (
     score,
 )
 from aolink.estimation.estimate import COMPARED
-from aolink.estimation.estimators import Options, measure
+from aolink.estimation.measuring import measure
 from aolink.estimation.observation import PathMoments
+from aolink.estimation.options import Options
 from aolink.plant import lift
 from aolink.recording.reestimate import first_difference
 from aolink.rig import load_rig
@@ -347,6 +348,8 @@ def test_it_does_not_matter_how_many_exposures_are_handed_over_at_once(name, flu
     some[3] = dataclasses.replace(some[3], pixels=dark)
     some[5] = dataclasses.replace(some[5], mask=mask)
     some[6] = dataclasses.replace(some[6], pixels=np.full(rig.sensor.shape, rig.sensor.full_scale, np.uint16))
+    some[9] = dataclasses.replace(some[9], pixels=np.roll(some[9].pixels, some[9].pixels.shape[1] // 2, axis=1))
+    some[11] = dataclasses.replace(some[11], lead_inputs=some[10].inputs[:7], first_step=some[11].first_step + 7)
     some[12] = dataclasses.replace(some[12], n_steps=150, inputs=some[12].inputs[:150])
     names = ("o1", "o3", "moments")
     one_by_one, seven, at_once = Driver(rig, names), Driver(rig, names), Driver(rig, names)
@@ -358,3 +361,21 @@ def test_it_does_not_matter_how_many_exposures_are_handed_over_at_once(name, flu
         expected = one_by_one.step(exposure)
         assert first_difference(expected, ours) is None
         assert first_difference(expected, theirs[1]) is None
+
+
+def test_the_loop_over_numbers_is_the_filter_in_arrays():
+    """Bit for bit, with exposures that are refused, one that is not a number, and a gap."""
+    rig = load_rig("section-vi-lively")
+    some = list(simulate(rig, 60, seed=5))
+    for k in (20, 40, 41, 42, 43):
+        some[k] = dataclasses.replace(some[k], pixels=some[k - 7].pixels[:, ::-1].copy())
+    some[30] = dataclasses.replace(some[30], inputs=np.full_like(some[30].inputs, np.nan))
+    some[50:] = [dataclasses.replace(each, first_step=each.first_step + 9) for each in some[50:]]
+    written, arrays = Driver(rig, ["o3"]), Driver(rig, ["o3"])
+    arrays.estimators[0]._filter._written_out = False
+    ours, theirs = ([each for _, (each,) in driver.steps(some)] for driver in (written, arrays))
+    assert first_difference(ours, theirs) is None
+    assert {each.status for each in ours} >= {Status.OK, Status.GATED}
+    np.testing.assert_array_equal(
+        written.estimators[0]._filter._unseen.covariance, arrays.estimators[0]._filter._unseen.covariance
+    )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation import exposure_model, make_estimator, pixels
-from aolink.estimation.estimators import measure
+from aolink.estimation.measuring import measure
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import WindowedMoments
 from aolink.estimation.windowed_spots import WindowedSpots

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from aolink.estimation import Status, exposure_model, make_estimator, pixels, profile, run, score
-from aolink.estimation.estimators import measure
 from aolink.estimation.hypotheses import cholesky, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
 from aolink.estimation.importance import importance_corrected
+from aolink.estimation.measuring import measure
 from aolink.estimation.mixture import MixtureUpdates, explored
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import Profile, WindowedMoments

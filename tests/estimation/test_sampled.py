@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from aolink.estimation import exposure_model, make_estimator, pixels
-from aolink.estimation.estimators import measure
 from aolink.estimation.hypotheses import single
+from aolink.estimation.measuring import measure
 from aolink.estimation.observation import Belief, corrected
 from aolink.estimation.sampled import SampledUpdates, fitted
 from aolink.estimation.windowed import Profile, WindowedMoments

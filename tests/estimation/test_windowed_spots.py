@@ -8,7 +8,7 @@ import pytest
 from scipy import linalg
 
 from aolink.estimation import Status, exposure_model, make_estimator, run, score, windowed
-from aolink.estimation.estimators import measure
+from aolink.estimation.measuring import measure
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import _nodes
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots

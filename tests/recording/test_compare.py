@@ -6,8 +6,10 @@ import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pytest
 from google.protobuf.message import Message
 from hypothesis import given
 from hypothesis import strategies as st
@@ -139,9 +141,53 @@ def test_messages_of_unknown_kinds_are_compared_as_bytes(recorded: Session, tmp_
         file.add("/mine", Schema(id=0, name="mine.Own", encoding="protobuf", data=b""), data, 1, 1)
         file.finish()
     one, two = Recording(tmp_path / "a.mcap"), Recording(tmp_path / "b.mcap")
-    assert one.foreign == ["/mine"]
+    assert one.counts == {"/mine": 1}
     assert compare(one, one)["/mine"].same
     assert compare(one, two)["/mine"].fields["value"].messages == 1
+
+
+def test_what_does_not_fit_into_memory_waits_in_a_file(
+    recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames of one recording are far behind those of the other; the same is found as with much memory."""
+    one = Recording(recorded.path)
+    with RecordingWriter(tmp_path / "b.mcap", one.rig, {}, one.start_ns, deterministic=True) as writer:
+        for kept in (False, True):
+            for each in one.messages():
+                if (each.topic == topics.IMAGE) is kept and not each.topic.startswith(topics.ESTIMATE):
+                    writer.write(each.topic, each.message, each.log_time_ns)
+    two = Recording(tmp_path / "b.mcap")
+    put, peak = module._Waiting.put, []
+
+    def watched(self: module._Waiting, *args: Any, **kwargs: Any) -> None:
+        put(self, *args, **kwargs)
+        peak.append((self._bytes, len(self._kept)))
+
+    monkeypatch.setattr(module._Waiting, "put", watched)
+    expected = compare(one, two)
+    most, entries = max(peak)
+    monkeypatch.setattr(module, "_BYTES_KEPT", most // 10)
+    peak.clear()
+    assert compare(one, two) == expected
+    assert 0 < max(peak)[0] <= most // 10
+    # What one of them alone has is counted, not kept.
+    assert expected["/estimate/o3"].missing == one.counts["/estimate/o3"]
+    assert entries <= sum(two.counts.values())
+
+
+def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tmp_path: Path) -> None:
+    def change(topic: str, message: Message) -> list[Message]:
+        for name in ("device_ns", "device_start_ns", "host_start_ns"):
+            if hasattr(message, name):
+                setattr(message, name, getattr(message, name) + 12345)
+        if topic == topics.IMAGE:
+            message.timestamp.nanos += 1  # type: ignore[attr-defined]
+        return [message]
+
+    one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
+    assert {*compare(one, two)[topics.EXPOSURE].fields} == {"device_start_ns", "host_start_ns"}
+    assert {*compare(one, two)[topics.IMAGE].fields} == {"timestamp"}
+    assert all(each.same for each in compare(one, two, relative_to_start=True).values())
 
 
 def test_accept_is_refused_where_it_would_replace_more(aolink: Run, recorded: Session, tmp_path: Path) -> None:

@@ -133,6 +133,20 @@ def test_garbage_anywhere_is_one_error_or_less_to_read(
             recording.estimates(name)
 
 
+@pytest.mark.parametrize("length", [1 << 63, (1 << 64) - 1])
+def test_a_chunk_that_says_it_holds_more_than_can_be_costs_itself(
+    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path, length: int
+) -> None:
+    data, chunks = bytearray(many_chunks[0]), many_chunks[1]
+    start = chunks[2][0]
+    held = start + 9 + 32 + data[start + 9 + 28]  # behind the name of the compression
+    data[held : held + 8] = length.to_bytes(8, "little")
+    (path := tmp_path / "a.mcap").write_bytes(data)
+    whole = set().union(*(m for k, m in enumerate(by_chunk(many_chunks[0], chunks)) if k != 2))
+    assert sequences(path) == whole
+    assert len(Recording(path, check=True).losses) == 1
+
+
 def test_a_file_of_another_kind_with_private_records_is_refused_with_one_error(tmp_path: Path) -> None:
     with (path := tmp_path / "foreign.mcap").open("wb") as file:
         writer = Writer(file)

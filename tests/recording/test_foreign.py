@@ -9,10 +9,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from mcap.records import Schema
 
+from aolink.recording import topics
 from aolink.recording.compare import compare
+from aolink.recording.editing import cut
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import reestimate, write_reestimated
+from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
+from aolink.recording.writer import begin_recording
 from tests.conftest import Session
 
 ROOT = Path(__file__).parents[2]
@@ -33,6 +38,30 @@ def test_another_reader_finds_nothing_wrong(recorded: Session, tmp_path: Path) -
         rows = [line for line in said.splitlines() if re.search(r" /\w", line)]
         assert len(rows) == len(Recording(path).counts)
         assert all(line.split()[0] == "ok" for line in rows), said
+
+
+def test_messages_of_other_software_come_along(recorded: Session, tmp_path: Path) -> None:
+    """Into new estimates and into a part, in their own encoding."""
+    source, other = Recording(recorded.path), Schema(id=0, name="weather", encoding="jsonschema", data=b"{}")
+    file = McapFile(tmp_path / "a.mcap", WriteOptions())
+    begin_recording(file, source.rig, source.metadata, source.start_ns, {})
+    for number, raw in enumerate(source.raw_messages(), 1):
+        if number % 50 == 1:
+            file.add("/weather", other, b'{"wind": %d}' % number, raw.log_time_ns, 2 * number, "json")
+        file.add(raw.topic, schema_of(topics.SCHEMAS[raw.schema]), raw.data, raw.log_time_ns, 2 * number + 1)
+    file.finish()
+    before = Recording(tmp_path / "a.mcap")
+    write_reestimated(before, ["o3"], tmp_path / "b.mcap")
+    cut(tmp_path / "a.mcap", tmp_path / "c.mcap", 0, 1e6)
+    for name in ("b", "c"):
+        after = Recording(tmp_path / f"{name}.mcap")
+        said = [(raw.log_time_ns, raw.data) for raw in after.raw_messages("/weather")]
+        theirs = [(raw.log_time_ns, raw.data) for raw in before.raw_messages("/weather")]
+        assert said == (theirs if name == "b" else theirs[-len(said) :])
+        assert len(said) > 1
+        assert (after.encodings["/weather"], after.encodings[topics.IMAGE]) == ("json", "protobuf")
+        assert after.schemas["weather"].encoding == "jsonschema"
+    assert first_difference(Recording(tmp_path / "b.mcap").estimates("o3"), source.estimates("o3")) is None
 
 
 def test_the_page_for_other_software_is_right(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
+import threading
 import time
 import tracemalloc
 from pathlib import Path
@@ -28,6 +30,7 @@ from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import exposure_model
 from aolink.recording import convert, schemas_pb2, topics
+from aolink.recording.mcap_file import McapFile
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.recording.writer import RecordingWriter
@@ -269,3 +272,51 @@ def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monk
     with pytest.raises(RecordingError, match="does not answer"):
         writer.close()
     os.close(reader)  # lets the thread go
+
+
+def test_a_writer_that_is_never_idle_synchronises_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every second of its clock, while messages wait: a power cut must not cost more because there is much to do."""
+    may_write, seconds, synced = threading.Event(), itertools.count(), list[tuple[int, int]]()
+    path, sync, begin = tmp_path / "a.mcap", McapFile.sync, time.monotonic()
+
+    class Clock:
+        """Each look at it is a fifth of a second later than the one before."""
+
+        @staticmethod
+        def monotonic() -> float:
+            may_write.wait()
+            return begin + next(seconds) / 5
+
+    def watched(file: McapFile) -> None:
+        synced.append((len(writer._queue), path.stat().st_size))
+        sync(file)
+
+    monkeypatch.setattr(McapFile, "sync", watched)
+    writer = RecordingWriter(path, load_rig("section-vi"), {}, 0)
+    with monkeypatch.context() as patched:
+        patched.setattr("aolink.recording.writer.time", Clock)
+        message = Log(message="x" * 4000)
+        for k in range(2000):  # 8 MB, in 500 portions
+            writer._queue.append((topics.LOG, message, message.SerializeToString(), k))
+        may_write.set()
+        while writer._queue:
+            writer._thread.join(0.01)
+    writer.close()
+    busy = [(left, size) for left, size in synced if left]
+    assert len(busy) > 50
+    sizes = [size for _, size in busy]
+    assert sizes == sorted(sizes)
+    assert all(later - sooner < 200_000 for sooner, later in itertools.pairwise(sizes))
+    assert Recording(path).counts == {topics.LOG: 2000}
+
+
+def test_no_schema_has_a_map() -> None:
+    """Only maps are written in an order that may change: without them the same messages give the same bytes."""
+    waiting, seen = [kind.DESCRIPTOR for kind in topics.SCHEMAS.values()], set()
+    while waiting:
+        kind = waiting.pop()
+        seen.add(kind.full_name)
+        assert not kind.GetOptions().map_entry, kind.full_name
+        inner = [each.message_type for each in kind.fields if each.message_type is not None]
+        waiting += [each for each in inner if each.full_name not in seen]
+    assert "foxglove.RawImage" in seen

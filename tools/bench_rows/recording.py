@@ -23,6 +23,7 @@ from aolink.wire import messages_pb2 as wire
 from bench_rows.row import Row, median_s, resident_mb
 
 KILLS = 100
+_ROWS = 50_000
 _LOOP_S = 20.0
 
 
@@ -251,3 +252,35 @@ def batch_workers() -> Row:
 
         one, two = (statistics.median(work(jobs) for _ in range(3)) for jobs in (1, 2))
     return Row("8 recordings estimated again on 2 processes", f"{two:.1f} s", f"on one {one:.1f} s", one / two, 1.8)
+
+
+def rrd_of_ten_minutes() -> Row:
+    """The .rrd of 3000 exposures with o3, against one call of rr.log for each row in it, of some of them."""
+    import rerun as rr
+    from rerun.chunk import RrdReader
+
+    from aolink.recording.reestimate import write_reestimated
+    from aolink.viewing import save_rrd
+
+    def logged_row_by_row(path: Path) -> float:
+        stream = rr.RecordingStream("bench")
+        stream.save(path)
+        start = time.perf_counter()
+        for row in range(_ROWS):
+            stream.set_time("time", duration=row * 1e-3)
+            stream.log("line", rr.Scalars(1e-3 * row))
+        stream.disconnect()
+        return (time.perf_counter() - start) / _ROWS
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        record_long(folder / "bare.mcap", 3000)
+        write_reestimated(Recording(folder / "bare.mcap"), ["o3"], folder / "a.mcap")
+        recording = Recording(folder / "a.mcap")
+        ours, _ = median_s(lambda: save_rrd(recording, folder / "a.rrd", overwrite=True), 3)
+        row = logged_row_by_row(folder / "b.rrd")
+        rows = sum(chunk.num_rows for chunk in RrdReader(folder / "a.rrd").stream())
+    theirs = rows * row
+    return Row(
+        f".rrd of ten minutes, {rows / 1e3:.0f}k rows", f"{ours:.1f} s", f"rr.log {theirs:.0f} s", theirs / ours, 20
+    )

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
 import pty
 import statistics
+import tempfile
 import time
 import tty
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from bench_rows.row import Row
+
+_MINUTE_EXPOSURES = 300
+_LENSLET_FRAMES = 500
 
 
 def link_throughput() -> Row:
@@ -64,3 +70,73 @@ def link_throughput() -> Row:
     return Row(
         "link throughput over a pseudo terminal", f"{ours:.0f} MB/s", f"os.read {theirs:.0f} MB/s", ours / theirs, 0.5
     )
+
+
+def commands_at_1_khz() -> Row:
+    """A minute in real time with a simulated rig as a process of its own: steps that came late or not at all."""
+    from aolink.demo import simulated_rig
+    from aolink.rig import load_rig
+    from aolink.session import record
+
+    rig = load_rig("single-lenslet")
+    with tempfile.TemporaryDirectory() as folder, simulated_rig(rig.name, "--real-time") as ports:
+        report = record(rig, *ports, Path(folder) / "a.mcap", estimators=["o3"], exposures=_MINUTE_EXPOSURES)
+    lost = report.steps_commanded - report.steps_applied
+    return Row(
+        f"commands at 1 kHz, {report.steps_commanded / 1000:.0f} s, in blocks of {rig.mirror.block_steps}",
+        f"{report.steps_late} steps late, {lost} lost",
+        "limit 0",
+        1.0 if not (report.steps_late or lost or report.frames_lost) else 0.0,
+        1.0,
+    )
+
+
+def frame_to_command() -> Row:
+    """One lenslet: from the last byte of a frame on one pseudo terminal to the command that follows on another."""
+    from aolink.assembly import Assembler, FrameReassembly
+    from aolink.estimation import Driver
+    from aolink.rig import load_rig
+    from aolink.simulation.devices import SimulatedDevices
+    from aolink.wire import messages_pb2 as pb
+    from aolink.wire.link import Link
+    from aolink.wire.packet import encode_message
+    from aolink.wire.port import SerialPort, wait_readable
+
+    rig = load_rig("single-lenslet")
+    devices = SimulatedDevices(rig, virtual_time=True, step_zero_ns=0)
+    devices.handle("camera", pb.CameraControl(run=True, exposures=_LENSLET_FRAMES), 0)
+    devices.advance_to(200 * _LENSLET_FRAMES)
+    chunks = [each.message for each in devices.outbox if isinstance(each.message, pb.FrameChunk)]
+    terminals = [pty.openpty() for _ in range(2)]
+    for _, slave in terminals:
+        tty.setraw(slave)
+    camera, mirror = (Link(name, SerialPort(os.ttyname(slave)), time.monotonic_ns)
+                      for name, (_, slave) in zip(("camera", "mirror"), terminals, strict=True))  # fmt: skip
+    assembler, driver = Assembler(rig), Driver(rig, ["o3"])
+    frames = FrameReassembly(rig.sensor.shape, rig.timing.fast_step_ns)
+    gain, block, times = np.array([0.02, 0.5]), rig.mirror.block_steps, []
+    for number, chunk in enumerate(chunks):
+        first = 200 * number
+        assembler.add_applied(pb.Applied(first_step=first, n_steps=200, u=np.zeros(400)))
+        os.write(terminals[0][0], encode_message(chunk, number & 0xFFFF))
+        before = len(times)
+        while len(times) == before:
+            wait_readable([camera.transport], 1.0)
+            start = time.perf_counter()
+            for received in camera.receive():
+                for frame in frames.add(received.message, received.receive_ns):
+                    (exposure,) = assembler.add_frame(frame)
+                    (estimate,) = driver.step(exposure)
+                    u = np.tile(np.clip(-estimate.end_state @ gain, -0.05, 0.05), block)
+                    mirror.send(pb.CommandBlock(block_id=number + 1, first_step=first + 400, n_steps=block, u=u))
+                    times.append(time.perf_counter() - start)
+        os.read(terminals[1][0], 65536)
+    for each in (camera, mirror):
+        each.transport.close()
+    for descriptor in itertools.chain(*terminals):
+        os.close(descriptor)
+    p50, p99 = np.percentile(times, [50, 99]) * 1e3
+    return Row(
+        f"one lenslet, frame complete to command sent, {len(times)} frames",
+        f"{p50:.2f} ms, p99 {p99:.2f}", "p99 1 ms", 1 / p99, 1.0,
+    )  # fmt: skip

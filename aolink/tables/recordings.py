@@ -1,0 +1,144 @@
+"""What recordings hold, how two of them compare, and what came of many."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from aolink.recording import topics
+from aolink.recording.compare import TopicComparison
+from aolink.recording.reader import Recording
+from aolink.tables.json import without_nan
+
+_LOSSES = (
+    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
+    "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_clipped", "steps_parked",
+)  # fmt: skip
+"""What a session counts of what went wrong."""
+
+
+def recording_facts(recording: Recording) -> dict[str, Any]:
+    """What `aolink info` says of a recording."""
+    duration_s = (recording.end_ns - recording.start_ns) / 1e9
+    return {
+        "file": str(recording.path),
+        "bytes": recording.path.stat().st_size,
+        "complete": recording.complete,
+        "damage": recording.damage,
+        "duration_s": duration_s,
+        "messages": dict(sorted(recording.counts.items())),
+        "rates_per_s": {
+            topic: round((count - 1) / duration_s, 3)
+            for topic, count in sorted(recording.counts.items())
+            if duration_s and count > 1
+        },
+        "gaps": _gaps(recording),
+        "losses": _losses(recording),
+        "damaged_parts": [loss.text() for loss in recording.losses],
+        "truth": topics.TRUTH in recording.counts,
+        "session": {name: _typed(name, value) for name, value in recording.metadata.items()},
+        "estimators": recording.estimators,
+    }
+
+
+def _gaps(recording: Recording) -> dict[str, float]:
+    """Where the camera's frames are further apart than their period: how often, and the longest, in fast steps."""
+    period, last, gaps = recording.rig.timing.frame_period_steps, None, []
+    for recorded in recording.messages(topics.EXPOSURE):
+        first = recorded.message.first_step  # type: ignore[attr-defined]
+        if last is not None and first - last != period:
+            gaps.append(first - last - period)
+        last = first
+    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}
+
+
+def _losses(recording: Recording) -> dict[str, int]:
+    """What was lost in the session, by cause; and in the file."""
+    counted = {
+        name: int(recording.metadata[name])
+        for name in _LOSSES
+        if recording.metadata.get(name, "0").isdigit() and int(recording.metadata.get(name, "0"))
+    }
+    if recording.losses:
+        counted["parts_of_the_file"] = len(recording.losses)
+    return counted
+
+
+def _typed(name: str, value: str) -> Any:
+    """A value of the metadata, which knows text only."""
+    if name in ("note", "rig", "rig_digest", "camera", "mirror"):
+        return value
+    with contextlib.suppress(ValueError):
+        return without_nan(float(value) if not value.lstrip("-").isdigit() else int(value))
+    return {"True": True, "False": False}.get(value, value)
+
+
+def facts(values: Mapping[str, Any]) -> Table:
+    """Name and value, line by line."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    flat = {name: value for name, value in values.items() if name != "session"} | values["session"]
+    for name, value in flat.items():
+        if name in ("damage", "warnings") and not value:
+            continue
+        if isinstance(value, Mapping):
+            value = ", ".join(f"{key} {count}" for key, count in value.items())
+        elif isinstance(value, list):
+            value = " ".join(value) or "none"
+        table.add_row(name, escape(str(value)))
+    return table
+
+
+def batch(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """What came of many recordings and models, a row each."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    columns = ("recording", "model", "estimator", "exposures", "path_rmse", "end_rmse", "nis", "end_nees", "not_ok")
+    for name in columns:
+        table.add_column(name, justify="left" if name in columns[:3] else "right", no_wrap=True)
+    for row in rows:
+        if row["error"]:
+            table.add_row(Path(row["recording"]).name, escape(row["model"]), "failed")
+            continue
+        cells = [Path(row["recording"]).name if name == "recording" else row[name] for name in columns]
+        table.add_row(*(escape(f"{cell:.4g}" if isinstance(cell, float) else str(cell or "")) for cell in cells))
+    return table
+
+
+def comparison(found: Mapping[str, TopicComparison]) -> Table:
+    """Topic by topic: how many messages were compared, and what differs first."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("topic", "field"):
+        table.add_column(name, no_wrap=True)
+    for name in ("compared", "differ", "largest", "relative"):
+        table.add_column(name, justify="right", no_wrap=True)
+    table.add_column("first")
+    for topic, each in found.items():
+        if each.same:
+            table.add_row(topic, "", str(each.compared), "0", "", "", "")
+        for name, field in each.fields.items():
+            frame = f"frame {field.first.frame_id}: " if field.first.frame_id is not None else ""
+            sizes = (f"{field.largest:.2g}", f"{field.largest_relative:.2g}")
+            table.add_row(
+                topic, name, str(each.compared), str(field.messages), *sizes, escape(frame + field.first.text)
+            )
+        for count, what, first in (
+            (each.missing, "missing", each.first_missing),
+            (each.added, "added", each.first_added),
+        ):
+            if count:
+                table.add_row(topic, what, str(each.compared), str(count), "", "", escape(first))
+    return table
+
+
+def comparison_as_json(found: Mapping[str, TopicComparison], *, same_rig: bool) -> dict[str, Any]:
+    """The same for scripts; a difference without a size is null."""
+    same = same_rig and all(each.same for each in found.values())
+    return dict(without_nan({"same": same, "same_rig": same_rig, "topics": {k: asdict(v) for k, v in found.items()}}))
