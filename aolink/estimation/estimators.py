@@ -256,7 +256,10 @@ def _of_pixels(rig: Rig, name: str, options: Options) -> HypothesisFilter:
     updates: Updates = SampledUpdates(options.particles, options.seed)
     if name != "sampled":
         updates = ProfileUpdates() if name == "profile" else MixtureUpdates()
-    return HypothesisFilter(rig.plant, rig.sensor, updates, gate=options.gate)
+    pixels = HypothesisFilter(rig.plant, rig.sensor, updates, gate=options.gate)
+    # What profile compiles when a blur has several readings, mixture does at once.
+    pixels.warm_up(MixtureUpdates())
+    return pixels
 
 
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:

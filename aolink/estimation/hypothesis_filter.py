@@ -98,18 +98,17 @@ class HypothesisFilter:
         self._unseen = self.belief.belief
         self._missed = np.zeros(axes, dtype=np.int64)
         self._number = 0
-        self._warm_up()
 
-    def _warm_up(self) -> None:
-        """Have all code compiled before the first exposure: a session must not wait for it."""
+    def warm_up(self, updates: Updates) -> None:
+        """Have an exposure of one axis updated by these: what they compile, a session need not wait for."""
         if self.plant.n_outputs > 1:
             return
         model, pixels = exposure_model(self.plant, 2), self.sensor.profile.pixels
         dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
-        view = PixelView(self.sensor, model, response, dark, self._updates.reduction(model, self.sensor))
+        view = PixelView(self.sensor, model, response, dark, updates.reduction(model, self.sensor))
         one = slice(0, 1)
-        self._updates.update(view.part(one), self.belief.part(one), 0)
+        updates.update(view.part(one), self.belief.part(one), 0)
 
     def bridge(self, inputs: FloatArray) -> None:
         """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""

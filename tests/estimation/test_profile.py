@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation import Status, exposure_model, make_estimator, pixels, profile, run, score
-from aolink.estimation.hypotheses import cholesky, single
+from aolink.estimation.hypotheses import Hypotheses, cholesky, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
 from aolink.estimation.importance import importance_corrected
 from aolink.estimation.measuring import measure
@@ -101,6 +101,42 @@ def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
     sd = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(after.belief.mean[0] / sd, mean / sd, atol=0.3)
     np.testing.assert_allclose(np.sqrt(np.diag(after.belief.covariance[0])) / sd, 1.0, atol=0.25)
+
+
+@pytest.mark.parametrize("seed", [10, 11])
+def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
+    """Gaussians about the modes alone are 0.4 and 0.7 standard deviations off."""
+    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=seed)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 200
+    update = profile.ProfileUpdates().update(view, single(state), 0)
+    assert update.several[0]
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.32)
+    np.testing.assert_allclose(np.sqrt(np.diag(update.coefficients.covariance[0])) / sd, 1.0, atol=0.35)
+
+
+def test_evidence_of_a_mode_has_the_weight_of_its_prior():
+    view, state = seen(quiet(RIG, 0.01), width=0.3)
+    apart = state.mean[:, None] + np.array([[0.0, 0.0], [0.1, 3.0]])
+    both = np.repeat(state.covariance[:, None], 2, axis=1) / 4
+    evidence = []
+    for share in (0.5, 0.9):
+        modes, _ = explored(view, Hypotheses(np.log([[share, 1 - share]]), apart, both))
+        evidence.append(modes.log_evidence[0].reshape(2, -1))
+    there = np.isfinite(evidence[0]) & np.isfinite(evidence[1])
+    assert there.any(axis=1).all()
+    expected = np.broadcast_to(np.log([[0.9 / 0.5], [0.1 / 0.5]]), there.shape)
+    np.testing.assert_allclose(evidence[1][there] - evidence[0][there], expected[there], atol=1e-9)
+
+
+def test_points_are_drawn_from_the_wide_gaussian_too():
+    view, state = seen(quiet(RIG, 0.01), width=0.5)
+    _, proposal = explored(view, single(state))
+    prior = view.reduced.prior(state)
+    wide = profile.broad(view, prior)
+    same = np.abs(proposal.mean[0] - wide.mean[0]).max(axis=1) < 1e-12
+    assert np.exp(proposal.log_weight[0, same]).sum() == pytest.approx(0.3)
 
 
 def test_a_path_and_its_reversal_are_two_readings():
