@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -62,3 +63,12 @@ def open_recording(file: Path, *, check: bool = False) -> Recording:
 def program() -> str:
     """What the user types for this program: its name where the shell finds it, else its path."""
     return "aolink" if shutil.which("aolink") else str(Path(sys.executable).with_name("aolink"))
+
+
+def get_ready(rig: Rig, estimators: Sequence[str]) -> None:
+    """Have what estimators compile compiled before anything waits for them, and say so on a terminal."""
+    from aolink.estimation import make_estimator
+
+    with stderr.status("getting the estimators ready: what they compile takes some 20 s, the first time"):
+        for name in estimators:
+            make_estimator(rig, name)

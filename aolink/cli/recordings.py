@@ -18,6 +18,7 @@ from aolink.cli.common import (
     JsonOption,
     OverwriteOption,
     app,
+    get_ready,
     open_recording,
     stderr,
     stdout,
@@ -160,6 +161,7 @@ def _estimate_one(
     recording = open_recording(file)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     total, known = recording.counts.get("/camera/image", 0), recording.damage
+    get_ready(recording.rig, names)
     with progress_bar(stderr, total) as tell:
         if output is not None:
             write_reestimated(

@@ -21,6 +21,7 @@ from aolink.cli.common import (
     OverwriteOption,
     RigArgument,
     app,
+    get_ready,
     load_checked,
     open_recording,
     program,
@@ -219,6 +220,7 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
+    get_ready(loaded, estimator or [])
     with (
         _live_view(loaded, estimator or [], shown=view) as watch,
         StopRequest().installed() as stop,
@@ -299,6 +301,7 @@ def replay(
     """Play a recording again: through the estimators as if it were live, or to a rig."""
     recording = open_recording(file)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
+    get_ready(recording.rig, names)
     if to_rig:
         if not (camera and mirror and output):
             raise typer.BadParameter("--to-rig needs --camera PORT, --mirror PORT and -o FILE")
@@ -423,10 +426,11 @@ def demo(
 ) -> None:
     """Do the main job with a simulated rig: record, estimate, estimate again, compare, draw."""
     from aolink import tables
-    from aolink.demo import new_folder, run_demo
+    from aolink.demo import new_folder, possible_estimators, run_demo
     from aolink.recording.reader import Recording
 
     loaded = load_checked(rig)
+    get_ready(loaded, possible_estimators(loaded))
     folder = new_folder(out)
     with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
         result = run_demo(
