@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Assembler
 from aolink.errors import RecordingError, RigError
-from aolink.estimation import Estimate, ExposureModel
+from aolink.estimation import Estimate, ExposureModel, exposure_model
 from aolink.exposure import Exposure, Picture, Truth
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
@@ -151,7 +151,7 @@ class Recording:
     @cached_property
     def model(self) -> ExposureModel:
         """The exposure model that expands the recorded coefficients."""
-        return ExposureModel(self.rig.plant, self.rig.timing.exposure_steps)
+        return exposure_model(self.rig.plant, self.rig.timing.exposure_steps)
 
     def messages(
         self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None

@@ -1,0 +1,106 @@
+"""Products of large matrices in pieces so small that no library shares them among threads.
+
+So no bit depends on the number of threads, and nothing waits for a second core that is busy elsewhere: on a loaded
+machine OpenBLAS's threads take a second over what takes 10 ms alone. In pieces it takes as long as by one
+thread in one piece.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+FloatArray = NDArray[np.float64]
+
+# OpenBLAS shares products of more than 262144 multiplications.
+_MOST = 131_072
+_ROWS = 24
+_SIDE = 48
+# A matrix with fewer entries than this share is multiplied by its entries.
+_SPARSE = 0.05
+
+
+def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n, k) @ (k, m)"""
+    (n, k), m = a.shape, b.shape[1]
+    columns = max(8, _MOST // (_ROWS * max(k, 1)) // 8 * 8)
+    left = _padded(a, _ROWS, 1).reshape(-1, 1, _ROWS, k)
+    right = np.ascontiguousarray(_padded(b, 1, columns).reshape(k, -1, columns).swapaxes(0, 1))
+    out = np.matmul(left, right[None])
+    return np.ascontiguousarray(out.swapaxes(1, 2).reshape(len(left) * _ROWS, -1)[:n, :m])
+
+
+def gram(a: FloatArray) -> FloatArray:
+    """a' a, (n, m) -> (m, m): half of it, and the other half by symmetry."""
+    n, m = a.shape
+    padded = _padded(a, 1, _SIDE)
+    step = 4 * _SIDE
+    out = np.zeros((padded.shape[1],) * 2)
+    transposed = np.ascontiguousarray(padded.T)
+    for first in range(0, padded.shape[1], step):
+        some = slice(first, first + step)
+        out[some, : first + step] = matmul(transposed[some], padded[:, : first + step])
+    lower = np.tril(out[:m, :m])
+    return np.asarray(lower + np.tril(lower, -1).T)
+
+
+def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
+    """(n, k) @ (k,)"""
+    return np.asarray(np.einsum("nk,k->n", a, x))
+
+
+def congruences(a: FloatArray, p: FloatArray) -> FloatArray:
+    """`congruence` of many, p (axes, n, n)."""
+    return np.stack([congruence(a, each) for each in p])
+
+
+def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
+    """a p a' of a symmetric p, by the entries of ``a`` where they are few."""
+    if np.count_nonzero(a) <= _SPARSE * a.size:
+        entries = csr_array(a)
+        return np.asarray(entries @ np.ascontiguousarray((entries @ p).T))
+    return matmul(a, matmul(p, np.ascontiguousarray(a.T)))
+
+
+def inverse_root(a: FloatArray) -> FloatArray:
+    """L^-1 of a symmetric positive definite a = L L', so that a^-1 = L^-1' L^-1, (n, n), lower triangular.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        It is not positive definite.
+    """
+    n = len(a)
+    count = -(-n // _SIDE)
+    whole = np.eye(count * _SIDE)
+    whole[:n, :n] = a
+    L = np.ascontiguousarray(whole.reshape(count, _SIDE, count, _SIDE).swapaxes(1, 2))
+    W = np.zeros_like(L)
+    for j in range(count):
+        W[j, j] = np.linalg.inv(np.linalg.cholesky(L[j, j]))
+        L[j + 1 :, j] = L[j + 1 :, j] @ W[j, j].T
+        for i in range(j + 1, count):
+            L[i, j + 1 : i + 1] -= L[i, j] @ L[j + 1 : i + 1, j].swapaxes(1, 2)
+    for i in range(1, count):
+        row = np.zeros((i, _SIDE, _SIDE))
+        for k in range(i):
+            row[: k + 1] += L[i, k] @ W[k, : k + 1]
+        W[i, :i] = -W[i, i] @ row
+    return np.ascontiguousarray(W.swapaxes(1, 2).reshape(count * _SIDE, -1)[:n, :n])
+
+
+def inverse(a: FloatArray) -> FloatArray:
+    """Inverse of a symmetric positive definite matrix; raises as `inverse_root`."""
+    return gram(inverse_root(a))
+
+
+def _padded(a: FloatArray, rows: int, columns: int) -> FloatArray:
+    """The same with zeros up to whole multiples of these."""
+    n, m = a.shape
+    more = (-n % rows, -m % columns)
+    if not any(more):
+        return np.ascontiguousarray(a)
+    out = np.zeros((n + more[0], m + more[1]))
+    out[:n, :m] = a
+    return out
