@@ -24,6 +24,8 @@ _SPARSE = 0.05
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """(n, k) @ (k, m)"""
     (n, k), m = a.shape, b.shape[1]
+    if not n * k * m:
+        return np.zeros((n, m))
     columns = max(8, _MOST // (_ROWS * max(k, 1)) // 8 * 8)
     left = _padded(a, _ROWS, 1).reshape(-1, 1, _ROWS, k)
     right = np.ascontiguousarray(_padded(b, 1, columns).reshape(k, -1, columns).swapaxes(0, 1))

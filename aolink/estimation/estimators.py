@@ -15,6 +15,8 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.exposure_model import InputResponse, exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
 from aolink.estimation.filterpy_engine import FilterpyMoments
+from aolink.estimation.joint_moments import JointMoments
+from aolink.estimation.joint_profile import JointProfile
 from aolink.estimation.hypothesis_filter import HypothesisFilter, Updates
 from aolink.estimation.mixture import MixtureUpdates
 from aolink.estimation.moments import (
@@ -32,6 +34,7 @@ from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.exposure import Exposure
 from aolink.optics.camera import is_saturated, to_density
+from aolink.plant import alike_systems
 from aolink.rig import Rig, Sensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -97,7 +100,7 @@ class Estimator:
             self.options = options = replace(options, gain="time-varying")
         self._observation = _observation(rig, name, options)
         self._filter: BlurFilter | HypothesisFilter
-        if name in _OF_PIXELS:
+        if name in _OF_PIXELS and not isinstance(self._observation, JointProfile):
             self._filter = HypothesisFilter(rig.plant, rig.sensor, _OF_PIXELS[name](options), gate=options.gate)
         else:
             predict = self._observation.predict if isinstance(self._observation, FilterpyMoments) else None
@@ -337,6 +340,11 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
     if rig.plant.n_outputs > 1:
         assert isinstance(rig.sensor, SpotSensor)
         spots = rig.plant.n_outputs // 2
+        if alike_systems(rig.plant) is not None:
+            if name == "profile":
+                return JointProfile(rig.sensor, rig.plant.n_outputs)
+            of = options.orders, options.basis, options.flux
+            return JointMoments(rig.sensor, rig.plant.n_outputs, of[0], basis=of[1], flux=of[2])
         return WindowedSpots(rig.sensor, spots, options.orders, basis=options.basis, flux=options.flux)
     return WindowedMoments(rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux)
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +34,16 @@ NOISE_LEFT_OUT = 0.05
 """Largest share of the noise path (rms) that a factored basis leaves out."""
 # Cosines in which the noise of one actuator is looked for.
 _COSINES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class _Factors:
+    patterns: FloatArray
+    functions: FloatArray
+    course_of: Indices
+    end_rows: FloatArray
+    after: FloatArray
+    left_out: FloatArray
 
 
 class FactoredModel(ExposureModel):
@@ -69,8 +80,7 @@ class FactoredModel(ExposureModel):
         return self.patterns, self.courses
 
     @cached_property
-    def _parts(self) -> tuple[FloatArray, FloatArray, Indices, FloatArray, FloatArray]:
-        """Patterns, distinct courses, the course of each coefficient, end rows; and what paths leave out."""
+    def _factors(self) -> _Factors:
         systems, n_steps, n = self.systems, self.n_steps, self.plant.n_states
         one = systems.one
         count = min(_COSINES, n_steps)
@@ -104,29 +114,41 @@ class FactoredModel(ExposureModel):
         rows[:, :n] = self.transition
         pushed = (turned @ ends)[time]  # of one system, (kept, n)
         rows[systems.order, n:] = (systems.noise_sd * along[space]).T[:, None] * pushed.T
-        noise = (systems.gains * systems.noise_sd) ** 2 @ np.ones(len(systems.noise_sd)) * energy / n_steps
+        noise = ((systems.gains * systems.noise_sd) ** 2).sum(axis=1) * energy / n_steps
         left_out = noise - (patterns[:, n:] ** 2) @ (values[time] ** 2) / n_steps
-        return patterns, functions, which, rows, np.maximum(left_out, 0.0)
+        after = np.append(one.C @ self.transition_of_one, (turned @ ends)[:distinct] @ one.C[0])
+        return _Factors(patterns, functions, which, rows, after, np.maximum(left_out, 0.0))
+
+    @property
+    def transition_of_one(self) -> FloatArray:
+        """A_1^N, (n, n)."""
+        own = self.systems.order[0]
+        return self.transition[np.ix_(own, own)]
 
     @property
     def patterns(self) -> FloatArray:
         """P, (n_outputs, n_coefficients)."""
-        return self._parts[0]
+        return self._factors.patterns
 
     @property
     def functions(self) -> FloatArray:
         """The distinct courses, (n_steps, m)."""
-        return self._parts[1]
+        return self._factors.functions
 
     @property
     def course_of(self) -> Indices:
         """The course of each coefficient, (n_coefficients,)."""
-        return self._parts[2]
+        return self._factors.course_of
+
+    @property
+    def after(self) -> FloatArray:
+        """The distinct courses in the step after the last, (m,)."""
+        return self._factors.after
 
     @property
     def left_out(self) -> FloatArray:
         """Variance of the path that the basis leaves out, mean over the steps, slope units squared, (n_outputs,)."""
-        return self._parts[4]
+        return self._factors.left_out
 
     @property
     def noise_left_out(self) -> float:
@@ -142,7 +164,7 @@ class FactoredModel(ExposureModel):
 
     @property
     def _with_noise(self) -> tuple[FloatArray, FloatArray]:
-        return self.functions, self._parts[3]
+        return self.functions, self._factors.end_rows
 
     def columns(self, count: int) -> list[Indices]:
         """Which of the first ``count`` coefficients have each of the distinct courses."""
@@ -184,15 +206,19 @@ class FactoredModel(ExposureModel):
 
     def path_sd(self, covariance: FloatArray) -> FloatArray:
         """Standard deviation of the path, as of `ExposureModel`; with process noise in it, also what is left out."""
-        count = covariance.shape[1]
-        parts = [(c, columns) for c, columns in enumerate(self.columns(count)) if len(columns)]
-        variance = np.zeros((len(covariance), self.plant.n_outputs, self.n_steps))
-        if count > self.plant.n_states:
+        variance = ((self.functions @ self.of_outputs(covariance)) * self.functions).sum(axis=3)
+        if covariance.shape[1] > self.plant.n_states:
             variance += self.left_out[:, None]
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+    def of_outputs(self, covariance: FloatArray) -> FloatArray:
+        """Covariance of the courses' shares of each output's path, (axes, n_outputs, m, m), of the first coefficients'."""
+        count, m = covariance.shape[1], self.functions.shape[1]
+        out = np.zeros((len(covariance), self.plant.n_outputs, m, m))
         for axis, P in enumerate(covariance):
-            for place, (c, own) in enumerate(parts):
-                for d, other in parts[: place + 1]:
+            columns = self.columns(count)
+            for c, own in enumerate(columns):
+                for d, other in enumerate(columns[: c + 1]):
                     block = tiles.matmul(self.patterns[:, own], P[np.ix_(own, other)])
-                    shared = (block * self.patterns[:, other]).sum(axis=1) * (1 if c == d else 2)
-                    variance[axis] += shared[:, None] * (self.functions[:, c] * self.functions[:, d])
-        return np.sqrt(np.maximum(variance, 0.0))
+                    out[axis, :, c, d] = out[axis, :, d, c] = (block * self.patterns[:, other]).sum(axis=1)
+        return out

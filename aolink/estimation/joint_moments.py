@@ -1,0 +1,131 @@
+"""Windowed moments of all spots of one large plant, in information form.
+
+Each spot by itself is what `WindowedSpots` makes of one spot; its coefficients are the courses' shares of its
+two paths. What its sums tell of these is summed over spots (`JointPaths.information`). What a regression leaves out is taken
+as each spot's own: spots that move alike have errors alike, which the dense form knows and this does not, for it would
+take a second a frame. `_SHARED` says what that costs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink import tiles
+from aolink.estimation import large, stacked
+from aolink.estimation.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.factored_model import FactoredModel
+from aolink.estimation.joint import JointPaths, joint_paths
+from aolink.estimation.moments import LEAST_FLUX, Flux
+from aolink.estimation.observation import Belief, Correction
+from aolink.estimation.windowed import _NOT_BELIEVED, _PASSES, Basis, Nodes, Regression, _memory, _slowest
+from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
+from aolink.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+# Squarings of a matrix of which the spectral radius is wanted.
+_SQUARINGS = 6
+
+
+class JointMoments:
+    """The estimator `moments` of a plant with hundreds of states, as an observation of `BlurFilter`.
+
+    Parameters
+    ----------
+    orders, basis, flux:
+        As of `WindowedSpots`.
+    """
+
+    models_noise = True
+
+    def __init__(
+        self, sensor: SpotSensor, n_outputs: int, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
+        flux: Flux = "known",
+    ) -> None:  # fmt: skip
+        self.sensor = sensor
+        self._spot = WindowedSpots(sensor, 1, orders, basis=basis, flux=flux)
+        self.n_measurements = self._spot.n_measurements * (n_outputs // 2)
+
+    def correct(
+        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
+    ) -> Correction:
+        """Iterated statistical linearisation, copy by copy of the plant."""
+        assert isinstance(model, FactoredModel)
+        paths, n = joint_paths(model, self.sensor), model.plant.n_states
+        mean, covariance, rest = prior.mean.copy(), prior.covariance.copy(), []
+        for axis in range(len(mean)):
+            some = slice(0, paths.size)
+            before = Belief(mean[axis, some], covariance[axis, :n, :n])
+            windows = _by_spot(measured, axis)
+            t, P, *told = self._corrected(model, paths.with_inputs(response, axis), before, windows)
+            mean[axis, some], covariance[axis, some, some] = t, P
+            rest.append(told)
+        new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))
+        return Correction(Belief(mean, covariance), new, S, nis)
+
+    def _corrected(
+        self, model: FactoredModel, paths: JointPaths, prior: Belief, windows: SpotWindows
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        nodes = paths.of_one_spot()
+        precision = paths.prior_information(prior.covariance)
+        wide = paths.prior_covariance(prior.covariance)
+        rho = _slowest(model.transition_of_one[None])[0]
+        memory, t, P = _memory(rho), prior.mean, wide
+        spread = first = paths.spread_of_spots(wide)
+        for to_come in reversed(range(_PASSES)):
+            y, noise, fit = self._spot.look(nodes, Belief(paths.shares_of_spots(t), spread), windows)
+            light = None
+            if self._spot.flux == "measured":
+                light = (y / np.sqrt(np.einsum("skk->sk", noise)))[:, 0].min()
+                y, noise, fit = self._spot._ratios(y, noise, fit)
+            new = y - fit.expected - stacked.matvec(fit.slope, paths.shares_of_spots(prior.mean - t))
+            H, score = _told(paths, fit, noise + memory * fit.remainder, new)
+            P = tiles.gram(large.inverse_root(precision + H))
+            t = prior.mean + tiles.matvec(P, score)
+            if to_come:
+                spread = paths.spread_of_spots(P)
+                memory = _memory(np.sqrt(rho * _closed_loop(model, P, precision)))
+        # The spread to expect of this one innovation is without the memory.
+        own = noise + fit.remainder
+        H, score = _told(paths, fit, own, new)
+        white = tiles.matvec(large.inverse_root(precision + H), score)
+        weighted = np.linalg.solve(own, new[..., None])[..., 0]
+        nis = np.asarray((new * weighted).sum() - white @ white)
+        if light is not None and light < LEAST_FLUX:
+            nis = np.asarray(_NOT_BELIEVED)
+        S = np.einsum("skk->sk", stacked.congruence(fit.slope, first) + own)
+        return t, P, new.ravel(), S.ravel(), nis
+
+
+def _by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
+    """One copy's spots as if they were copies of a plant with one spot each."""
+    light = None if measured.light is None else measured.light[axis, :, None]
+    return SpotWindows(density=measured.density[axis, :, None], mask=measured.mask[axis, :, None], light=light)
+
+
+def _told(paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What the sums of all spots tell of the coefficients: information and score."""
+    weighted = np.linalg.solve(R, np.concatenate([fit.slope, new[..., None]], axis=2))
+    told = stacked.transpose(fit.slope) @ weighted
+    shape = (len(told), 2, len(paths.groups))
+    return paths.information(told[..., :-1].reshape(*shape, *shape[1:])), paths.score(told[..., -1].reshape(shape))
+
+
+def _closed_loop(model: FactoredModel, covariance: FloatArray, precision: FloatArray) -> float:
+    """By what an error of the start state goes on to the next exposure's, A (I - K H): its spectral radius."""
+    n = model.plant.n_states
+    kept = tiles.matmul(np.ascontiguousarray(covariance[:, :n]), precision[:n, :n])
+    power = tiles.matmul(model.end_rows[:, : len(kept)], kept)
+    log_size, before = 0.0, 0.0
+    for _ in range(_SQUARINGS):
+        size = float(np.sqrt((power * power).sum()))
+        if not 0 < size < np.inf:
+            return 0.0
+        power = tiles.matmul(power / size, power / size)
+        log_size, before = 2 * (log_size + np.log(size)), log_size + np.log(size)
+    last = log_size + 0.5 * np.log(max(float((power * power).sum()), 1e-300))
+    return float(np.exp((last - before) / 2 ** (_SQUARINGS - 1)))
