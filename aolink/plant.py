@@ -73,7 +73,7 @@ def alike_systems(plant: Plant) -> AlikeSystems | None:
     order = alike(plant.A, plant.B, plant.B_w)
     if order is None:
         return None
-    seen = np.flatnonzero(plant.C.any(axis=0)[order].any(axis=0))
+    seen = np.flatnonzero(np.abs(plant.C).max(axis=0)[order].max(axis=0))
     if len(seen) != 1:
         return None
     first, n = order[0], order.shape[1]

@@ -35,7 +35,7 @@ def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def gram(a: FloatArray) -> FloatArray:
     """a' a, (n, m) -> (m, m): half of it, and the other half by symmetry."""
-    n, m = a.shape
+    m = a.shape[1]
     padded = _padded(a, 1, _SIDE)
     step = 4 * _SIDE
     out = np.zeros((padded.shape[1],) * 2)

@@ -15,9 +15,9 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.exposure_model import InputResponse, exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
 from aolink.estimation.filterpy_engine import FilterpyMoments
+from aolink.estimation.hypothesis_filter import HypothesisFilter, Updates
 from aolink.estimation.joint_moments import JointMoments
 from aolink.estimation.joint_profile import JointProfile
-from aolink.estimation.hypothesis_filter import HypothesisFilter, Updates
 from aolink.estimation.mixture import MixtureUpdates
 from aolink.estimation.moments import (
     Flux,
@@ -34,7 +34,7 @@ from aolink.estimation.windowed import Basis, Profile, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.exposure import Exposure
 from aolink.optics.camera import is_saturated, to_density
-from aolink.plant import alike_systems
+from aolink.plant import MANY_STATES, alike_systems
 from aolink.rig import Rig, Sensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -265,7 +265,15 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     orders = tuple(chosen.orders)
     if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
-    if name in _OF_PIXELS and isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None:
+    joint = alike_systems(rig.plant) is not None
+    if name in _OF_PIXELS and rig.plant.n_states > MANY_STATES and not (name == "profile" and joint):
+        alike = "" if name != "profile" else " that is not of alike systems side by side"
+        raise EstimatorError(
+            f"{name} follows the readings of a blur for at most {MANY_STATES} states of one plant, {rig.name} has"
+            f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
+        )
+    partly_lit = isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None
+    if name in _OF_PIXELS and partly_lit and not joint:
         raise EstimatorError(
             f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets: use moments or o3"
         )
@@ -274,7 +282,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
-    if name == "moments" and rig.plant.n_outputs > 2 * _MOST_SPOTS:
+    if name == "moments" and rig.plant.n_outputs > 2 * _MOST_SPOTS and not joint:
         raise EstimatorError(
             f"moments looks at each two spots that one plant moves together: at most {_MOST_SPOTS},"
             f" {rig.name} has {rig.plant.n_outputs // 2}; use o3"

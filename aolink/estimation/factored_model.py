@@ -202,7 +202,7 @@ class FactoredModel(ExposureModel):
         """basis @ coefficients + c, as of `ExposureModel`."""
         count = coefficients.shape[1]
         patterns, courses = self.patterns[:, :count], self.courses[:, :count]
-        return np.stack([c + tiles.matmul(patterns * z, courses.T) for z, c in zip(coefficients, input_path, strict=True)])
+        return input_path + np.stack([tiles.matmul(patterns * z, courses.T) for z in coefficients])
 
     def path_sd(self, covariance: FloatArray) -> FloatArray:
         """Standard deviation of the path, as of `ExposureModel`; with process noise in it, also what is left out."""
@@ -212,7 +212,7 @@ class FactoredModel(ExposureModel):
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def of_outputs(self, covariance: FloatArray) -> FloatArray:
-        """Covariance of the courses' shares of each output's path, (axes, n_outputs, m, m), of the first coefficients'."""
+        """Covariance of the courses' shares of each output's path, (axes, n_outputs, m, m)."""
         count, m = covariance.shape[1], self.functions.shape[1]
         out = np.zeros((len(covariance), self.plant.n_outputs, m, m))
         for axis, P in enumerate(covariance):

@@ -27,8 +27,8 @@ from aolink.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
 
-# Rms of the noise path that is left out, in standard deviations of the kernel. Half of what one spot alone may leave out:
-# many spots tell a displacement of all of them more finely.
+# Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
+# out, for many spots tell a displacement of all of them more finely.
 _LEFT_OUT = 0.05
 
 
@@ -149,6 +149,12 @@ class JointPaths:
         m = len(self.groups)
         return self.spread(covariance).reshape(self.spots, 2 * m, 2 * m)
 
+    def rms_spread(self, state_covariance: FloatArray) -> float:
+        """Standard deviation of the paths before the exposure, rms over outputs and nodes."""
+        spread = self.spread(self.prior_covariance(state_covariance))
+        own = np.einsum("sdcde->ce", spread) / (2 * self.spots)
+        return float(np.sqrt(max((self.weights * ((self.functions @ own) * self.functions).sum(axis=1)).sum(), 0.0)))
+
     def prior_covariance(self, state_covariance: FloatArray) -> FloatArray:
         """The coefficients' covariance before the exposure, (size, size)."""
         n = len(state_covariance)
@@ -179,4 +185,5 @@ def _node_count(model: FactoredModel, functions: FloatArray, paths: JointPaths, 
     own = np.einsum("sdcde->sdce", paths.spread(covariance)).reshape(-1, *(functions.shape[1],) * 2)
     square = np.einsum("kc,oce,ke->ok", moves, own, moves)
     speed = float(np.sqrt(square.mean(axis=1).max())) if square.size else 0.0
-    return int(min(model.n_steps, max(_FEWEST_NODES, np.ceil(2 * speed * model.n_steps / (_SPACING * np.sqrt(blurred))))))
+    wanted = np.ceil(2 * speed * model.n_steps / (_SPACING * np.sqrt(blurred)))
+    return int(min(model.n_steps, max(_FEWEST_NODES, wanted)))

@@ -1,15 +1,14 @@
 """Windowed moments of all spots of one large plant, in information form.
 
-Each spot by itself is what `WindowedSpots` makes of one spot; its coefficients are the courses' shares of its
-two paths. What its sums tell of these is summed over spots (`JointPaths.information`). What a regression leaves out is taken
-as each spot's own: spots that move alike have errors alike, which the dense form knows and this does not, for it would
-take a second a frame. `_SHARED` says what that costs.
+Each spot by itself is what `WindowedSpots` makes of one spot; its coefficients are the courses' shares of its two
+paths. What its sums tell of these is summed over spots (`JointPaths.information`). What a regression leaves out is
+taken as each spot's own: spots that move alike have errors alike, which the dense form knows and this does not, for it
+would take seconds a frame.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +20,14 @@ from aolink.estimation.factored_model import FactoredModel
 from aolink.estimation.joint import JointPaths, joint_paths
 from aolink.estimation.moments import LEAST_FLUX, Flux
 from aolink.estimation.observation import Belief, Correction
-from aolink.estimation.windowed import _NOT_BELIEVED, _PASSES, Basis, Nodes, Regression, _memory, _slowest
+from aolink.estimation.windowed import _NOT_BELIEVED, _PASSES, Basis, Regression, _memory, _slowest
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
 
 # Squarings of a matrix of which the spectral radius is wanted.
-_SQUARINGS = 6
+_SQUARINGS = 5
 
 
 class JointMoments:
@@ -60,16 +59,22 @@ class JointMoments:
         for axis in range(len(mean)):
             some = slice(0, paths.size)
             before = Belief(mean[axis, some], covariance[axis, :n, :n])
-            windows = _by_spot(measured, axis)
-            t, P, *told = self._corrected(model, paths.with_inputs(response, axis), before, windows)
+            windows = by_spot(measured, axis)
+            t, P, *told = self.corrected(model, paths.with_inputs(response, axis), before, windows)
             mean[axis, some], covariance[axis, some, some] = t, P
             rest.append(told)
         new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))
         return Correction(Belief(mean, covariance), new, S, nis)
 
-    def _corrected(
+    def corrected(
         self, model: FactoredModel, paths: JointPaths, prior: Belief, windows: SpotWindows
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Of one copy, with a prior of the coefficients' mean and of the state's covariance.
+
+        Returns
+        -------
+        Mean and covariance of the coefficients, innovation, its variance, and the NIS.
+        """
         nodes = paths.of_one_spot()
         precision = paths.prior_information(prior.covariance)
         wide = paths.prior_covariance(prior.covariance)
@@ -101,7 +106,7 @@ class JointMoments:
         return t, P, new.ravel(), S.ravel(), nis
 
 
-def _by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
+def by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
     """One copy's spots as if they were copies of a plant with one spot each."""
     light = None if measured.light is None else measured.light[axis, :, None]
     return SpotWindows(density=measured.density[axis, :, None], mask=measured.mask[axis, :, None], light=light)

@@ -71,11 +71,14 @@ def motion(estimate: Estimate, mix: FloatArray) -> tuple[FloatArray, FloatArray]
     axes, count = covariance.shape[:2]
     weights = mix.reshape(len(mix), axes, -1)
     outputs, paths = estimate.model.factors
-    total = np.zeros((len(mix) * paths.shape[1],) * 2)
+    total = np.zeros((len(mix) * estimate.model.n_steps,) * 2)
     for axis in range(axes):
         if weights[:, axis].any():
             mixed = weights[:, axis] if outputs is None else weights[:, axis] @ outputs
-            rows = np.tensordot(mixed, paths[:, :, :count], axes=1).reshape(-1, count)
+            if paths.ndim == 2:  # courses of the coefficients, the outputs their patterns
+                rows = (mixed[:, None, :count] * paths[:, :count]).reshape(-1, count)
+            else:
+                rows = np.tensordot(mixed, paths[:, :, :count], axes=1).reshape(-1, count)
             total += rows @ covariance[axis] @ rows.T
     return mix @ estimate.path, total
 
