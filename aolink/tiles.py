@@ -80,7 +80,7 @@ def inverse_root(a: FloatArray) -> FloatArray:
     L = np.ascontiguousarray(whole.reshape(count, _SIDE, count, _SIDE).swapaxes(1, 2))
     W = np.zeros_like(L)
     for j in range(count):
-        W[j, j] = np.linalg.inv(np.linalg.cholesky(L[j, j]))
+        W[j, j] = np.tril(np.linalg.inv(np.linalg.cholesky(L[j, j])))
         L[j + 1 :, j] = L[j + 1 :, j] @ W[j, j].T
         for i in range(j + 1, count):
             L[i, j + 1 : i + 1] -= L[i, j] @ L[j + 1 : i + 1, j].swapaxes(1, 2)

@@ -5,8 +5,8 @@ Start states have the pattern of their actuator and one of few courses, C_1 A_1^
 the exposure is a Kronecker product of what the outputs make of the actuators and of what the fast steps make of an
 actuator's noise; the singular values of it are the products of theirs, and the largest are kept.
 
-What is left out of the noise path is at most `NOISE_LEFT_OUT` of it, rms over outputs and steps; the patterns being
-orthogonal that is exact up to the cosines' own remainder, which is counted in. It is added back: to the end
+What is left out of the noise path is at most `NOISE_LEFT_OUT` of it, rms over outputs and steps, the patterns being
+orthogonal; what cosines leave out of it is counted in. It is added back: to the end
 covariance as a whole, to the path's variance for each output, spread over the steps. A dense basis of 144 actuators
 and 200 outputs would take 2 GB, this takes 2 MB.
 """
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,14 +36,65 @@ NOISE_LEFT_OUT = 0.05
 _COSINES = 64
 
 
-@dataclass(frozen=True, eq=False)
-class _Factors:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NoiseFactors:
+    """The process noise of one exposure as patterns times courses, the largest first."""
+
     patterns: FloatArray
-    functions: FloatArray
+    """(n_outputs, k)"""
     course_of: Indices
-    end_rows: FloatArray
+    """Which of the courses each coefficient has, (k,)."""
+    courses: FloatArray
+    """Paths of one system, (n_steps, m)."""
     after: FloatArray
+    """The courses in the step after the last, (m,)."""
+    ends: FloatArray
+    """End states of the coefficients, (n_states, k)."""
+    end_remainder: FloatArray
+    """Covariance of the end state that they leave out, (n_states, n_states)."""
     left_out: FloatArray
+    """Variance of the path that they leave out, mean over the steps, slope units squared, (n_outputs,)."""
+
+
+def noise_factors(systems: AlikeSystems, n_steps: int) -> NoiseFactors:
+    """Factors of which all but `NOISE_LEFT_OUT` of the noise path consists."""
+    one, sd = systems.one, systems.noise_sd
+    m = np.arange(min(_COSINES, n_steps))
+    phase = np.pi * (np.arange(n_steps) + 0.5) / n_steps
+    cosines = np.cos(m[:, None] * phase) * np.sqrt(np.where(m, 2, 1) / n_steps)[:, None]
+    paths, ends = input_response(replace(one, B=one.B_w), cosines[:, :, None])
+    courses, values, turned = np.linalg.svd(paths[:, 0].T, full_matrices=False)
+    across, sizes, _ = np.linalg.svd(systems.gains * sd, full_matrices=False)
+    along = np.linalg.svd(systems.gains * sd)[2]  # all directions of the systems, those that are not seen as well
+
+    # Energy of one noise over all steps, with what the cosines leave out of it.
+    impulse = output_rows(one, n_steps)[0] @ one.B_w[:, 0]
+    energy = float((np.arange(n_steps - 1, -1, -1) * impulse**2).sum())
+    total = energy * float((sizes**2).sum())
+    products = np.outer(sizes**2, values**2)
+    largest = np.argsort(-products, axis=None, kind="stable")
+    missing = total - np.cumsum(products.ravel()[largest])
+    count = 0 if not total else 1 + int(np.argmax(np.append(missing, 0.0) <= NOISE_LEFT_OUT**2 * total))
+    space, time = np.unravel_index(largest[:count], products.shape)
+
+    distinct = int(time.max(initial=-1)) + 1
+    pushed = turned @ ends  # of one system, (cosines, n)
+    patterns = across[:, space] * sizes[space]
+    rows = np.empty((systems.order.size, len(space)))
+    rows[systems.order] = (sd * along[space]).T[:, None] * pushed[time].T
+    # Direction by direction of the systems: what a small covariance leaves out has no rounding below zero.
+    rest = np.repeat(lift(one, n_steps)[1][None], len(along), axis=0)
+    np.subtract.at(rest, space, pushed[time, :, None] * pushed[time, None, :])
+    sizes_of_rest, vectors = np.linalg.eigh(rest)
+    roots = vectors * np.sqrt(np.maximum(sizes_of_rest, 0.0))[:, None]
+    root = np.empty((systems.order.size, roots.shape[0] * roots.shape[2]))
+    root[systems.order] = np.einsum("ia,ise->asie", along * sd, roots).reshape(*systems.order.shape, -1)
+    noise = ((systems.gains * sd) ** 2).sum(axis=1) * energy / n_steps
+    return NoiseFactors(
+        patterns=patterns, course_of=time, courses=courses[:, :distinct] * values[:distinct],
+        after=pushed[:distinct] @ one.C[0], ends=rows, end_remainder=tiles.gram(np.ascontiguousarray(root.T)),
+        left_out=np.maximum(noise - patterns**2 @ values[time] ** 2 / n_steps, 0.0),
+    )  # fmt: skip
 
 
 class FactoredModel(ExposureModel):
@@ -80,44 +131,9 @@ class FactoredModel(ExposureModel):
         return self.patterns, self.courses
 
     @cached_property
-    def _factors(self) -> _Factors:
-        systems, n_steps, n = self.systems, self.n_steps, self.plant.n_states
-        one = systems.one
-        count = min(_COSINES, n_steps)
-        phase = np.pi * (np.arange(n_steps) + 0.5) / n_steps
-        m = np.arange(count)
-        cosines = np.cos(m[:, None] * phase) * np.sqrt(np.where(m, 2, 1) / n_steps)[:, None]
-        driven = Plant(**(vars(one) | {"B": one.B_w}))
-        paths, ends = input_response(driven, cosines[:, :, None])
-        left, values, turned = np.linalg.svd(paths[:, 0].T, full_matrices=False)
-        across, sizes, along = np.linalg.svd(systems.gains * systems.noise_sd, full_matrices=False)
-        # Energy of one noise over all steps, what the cosines leave out of it included.
-        impulse = self.state_courses @ one.B_w[:, 0]
-        energy = float((np.arange(n_steps - 1, -1, -1) * impulse**2).sum())
-        total = energy * float((sizes**2).sum())
-        products = np.outer(sizes**2, values**2)
-        largest = np.argsort(-products, axis=None, kind="stable")
-        found = np.cumsum(products.ravel()[largest])
-        enough = np.flatnonzero(total - found <= NOISE_LEFT_OUT**2 * total)
-        kept = largest[: enough[0] + 1] if len(enough) else largest
-        kept = kept if total else kept[:0]
-        space, time = np.unravel_index(kept, products.shape)
-
-        distinct = int(time.max()) + 1 if len(time) else 0
-        functions = np.concatenate([self.state_courses, left[:, :distinct] * values[:distinct]], axis=1)
-        patterns = np.empty((len(systems.gains), n + len(kept)))
-        which = np.empty(n + len(kept), dtype=np.intp)
-        for s in range(systems.order.shape[1]):
-            patterns[:, systems.order[:, s]], which[systems.order[:, s]] = systems.gains, s
-        patterns[:, n:], which[n:] = across[:, space] * sizes[space], systems.order.shape[1] + time
-        rows = np.zeros((n, n + len(kept)))
-        rows[:, :n] = self.transition
-        pushed = (turned @ ends)[time]  # of one system, (kept, n)
-        rows[systems.order, n:] = (systems.noise_sd * along[space]).T[:, None] * pushed.T
-        noise = ((systems.gains * systems.noise_sd) ** 2).sum(axis=1) * energy / n_steps
-        left_out = noise - (patterns[:, n:] ** 2) @ (values[time] ** 2) / n_steps
-        after = np.append(one.C @ self.transition_of_one, (turned @ ends)[:distinct] @ one.C[0])
-        return _Factors(patterns, functions, which, rows, after, np.maximum(left_out, 0.0))
+    def noise(self) -> NoiseFactors:
+        """The process noise."""
+        return noise_factors(self.systems, self.n_steps)
 
     @property
     def transition_of_one(self) -> FloatArray:
@@ -125,37 +141,42 @@ class FactoredModel(ExposureModel):
         own = self.systems.order[0]
         return self.transition[np.ix_(own, own)]
 
-    @property
+    @cached_property
     def patterns(self) -> FloatArray:
         """P, (n_outputs, n_coefficients)."""
-        return self._factors.patterns
+        own = np.empty((len(self.systems.gains), self.plant.n_states))
+        own[:, self.systems.order] = self.systems.gains[:, :, None]
+        return np.concatenate([own, self.noise.patterns], axis=1)
 
-    @property
+    @cached_property
     def functions(self) -> FloatArray:
         """The distinct courses, (n_steps, m)."""
-        return self._factors.functions
+        return np.concatenate([self.state_courses, self.noise.courses], axis=1)
 
-    @property
-    def course_of(self) -> Indices:
-        """The course of each coefficient, (n_coefficients,)."""
-        return self._factors.course_of
-
-    @property
+    @cached_property
     def after(self) -> FloatArray:
         """The distinct courses in the step after the last, (m,)."""
-        return self._factors.after
+        return np.append(self.systems.one.C @ self.transition_of_one, self.noise.after)
 
-    @property
-    def left_out(self) -> FloatArray:
-        """Variance of the path that the basis leaves out, mean over the steps, slope units squared, (n_outputs,)."""
-        return self._factors.left_out
+    @cached_property
+    def course_of(self) -> Indices:
+        """The course of each coefficient, (n_coefficients,)."""
+        each = self.systems.order.shape[1]
+        own = np.empty(self.plant.n_states, dtype=np.intp)
+        own[self.systems.order] = np.arange(each)
+        return np.append(own, each + self.noise.course_of)
 
     @property
     def noise_left_out(self) -> float:
         """Share of the noise path that the basis leaves out, rms over outputs and steps."""
-        kept = ((self.patterns**2).sum(axis=0) * (self.courses**2).mean(axis=0))[self.plant.n_states :].sum()
-        total = kept + self.left_out.sum()
-        return math.sqrt(float(self.left_out.sum() / total)) if total else 0.0
+        kept = float((self.noise.patterns**2 @ (self.noise.courses**2).mean(axis=0)[self.noise.course_of]).sum())
+        missing = float(self.noise.left_out.sum())
+        return math.sqrt(missing / (kept + missing)) if missing else 0.0
+
+    @cached_property
+    def end_remainder(self) -> FloatArray:
+        """Covariance of what the noise coefficients leave out of the end state, (n_states, n_states)."""
+        return self.noise.end_remainder
 
     @property
     def courses(self) -> FloatArray:
@@ -164,7 +185,11 @@ class FactoredModel(ExposureModel):
 
     @property
     def _with_noise(self) -> tuple[FloatArray, FloatArray]:
-        return self.functions, self._factors.end_rows
+        return self.functions, self._end_rows
+
+    @cached_property
+    def _end_rows(self) -> FloatArray:
+        return np.concatenate([self.transition, self.noise.ends], axis=1)
 
     def columns(self, count: int) -> list[Indices]:
         """Which of the first ``count`` coefficients have each of the distinct courses."""
@@ -208,7 +233,7 @@ class FactoredModel(ExposureModel):
         """Standard deviation of the path, as of `ExposureModel`; with process noise in it, also what is left out."""
         variance = ((self.functions @ self.of_outputs(covariance)) * self.functions).sum(axis=3)
         if covariance.shape[1] > self.plant.n_states:
-            variance += self.left_out[:, None]
+            variance += self.noise.left_out[:, None]
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def of_outputs(self, covariance: FloatArray) -> FloatArray:

@@ -46,7 +46,7 @@ class JointPaths:
         n = model.plant.n_states
         variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
         energy = (model.patterns[:, n:] ** 2).sum(axis=0) * (model.functions**2).mean(axis=0)[model.course_of[n:]]
-        rest = np.append(np.cumsum(energy[::-1])[::-1], 0.0) + model.left_out.sum()
+        rest = np.append(np.cumsum(energy[::-1])[::-1], 0.0) + model.noise.left_out.sum()
         enough = np.flatnonzero(rest <= _LEFT_OUT**2 * variance * model.plant.n_outputs)
         kept = int(enough[0]) if len(enough) else len(energy)
         self.widening = float(rest[kept]) / model.plant.n_outputs

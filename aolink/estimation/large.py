@@ -15,6 +15,9 @@ FloatArray = NDArray[np.float64]
 
 # Relative to each variance; what a prior knows for certain stays certain to this.
 _JITTER = 1e-10
+# Exposures in which a gain has settled, or there is none; and the relative change of a covariance that is rounding.
+_MOST_EXPOSURES = 1000
+_SETTLED = 1e-11
 
 
 def information(covariance: FloatArray) -> FloatArray:
@@ -64,3 +67,27 @@ def corrected(
         covariance = tiles.congruence(keep, P) + tiles.matmul(told, np.ascontiguousarray(gain.T))
         covariance = (covariance + covariance.T) / 2
     return mean + moved, covariance, S, nis
+
+
+def steady_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:
+    """The gain that a Kalman filter settles at, (n_states, m); None where it does not settle.
+
+    The Riccati equation stepped from exposure to exposure: half a second for hundreds of states, of which a plant
+    forgets what it is not shown.
+
+    Parameters
+    ----------
+    R:
+        Blocks along the diagonal, (blocks, size, size).
+    """
+    blocks, size, _ = R.shape
+    weighted = np.linalg.solve(R, H.reshape(blocks, size, -1)).reshape(H.shape)
+    told = tiles.matmul(np.ascontiguousarray(H.T), weighted)
+    told, P = (told + told.T) / 2, Q
+    for _ in range(_MOST_EXPOSURES):
+        before, after = P, tiles.inverse(information(P) + told)
+        P = tiles.congruence(A, after) + Q
+        P = (P + P.T) / 2
+        if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
+            return tiles.matmul(after, np.ascontiguousarray(weighted.T))
+    return None

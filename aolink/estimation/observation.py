@@ -330,6 +330,8 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
         Covariance of the centroids as blocks along its diagonal, (blocks, size, size), or whole.
     """
     H = model.mean_row
+    if R.ndim == 3 and H.shape[1] > MANY_STATES:
+        return large.steady_gain(model.transition, H, Q, R)
     if R.ndim == 3 and len(H) > H.shape[1]:
         return _compressed_gain(model, Q, R)
     R = linalg.block_diag(*R) if R.ndim == 3 else R
