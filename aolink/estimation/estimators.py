@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -357,6 +358,7 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
     return WindowedMoments(rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux)
 
 
+@lru_cache(maxsize=4)
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file, of all axes or of each; None if there is none."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)

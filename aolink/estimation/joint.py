@@ -61,6 +61,7 @@ class JointPaths:
         self.patterns = np.ascontiguousarray(model.patterns[:, : self.size])
         """(n_outputs, size)"""
         self._by_course = [np.ascontiguousarray(self.patterns[:, own]) for own in self.groups]
+        self._transposed = [np.ascontiguousarray(own.T) for own in self._by_course]
         self._starts = np.cumsum([0] + [len(own) for own in self.groups[:-1]])
         self.course_of = course_of
         functions = model.functions[:, :used]
@@ -108,25 +109,31 @@ class JointPaths:
 
     def information(self, of_shares: FloatArray) -> FloatArray:
         """Information on the coefficients from that on each spot's shares, (spots, 2, m, 2, m) -> (size, size)."""
-        out = np.empty((self.size, self.size))
-        for c, own in enumerate(self.groups):
-            left = np.ascontiguousarray(self._by_course[c].T)
-            for d, other in enumerate(self.groups[: c + 1]):
-                right = self._by_course[d].reshape(self.spots, 2, -1)
-                block = tiles.matmul(left, (of_shares[:, :, c, :, d] @ right).reshape(2 * self.spots, -1))
-                out[np.ix_(own, other)] = block
-                if c != d:
-                    out[np.ix_(other, own)] = block.T
-        return (out + out.T) / 2
+        m = len(self.groups)
+        by_course = np.empty((self.size, self.size))  # in the order of courses
+        flat = of_shares.reshape(self.spots, 2 * m, 2, m)
+        right = [flat[..., d] @ self._by_course[d].reshape(self.spots, 2, -1) for d in range(m)]
+        rows = np.concatenate(right, axis=2).reshape(self.spots, 2, m, -1)
+        for c, start in enumerate(self._starts):
+            end = start + len(self.groups[c])
+            mine = np.ascontiguousarray(rows[:, :, c, :end]).reshape(2 * self.spots, -1)
+            by_course[start:end, :end] = tiles.matmul(self._transposed[c], mine)
+        lower = np.tril(by_course)
+        out = np.empty_like(lower)
+        out[np.ix_(self.order, self.order)] = lower + np.tril(lower, -1).T
+        return out
 
     def spread(self, covariance: FloatArray) -> FloatArray:
         """Covariance of the shares of each spot, from that of the coefficients, (spots, 2, m, 2, m)."""
         m = len(self.groups)
         out = np.empty((self.spots, 2, m, 2, m))
-        for c, own in enumerate(self.groups):
-            for d, other in enumerate(self.groups[: c + 1]):
-                left = tiles.matmul(self._by_course[c], covariance[np.ix_(own, other)]).reshape(self.spots, 2, -1)
-                block = left @ self._by_course[d].reshape(self.spots, 2, -1).swapaxes(1, 2)
+        turned = [own.reshape(self.spots, 2, -1).swapaxes(1, 2) for own in self._by_course]
+        sorted_ = covariance[np.ix_(self.order, self.order)]
+        for c, start in enumerate(self._starts):
+            end = start + len(self.groups[c])
+            left = tiles.matmul(self._by_course[c], sorted_[start:end, :end]).reshape(self.spots, 2, -1)
+            for d, first in enumerate(self._starts[: c + 1]):
+                block = left[:, :, first : first + len(self.groups[d])] @ turned[d]
                 out[:, :, c, :, d] = block
                 out[:, :, d, :, c] = block.swapaxes(1, 2)
         return out
