@@ -26,9 +26,6 @@ from aolink.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
 
-# Squarings of a matrix of which the spectral radius is wanted.
-_SQUARINGS = 5
-
 
 class JointMoments:
     """The estimator `moments` of a plant with hundreds of states, as an observation of `BlurFilter`.
@@ -78,8 +75,9 @@ class JointMoments:
         nodes = paths.of_one_spot()
         precision = paths.prior_information(prior.covariance)
         wide = paths.prior_covariance(prior.covariance)
-        rho = _slowest(model.transition_of_one[None])[0]
-        memory, t, P = _memory(rho), prior.mean, wide
+        # Of hundreds of states the frames hardly show some, whose errors last as long as the plant remembers.
+        memory = _memory(_slowest(model.transition_of_one[None]))[0]
+        t, P = prior.mean, wide
         spread = first = paths.spread_of_spots(wide)
         for to_come in reversed(range(_PASSES)):
             y, noise, fit = self._spot.look(nodes, Belief(paths.shares_of_spots(t), spread), windows)
@@ -93,7 +91,6 @@ class JointMoments:
             t = prior.mean + tiles.matvec(P, score)
             if to_come:
                 spread = paths.spread_of_spots(P)
-                memory = _memory(np.sqrt(rho * _closed_loop(model, P, precision)))
         # The spread to expect of this one innovation is without the memory.
         own = noise + fit.remainder
         H, score = _told(paths, fit, own, new)
@@ -118,19 +115,3 @@ def _told(paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray) ->
     told = stacked.transpose(fit.slope) @ weighted
     shape = (len(told), 2, len(paths.groups))
     return paths.information(told[..., :-1].reshape(*shape, *shape[1:])), paths.score(told[..., -1].reshape(shape))
-
-
-def _closed_loop(model: FactoredModel, covariance: FloatArray, precision: FloatArray) -> float:
-    """By what an error of the start state goes on to the next exposure's, A (I - K H): its spectral radius."""
-    n = model.plant.n_states
-    kept = tiles.matmul(np.ascontiguousarray(covariance[:, :n]), precision[:n, :n])
-    power = tiles.matmul(model.end_rows[:, : len(kept)], kept)
-    log_size, before = 0.0, 0.0
-    for _ in range(_SQUARINGS):
-        size = float(np.sqrt((power * power).sum()))
-        if not 0 < size < np.inf:
-            return 0.0
-        power = tiles.matmul(power / size, power / size)
-        log_size, before = 2 * (log_size + np.log(size)), log_size + np.log(size)
-    last = log_size + 0.5 * np.log(max(float((power * power).sum()), 1e-300))
-    return float(np.exp((last - before) / 2 ** (_SQUARINGS - 1)))
