@@ -39,7 +39,7 @@ _FIRST_DAMPING = 0.01
 _LARGEST_DAMPING = 1e6
 _FREE_DAMPING = 0.1
 # The objective, which is of hundreds of coefficients, changes by less than this at a mode.
-_CONVERGED = 0.1
+_CONVERGED = 0.3
 # Rms of a path's prior, in standard deviations of the kernel, up to which there is one mode that matters.
 _LARGEST_SPREAD = 0.4
 # Relative to the information of a spot: one without pixels has none.
