@@ -62,6 +62,7 @@ class JointPaths:
         """(n_outputs, size)"""
         self._by_course = [np.ascontiguousarray(self.patterns[:, own]) for own in self.groups]
         self._transposed = [np.ascontiguousarray(own.T) for own in self._by_course]
+        self._gram = tiles.gram(self.patterns)
         self._starts = np.cumsum([0] + [len(own) for own in self.groups[:-1]])
         self.course_of = course_of
         functions = model.functions[:, :used]
@@ -158,9 +159,10 @@ class JointPaths:
 
     def rms_spread(self, state_covariance: FloatArray) -> float:
         """Standard deviation of the paths before the exposure, rms over outputs and nodes."""
-        spread = self.spread(self.prior_covariance(state_covariance))
-        own = np.einsum("sdcde->ce", spread) / (2 * self.spots)
-        return float(np.sqrt(max((self.weights * ((self.functions @ own) * self.functions).sum(axis=1)).sum(), 0.0)))
+        summed = (self._gram * self.prior_covariance(state_covariance))[np.ix_(self.order, self.order)]
+        own = np.add.reduceat(np.add.reduceat(summed, self._starts, axis=0), self._starts, axis=1)
+        variance = (self.weights * ((self.functions @ own) * self.functions).sum(axis=1)).sum()
+        return float(np.sqrt(max(variance, 0.0) / len(self.patterns)))
 
     def prior_covariance(self, state_covariance: FloatArray) -> FloatArray:
         """The coefficients' covariance before the exposure, (size, size)."""

@@ -170,14 +170,16 @@ def find_mode(
     """Where a start leads, for a prior with this mean and information."""
     paths, damping = view.paths, _FIRST_DAMPING
 
-    def objective(t: FloatArray, log_likelihood: float) -> float:
-        return float(0.5 * (t - mean) @ tiles.matvec(precision, t - mean)) - log_likelihood
+    def pulled(t: FloatArray, log_likelihood: float) -> tuple[FloatArray, float]:
+        """By the prior, and the objective."""
+        pull = tiles.matvec(precision, t - mean)
+        return pull, 0.5 * float((t - mean) @ pull) - log_likelihood
 
-    t, at = start, view.at(start)
-    now, used = objective(t, at.log_likelihood), 1
+    t, at, used = start, view.at(start), 1
+    pull, now = pulled(t, at.log_likelihood)
     H = precision + paths.information(at.information)
     while used < passes:
-        g = paths.score(at.score) - tiles.matvec(precision, t - mean)
+        g = paths.score(at.score) - pull
         damped = H.copy()
         np.fill_diagonal(damped, np.diagonal(H) * (1 + damping))
         W = large.inverse_root(damped)
@@ -188,9 +190,9 @@ def find_mode(
             break
         there = view.at(t + step)
         used += 1
-        value = objective(t + step, there.log_likelihood)
+        pull_there, value = pulled(t + step, there.log_likelihood)
         if value < now:
-            gain, now, t, at = now - value, value, t + step, there
+            gain, now, t, at, pull = now - value, value, t + step, there, pull_there
             H, damping = precision + paths.information(at.information), damping / 8
             if free and gain < _CONVERGED:
                 break

@@ -9,7 +9,18 @@ import pytest
 from scipy import linalg
 
 from aolink.errors import EstimatorError
-from aolink.estimation import Status, exposure_model, joint, joint_profile, large, make_estimator, observation, run, score, windowed
+from aolink.estimation import (
+    Status,
+    exposure_model,
+    joint,
+    joint_profile,
+    large,
+    make_estimator,
+    observation,
+    run,
+    score,
+    windowed,
+)
 from aolink.estimation import filter as filters
 from aolink.estimation.centroids import centroid_covariance
 from aolink.estimation.estimators import measure
