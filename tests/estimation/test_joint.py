@@ -19,6 +19,7 @@ from aolink.estimation import (
     observation,
     run,
     score,
+    smooth,
     windowed,
 )
 from aolink.estimation import filter as filters
@@ -286,6 +287,15 @@ def test_partly_lit_lenslets_have_their_share_of_the_light():
         found = score(exposures, estimates, 1)
         assert found.nis.low * 0.9 < found.nis.mean < found.nis.high * 1.2
         assert found.end_nees.mean == pytest.approx(288, rel=0.3)
+
+
+def test_what_came_later_tells_more(small_membrane):
+    exposures = simulate(small_membrane, 6)
+    estimates = run(small_membrane, exposures, ["profile"])["profile"]
+    filtered, smoothed = (
+        score(exposures, each).path_rmse for each in (estimates, smooth(small_membrane.plant, exposures, estimates))
+    )
+    assert smoothed < 0.95 * filtered
 
 
 # Trust
