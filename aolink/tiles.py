@@ -17,6 +17,7 @@ FloatArray = NDArray[np.float64]
 _MOST = 131_072
 _ROWS = 24
 _SIDE = 48
+_STRIP = 192
 # A matrix with fewer entries than this share is multiplied by its entries.
 _SPARSE = 0.05
 
@@ -24,27 +25,42 @@ _SPARSE = 0.05
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """(n, k) @ (k, m)"""
     (n, k), m = a.shape, b.shape[1]
-    if not n * k * m:
-        return np.zeros((n, m))
-    columns = max(8, _MOST // (_ROWS * max(k, 1)) // 8 * 8)
-    left = _padded(a, _ROWS, 1).reshape(-1, 1, _ROWS, k)
-    right = np.ascontiguousarray(_padded(b, 1, columns).reshape(k, -1, columns).swapaxes(0, 1))
-    out = np.matmul(left, right[None])
-    return np.ascontiguousarray(out.swapaxes(1, 2).reshape(len(left) * _ROWS, -1)[:n, :m])
+    if min(n, m) == 1:  # BLAS has functions of their own for vectors, which it shares among threads sooner
+        return np.asarray(np.einsum("nk,km->nm", a, b))
+    out = np.zeros((n, m)) if not k else np.empty((n, m))
+    if not out.size or not k:
+        return out
+    # Pieces are views: nothing is copied.
+    columns = max(8, _MOST // (_ROWS * k) // 8 * 8)
+    for some, height in _strips(n, _ROWS):
+        left = a[some].reshape(-1, 1, height, k)
+        for others, width in _strips(m, columns):
+            right = b[:, others].reshape(k, -1, width).swapaxes(0, 1)
+            np.matmul(left, right, out=out[some, others].reshape(len(left), height, -1, width).swapaxes(1, 2))
+    return out
+
+
+def _strips(length: int, side: int) -> list[tuple[slice, int]]:
+    """Whole pieces of a length, and what is left of it, which is more than one; each with its pieces' side."""
+    whole = length // side * side
+    if length - whole == 1 and whole:
+        whole -= side
+    return [(some, step) for some, step in ((slice(0, whole), side), (slice(whole, length), length - whole))
+            if some.stop > some.start]  # fmt: skip
 
 
 def gram(a: FloatArray) -> FloatArray:
     """a' a, (n, m) -> (m, m): half of it, and the other half by symmetry."""
     m = a.shape[1]
-    padded = _padded(a, 1, _SIDE)
-    step = 4 * _SIDE
-    out = np.zeros((padded.shape[1],) * 2)
-    transposed = np.ascontiguousarray(padded.T)
-    for first in range(0, padded.shape[1], step):
-        some = slice(first, first + step)
-        out[some, : first + step] = matmul(transposed[some], padded[:, : first + step])
-    lower = np.tril(out[:m, :m])
-    return np.asarray(lower + np.tril(lower, -1).T)
+    out = np.empty((m, m))
+    transposed = np.ascontiguousarray(a.T)
+    for first in range(0, m, _STRIP):
+        last = min(first + _STRIP, m)
+        out[first:last, :last] = matmul(transposed[first:last], a[:, :last])
+        out[:first, first:last] = out[first:last, :first].T
+        own = np.tril(out[first:last, first:last])
+        out[first:last, first:last] = own + np.tril(own, -1).T
+    return out
 
 
 def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
@@ -95,14 +111,3 @@ def inverse_root(a: FloatArray) -> FloatArray:
 def inverse(a: FloatArray) -> FloatArray:
     """Inverse of a symmetric positive definite matrix; raises as `inverse_root`."""
     return gram(inverse_root(a))
-
-
-def _padded(a: FloatArray, rows: int, columns: int) -> FloatArray:
-    """The same with zeros up to whole multiples of these."""
-    n, m = a.shape
-    more = (-n % rows, -m % columns)
-    if not any(more):
-        return np.ascontiguousarray(a)
-    out = np.zeros((n + more[0], m + more[1]))
-    out[:n, :m] = a
-    return out
