@@ -90,22 +90,44 @@ def inverse_root(a: FloatArray) -> FloatArray:
         It is not positive definite.
     """
     n = len(a)
+    L, own = _cholesky(a)
+    count = len(L)
+    W = np.zeros_like(L)
+    for i in range(count):
+        W[i, i] = own[i]
+        row = np.zeros((i, _SIDE, _SIDE))
+        for k in range(i):
+            row[: k + 1] += L[i, k] @ W[k, : k + 1]
+        W[i, :i] = -own[i] @ row
+    return np.ascontiguousarray(W.swapaxes(1, 2).reshape(count * _SIDE, -1)[:n, :n])
+
+
+def solve(a: FloatArray, x: FloatArray) -> FloatArray:
+    """a^-1 x of a symmetric positive definite matrix, (n,); raises as `inverse_root`."""
+    L, own = _cholesky(a)
+    y = np.zeros((len(L), _SIDE))
+    y.reshape(-1)[: len(x)] = x
+    for i in range(len(L)):
+        y[i] = np.einsum("rc,c->r", own[i], y[i] - np.einsum("krc,kc->r", L[i, :i], y[:i]))
+    for i in reversed(range(len(L))):
+        y[i] = np.einsum("cr,c->r", own[i], y[i] - np.einsum("kcr,kc->r", L[i + 1 :, i], y[i + 1 :]))
+    return y.reshape(-1)[: len(x)]
+
+
+def _cholesky(a: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """L in square blocks, (k, k, side, side), those above the diagonal not zeroed; the inverses of its diagonal's."""
+    n = len(a)
     count = -(-n // _SIDE)
     whole = np.eye(count * _SIDE)
     whole[:n, :n] = a
     L = np.ascontiguousarray(whole.reshape(count, _SIDE, count, _SIDE).swapaxes(1, 2))
-    W = np.zeros_like(L)
+    own = np.empty((count, _SIDE, _SIDE))
     for j in range(count):
-        W[j, j] = np.tril(np.linalg.inv(np.linalg.cholesky(L[j, j])))
-        L[j + 1 :, j] = L[j + 1 :, j] @ W[j, j].T
+        own[j] = np.tril(np.linalg.inv(np.linalg.cholesky(L[j, j])))
+        L[j + 1 :, j] = L[j + 1 :, j] @ own[j].T
         for i in range(j + 1, count):
             L[i, j + 1 : i + 1] -= L[i, j] @ L[j + 1 : i + 1, j].swapaxes(1, 2)
-    for i in range(1, count):
-        row = np.zeros((i, _SIDE, _SIDE))
-        for k in range(i):
-            row[: k + 1] += L[i, k] @ W[k, : k + 1]
-        W[i, :i] = -W[i, i] @ row
-    return np.ascontiguousarray(W.swapaxes(1, 2).reshape(count * _SIDE, -1)[:n, :n])
+    return L, own
 
 
 def inverse(a: FloatArray) -> FloatArray:

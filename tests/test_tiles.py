@@ -36,6 +36,8 @@ def test_the_inverse_of_a_root_gives_the_inverse(n: int) -> None:
     np.testing.assert_array_equal(W, np.tril(W))
     np.testing.assert_allclose(W @ np.linalg.cholesky(a), np.eye(n), atol=1e-8)
     np.testing.assert_allclose(tiles.inverse(a) @ a, np.eye(n), atol=1e-7)
+    x = random(n)
+    np.testing.assert_allclose(tiles.solve(a, a @ x), x, atol=1e-7)
 
 
 def test_a_matrix_without_a_root_is_refused() -> None:

@@ -182,8 +182,7 @@ def find_mode(
         g = paths.score(at.score) - pull
         damped = H.copy()
         np.fill_diagonal(damped, np.diagonal(H) * (1 + damping))
-        W = large.inverse_root(damped)
-        step = tiles.matvec(W.T, tiles.matvec(W, g))
+        step = large.solve(damped, g)
         free = damping <= _FREE_DAMPING
         # What a step would gain says when it is at a mode, before the pixels are looked at again.
         if free and 0.5 * step @ g < _CONVERGED:

@@ -35,6 +35,12 @@ def inverse_root(precision: FloatArray) -> FloatArray:
     return np.asarray(tiles.inverse_root(precision * scale * scale[:, None]) * scale)
 
 
+def solve(precision: FloatArray, score: FloatArray) -> FloatArray:
+    """precision^-1 score, scaled as in `inverse_root`."""
+    scale = 1 / np.sqrt(np.diagonal(precision))
+    return tiles.solve(precision * scale * scale[:, None], score * scale) * scale
+
+
 def corrected(
     mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
