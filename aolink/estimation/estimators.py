@@ -53,7 +53,7 @@ ESTIMATOR_NAMES: tuple[str, ...] = ("open-loop", *_PAPER_ORDERS, "moments", *_OF
 _HIGHEST_ORDER = 8
 # Of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
-# Share of the pixels that `moments` can do with.
+# Share of the pixels that `moments` can do with; and of the spots, where hundreds of states hang together.
 _LEAST_USABLE = 0.5
 # Exposures together, and numbers in them.
 _AT_ONCE = 64
@@ -202,6 +202,7 @@ def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, 
         return measure_spots(
             sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
             least_usable=_LEAST_USABLE, least_significance=_least_significance(sensor),
+            least_spots=_LEAST_USABLE if isinstance(observation, JointMoments | JointProfile) else 1.0,
         )  # fmt: skip
     sensor = sensor.profile
     saturated = is_saturated(sensor, pixels) & exposure.mask

@@ -26,6 +26,9 @@ from aolink.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
 
+# A window without a pixel that can be used has neither moments nor noise.
+_NO_NOISE = 1e-14
+
 
 class JointMoments:
     """The estimator `moments` of a plant with hundreds of states, as an observation of `BlurFilter`.
@@ -77,13 +80,14 @@ class JointMoments:
         wide = paths.prior_covariance(prior.covariance)
         # Of hundreds of states the frames hardly show some, whose errors last as long as the plant remembers.
         memory = _memory(_slowest(model.transition_of_one[None]))[0]
-        t, P = prior.mean, wide
+        t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
         spread = first = paths.spread_of_spots(wide)
         for to_come in reversed(range(_PASSES)):
             y, noise, fit = self._spot.look(nodes, Belief(paths.shares_of_spots(t), spread), windows)
+            noise = noise + _NO_NOISE * np.eye(noise.shape[-1])
             light = None
             if self._spot.flux == "measured":
-                light = (y / np.sqrt(np.einsum("skk->sk", noise)))[:, 0].min()
+                light = (y[lit] / np.sqrt(np.einsum("skk->sk", noise[lit])))[:, 0].min()
                 y, noise, fit = self._spot._ratios(y, noise, fit)
             new = y - fit.expected - stacked.matvec(fit.slope, paths.shares_of_spots(prior.mean - t))
             H, score = _told(paths, fit, noise + memory * fit.remainder, new)

@@ -330,6 +330,28 @@ def test_a_part_of_a_window_that_is_missing_is_left_out(small_membrane, name):
     np.testing.assert_allclose(found.path, whole.path, atol=2 * whole.path_sd.max())
 
 
+@pytest.mark.parametrize(("name", "flux"), [("moments", "known"), ("moments", "measured"), ("profile", "known")])
+def test_a_window_that_is_missing_costs_its_own_spot(small_membrane, name, flux):
+    rig, exposures = small_membrane, simulate(small_membrane, 5)
+    mask = np.ones(rig.sensor.shape, dtype=bool)
+    mask[16:32, :16] = False
+    estimators = [make_estimator(rig, name, flux=flux) for _ in range(2)]
+    for exposure in exposures[:4]:
+        whole, found = (each.step(exposure) for each in estimators)
+    whole = estimators[0].step(exposures[4])
+    found = estimators[1].step(dataclasses.replace(exposures[4], mask=mask))
+    assert found.status == Status.OK
+    assert found.reason == "1 of 16 spots left out: 256 of 4096 pixels are missing"
+    own = slice(8, 10)  # the fifth spot's slopes, known by those around it, and worse than before
+    assert (found.path_sd[own] > whole.path_sd[own]).all()
+    truth = exposures[4].truth.path
+    assert np.sqrt(np.mean((found.path - truth) ** 2)) < 1.5 * np.sqrt(np.mean((whole.path - truth) ** 2))
+    mask[:, :32] = False
+    mask[:32] = False
+    gone = estimators[1].step(dataclasses.replace(exposures[4], mask=mask))
+    assert gone.status == Status.INPUT_INVALID
+
+
 def test_estimators_of_few_coefficients_are_refused(membrane):
     for name in ("mixture", "sampled"):
         with pytest.raises(EstimatorError, match="at most 64 states of one plant, membrane-12x12 has 288: use profile"):
