@@ -11,6 +11,10 @@ start from the truth found nothing better in nine of ten. Where the prior leaves
 of what a spot is wide there are many modes, and one of them says little: there, as in the first exposures of a
 recording, windowed moments of all spots (`JointMoments`) are taken instead, whose covariance says what they cannot
 tell apart.
+
+36 actuators before 16 lenslets are few enough for the dense `profile` with all its starts: path RMSE 0.090 there, 0.088
+here, 3 s and 20 ms a frame. The covariance at a mode is a little small: NEES of the start state 330 for 288 states, of
+the end state 285, and no better with more coefficients or nodes.
 """
 
 from __future__ import annotations
@@ -229,9 +233,8 @@ class JointProfile:
                 self.sensor, paths.with_inputs(response, axis), measured.density[axis], measured.mask[axis], light
             )
             before, P = prior.mean[axis, : paths.size], prior.covariance[axis, :n, :n]
-            precision = paths.prior_information(P)
             if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
-                mode = find_mode(view, before, precision, before)
+                mode = find_mode(view, before, paths.prior_information(P), before)
                 t, after, at = mode.t, tiles.gram(large.inverse_root(mode.precision)), mode.at
             else:
                 t, after, *_ = self._moments.corrected(model, view.paths, Belief(before, P), by_spot(measured, axis))
