@@ -41,6 +41,24 @@ def blockwise(
     return whole
 
 
+def alike(A: FloatArray, *columns: FloatArray) -> Indices | None:
+    """States of systems side by side that are all the same, each with one column of its own in other matrices.
+
+    Returns
+    -------
+    (systems, n): system a has the states ``order[a]``, and column a of each of ``columns``, (n_states, systems).
+    None where A does not fall apart into such systems.
+    """
+    parts = components(A)
+    if len({len(part) for part in parts}) > 1 or any(each.shape[1] != len(parts) for each in columns):
+        return None
+    order = np.stack(parts)
+    blocks = A[order[:, :, None], order[:, None, :]]
+    own = [np.stack([each[part, a] for a, part in enumerate(parts)]) for each in columns]
+    whole = all(np.count_nonzero(each) == np.count_nonzero(mine) for each, mine in zip(columns, own, strict=True))
+    return order if whole and all((each == each[0]).all() for each in (blocks, *own)) else None
+
+
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     """P = A P A' + Q for a stable A, (n, n)."""
 

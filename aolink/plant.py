@@ -13,13 +13,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.blocks import Indices, blockwise, components, eigenvalues, null_space
+from aolink import tiles
+from aolink.blocks import Indices, alike, blockwise, components, eigenvalues, null_space
 from aolink.rig import Plant, Rig
 
 FloatArray = NDArray[np.float64]
 
 _BLOCK_STEPS = 32
 _SMALL_PRODUCT = 100_000
+MANY_STATES = 64
+"""With more states than this a plant's matrices are large: a mirror is taken by its actuators."""
 _LARGEST_CHECK = 200_000
 # A mode that shrinks to this over one exposure is gone before the next, whatever the camera saw of it.
 _FORGOTTEN = 1e-3
@@ -42,6 +45,45 @@ def output_rows(plant: Plant, n_steps: int) -> FloatArray:
         rows = np.concatenate([rows, rows @ power])
         power = power @ power
     return np.ascontiguousarray(rows[:n_steps].transpose(1, 0, 2))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AlikeSystems:
+    """A plant of many inputs, each of which moves a small system of its own, all alike: outputs mix what these do.
+
+    A = I (x) A_1 and so on, C = gains (x) C_1.
+    """
+
+    one: Plant
+    """One of them, with unit noise; its output is what the plant's outputs see of it."""
+    gains: FloatArray
+    """(n_outputs, systems)"""
+    noise_sd: FloatArray
+    """Standard deviation of the noise of each, (systems,)."""
+    order: Indices
+    """States of each, (systems, n)."""
+
+
+@lru_cache(maxsize=16)
+def alike_systems(plant: Plant) -> AlikeSystems | None:
+    """The systems of a large plant that falls apart into such; None for another one, or one with few states."""
+    W = plant.process_noise
+    if plant.n_states <= MANY_STATES or np.count_nonzero(W - np.diag(np.diag(W))):
+        return None
+    order = alike(plant.A, plant.B, plant.B_w)
+    if order is None:
+        return None
+    seen = np.flatnonzero(np.abs(plant.C).max(axis=0)[order].max(axis=0))
+    if len(seen) != 1:
+        return None
+    first, n = order[0], order.shape[1]
+    one = Plant(
+        A=plant.A[np.ix_(first, first)], B=plant.B[first, :1], B_w=plant.B_w[first, :1], C=np.eye(n)[seen],
+        process_noise=np.eye(1), initial_mean=np.zeros(n), initial_covariance=np.eye(n), axes=1,
+    )  # fmt: skip
+    return AlikeSystems(
+        one=one, gains=np.ascontiguousarray(plant.C[:, order[:, seen[0]]]), noise_sd=np.sqrt(np.diag(W)), order=order
+    )
 
 
 @lru_cache(maxsize=64)
@@ -107,6 +149,13 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
         printed predictor has the inputs in reverse order and one step early.)
     """
     axes, k, n_u = u.shape
+    systems = alike_systems(plant)
+    if systems is not None:
+        own, ends = input_response(systems.one, u.transpose(0, 2, 1).reshape(axes * n_u, k, 1))
+        paths = [tiles.matmul(systems.gains, each) for each in own.reshape(axes, n_u, k)]
+        end = np.empty((axes, plant.n_states))
+        end[:, systems.order] = ends.reshape(axes, n_u, -1)
+        return np.stack(paths), end
     toeplitz, rows, kicks, transition = _block_maps(plant)
     length = toeplitz.shape[0] // n_u
     # Zeros in front leave a plant at rest at rest, so the last block ends where the inputs do.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
@@ -16,6 +17,8 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.exposure_model import exposure_model
 from aolink.estimation.filter import BlurFilter, Noise, Posterior, added_noise
 from aolink.estimation.filterpy_engine import FilterpyMoments
+from aolink.estimation.joint_moments import JointMoments
+from aolink.estimation.joint_profile import JointProfile
 from aolink.estimation.measuring import Measured, Measurements
 from aolink.estimation.moments import Flux
 from aolink.estimation.observation import Observation, PathMoments, steady_gain
@@ -24,6 +27,7 @@ from aolink.estimation.two_states import Run
 from aolink.estimation.windowed import Basis, WindowedMoments
 from aolink.estimation.windowed_spots import WindowedSpots
 from aolink.exposure import Exposure
+from aolink.plant import MANY_STATES, alike_systems
 from aolink.rig import Rig, SpotSensor
 
 if TYPE_CHECKING:
@@ -55,7 +59,7 @@ class Estimator:
             self.options = options = replace(options, gain="time-varying")
         self._observation = _observation(rig, name, options)
         self._filter: BlurFilter | HypothesisFilter
-        if name in _OF_PIXELS:
+        if name in _OF_PIXELS and not isinstance(self._observation, JointProfile):
             self._filter = _of_pixels(rig, name, options)
         else:
             predict = self._observation.predict if isinstance(self._observation, FilterpyMoments) else None
@@ -215,7 +219,15 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     orders = tuple(chosen.orders)
     if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
-    if name in _OF_PIXELS and isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None:
+    joint = alike_systems(rig.plant) is not None
+    if name in _OF_PIXELS and rig.plant.n_states > MANY_STATES and not (name == "profile" and joint):
+        alike = "" if name != "profile" else " that is not of alike systems side by side"
+        raise EstimatorError(
+            f"{name} follows the readings of a blur for at most {MANY_STATES} states of one plant, {rig.name} has"
+            f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
+        )
+    partly_lit = isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None
+    if name in _OF_PIXELS and partly_lit and not joint:
         raise EstimatorError(
             f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets: use moments or o3"
         )
@@ -224,7 +236,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f"engine 'filterpy' runs {', '.join(_PAPER_ORDERS)} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
-    if name == "moments" and rig.plant.n_outputs > 2 * _MOST_SPOTS:
+    if name == "moments" and rig.plant.n_outputs > 2 * _MOST_SPOTS and not joint:
         raise EstimatorError(
             f"moments looks at each two spots that one plant moves together: at most {_MOST_SPOTS},"
             f" {rig.name} has {rig.plant.n_outputs // 2}; use o3"
@@ -242,6 +254,11 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
     if rig.plant.n_outputs > 1:
         assert isinstance(rig.sensor, SpotSensor)
         spots = rig.plant.n_outputs // 2
+        if alike_systems(rig.plant) is not None:
+            if name == "profile":
+                return JointProfile(rig.sensor, rig.plant.n_outputs)
+            of = options.orders, options.basis, options.flux
+            return JointMoments(rig.sensor, rig.plant.n_outputs, of[0], basis=of[1], flux=of[2])
         return WindowedSpots(rig.sensor, spots, options.orders, basis=options.basis, flux=options.flux)
     return WindowedMoments(rig.sensor.profile, options.orders, basis=options.basis, flux=options.flux)
 
@@ -262,6 +279,7 @@ def _of_pixels(rig: Rig, name: str, options: Options) -> HypothesisFilter:
     return pixels
 
 
+@lru_cache(maxsize=4)
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
     """The gain of o1 with the noise that a frame has by the rig file, of all axes or of each; None if there is none."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation import stacked
-from aolink.plant import input_response, lift, output_rows, psd_root
+from aolink.plant import alike_systems, input_response, lift, output_rows, psd_root
 from aolink.rig import Plant
 
 FloatArray = NDArray[np.float64]
@@ -94,6 +94,10 @@ class ExposureModel:
         first, last = self.plant.C, self.last_rows
         squares = last[:, :, None] * last[:, None, :] - first[:, :, None] * first[:, None, :]
         return np.asarray(mean + self.moved * squares)
+
+    def times_quadratic(self, state: FloatArray) -> FloatArray:
+        """M x for each output, states (axes, n_states) -> (axes, n_outputs, n_states)."""
+        return np.asarray(np.matmul(self.quadratic, state[:, None, :, None])[..., 0])
 
     @cached_property
     def last_rows(self) -> FloatArray:
@@ -246,7 +250,12 @@ def exposure_model(plant: Plant, n_steps: int, offset: float = 0.0) -> ExposureM
 
 @lru_cache(maxsize=16)
 def _made_once(plant: Plant, n_steps: int, offset: float) -> ExposureModel:
-    return exposure_model(plant, n_steps).starting(offset) if offset else ExposureModel(plant, n_steps)
+    from aolink.estimation.factored_model import FactoredModel  # which is one
+
+    if offset:
+        return exposure_model(plant, n_steps).starting(offset)
+    systems = alike_systems(plant)
+    return ExposureModel(plant, n_steps) if systems is None else FactoredModel(plant, n_steps, systems)
 
 
 def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:

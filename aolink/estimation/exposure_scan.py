@@ -20,7 +20,7 @@ from aolink.estimation.centroids import centroid_covariance
 from aolink.estimation.exposure_model import exposure_model
 from aolink.estimation.filter import added_noise
 from aolink.estimation.observation import steady_gain
-from aolink.plant import lift, psd_root
+from aolink.plant import MANY_STATES, lift, psd_root
 from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]
@@ -73,10 +73,15 @@ def exposure_scan(rig: Rig, steps: Iterable[int] | None = None) -> list[Expected
     Raises
     ------
     EstimatorError
-        The plant has too many outputs, or a mode that neither dies out nor is seen.
+        The plant has too many outputs or states, or a mode that neither dies out nor is seen.
     """
     if rig.plant.n_outputs > _MOST_OUTPUTS:
         raise EstimatorError(f"an exposure scan takes {_MOST_OUTPUTS} outputs at most, {rig.name} has more")
+    if rig.plant.n_states > MANY_STATES:
+        raise EstimatorError(
+            f"an exposure scan takes {MANY_STATES} states of one plant at most, {rig.name} has {rig.plant.n_states}:"
+            " scan one with fewer actuators"
+        )
     return [_expected(with_exposure(rig, n)) for n in (candidates(rig) if steps is None else steps)]
 
 

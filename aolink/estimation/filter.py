@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from aolink import tiles
 from aolink.estimation import entries, stacked, two_states
 from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
 from aolink.estimation.moments import Measurement
 from aolink.estimation.observation import MOST_COVARIANCES, Belief, Correction, Observation, PathMoments
-from aolink.plant import input_response, lift
+from aolink.plant import MANY_STATES, input_response, lift
 from aolink.rig import Plant
 
 FloatArray = NDArray[np.float64]
@@ -214,7 +215,8 @@ def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: F
     """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
     mean = _predicted_mean(belief.mean, transition, kick)
     if max(transition.shape) > entries.MOST_ROWS:
-        return Belief(mean, stacked.symmetric(stacked.congruence(transition, belief.covariance) + noise))
+        spread = tiles.congruences if max(transition.shape) > MANY_STATES else stacked.congruence
+        return Belief(mean, stacked.symmetric(spread(transition, belief.covariance) + noise))
     P, Q = entries.unpack(belief.covariance), entries.unpack(noise)
     covariance = entries.congruence_by_numbers(transition.tolist(), P, Q)
     return Belief(mean, entries.pack(covariance, len(belief.covariance)))

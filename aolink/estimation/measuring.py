@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.estimation.joint_moments import JointMoments
+from aolink.estimation.joint_profile import JointProfile
 from aolink.estimation.moments import Measurement, least_significance, measure_moments, spot_significance
 from aolink.estimation.observation import Observation, PathMoments
 from aolink.estimation.options import Options
@@ -22,7 +24,7 @@ FloatArray = NDArray[np.float64]
 Measured = tuple[Measurement | Profile | SpotWindows | None, str]
 """What an observation takes of an exposure, or nothing; and what there is to say about it."""
 
-# Share of the pixels that `moments` can do with.
+# Share of the pixels that `moments` can do with; and of the spots, where hundreds of states hang together.
 _LEAST_USABLE = 0.5
 
 
@@ -81,6 +83,7 @@ def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, 
         return measure_spots(
             sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
             least_usable=_LEAST_USABLE, least_significance=_least_significance(sensor),
+            least_spots=_LEAST_USABLE if isinstance(observation, JointMoments | JointProfile) else 1.0,
         )  # fmt: skip
     sensor = sensor.profile
     saturated = is_saturated(sensor, pixels) & exposure.mask

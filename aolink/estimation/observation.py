@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from aolink.estimation import entries, stacked, two_states
+from aolink.estimation import entries, large, stacked, two_states
 from aolink.estimation.entries import Entry
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.moments import Measurement
+from aolink.plant import MANY_STATES
 
 FloatArray = NDArray[np.float64]
 
@@ -92,7 +93,10 @@ class PathMoments:
             blocks = measured.covariance.shape[1]
             if blocks > 1 and not self.crosses:
                 expected, slope = many_moments(model, response, prior.mean, self.orders)
-                return corrected_by_blocks(prior, measured.value - expected, slope, measured.covariance, self.gain)
+                innovation = measured.value - expected
+                if prior.mean.shape[1] > MANY_STATES:
+                    return _corrected_large(prior, innovation, slope, measured.covariance, self.gain)
+                return corrected_by_blocks(prior, innovation, slope, measured.covariance, self.gain)
             measured = replace(measured, covariance=measured.covariance[:, 0])
         h, H = _moment_entries(model, response, prior.mean, self.orders, crosses=self.crosses)
         axes = len(prior.mean)
@@ -166,7 +170,7 @@ def many_moments(
         moments.append(state @ rows.T + response.mean)
         slopes.append(np.broadcast_to(rows, (axes, *rows.shape)))
     if 2 in orders:
-        half = np.matmul(model.quadratic, state[:, None, :, None])[..., 0] + response.slope
+        half = model.times_quadratic(state) + response.slope
         moments.append(np.matmul(half + response.slope, state[:, :, None])[..., 0] + response.square)
         slopes.append(2 * half)
     return np.stack(moments, axis=2).reshape(axes, -1), np.stack(slopes, axis=2).reshape(axes, -1, n)
@@ -243,6 +247,17 @@ def corrected_by_blocks(
     return Correction(Belief(prior.mean + moved, covariance), innovation, S, nis)
 
 
+def _corrected_large(
+    prior: Belief, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
+) -> Correction:
+    """`corrected_by_blocks` for many states; of the innovation covariance there is the diagonal."""
+    axes = len(innovation)
+    gains = [None] * axes if gain is None else np.broadcast_to(gain, (axes, *gain.shape[-2:]))
+    every = zip(prior.mean, prior.covariance, innovation, H, R, gains, strict=True)
+    mean, covariance, S, nis = (np.stack(each) for each in zip(*(large.corrected(*one) for one in every), strict=True))
+    return Correction(Belief(mean, covariance), innovation, S, nis)
+
+
 def _corrected_small(
     prior: Belief, innovation: list[Entry], H: entries.Matrix, R: FloatArray, gain: FloatArray | None
 ) -> Correction:
@@ -286,6 +301,8 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
         Covariance of the centroids as blocks along its diagonal, (blocks, size, size), or whole.
     """
     H = model.mean_row
+    if R.ndim == 3 and H.shape[1] > MANY_STATES:
+        return large.steady_gain(model.transition, H, Q, R)
     if R.ndim == 3 and len(H) > H.shape[1]:
         return _compressed_gain(model, Q, R)
     R = linalg.block_diag(*R) if R.ndim == 3 else R

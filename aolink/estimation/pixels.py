@@ -315,11 +315,15 @@ class PixelView:
         return self.read_noise + self.gain * np.maximum(f, 0.0)
 
     def _terms(self) -> list[float]:
-        """c^j / j!, c the kernel's covariance of the two directions."""
-        (xx, xy), (_, yy) = self._kernel
-        rho = abs(xy) / math.sqrt(xx * yy)
-        count = 1 if rho == 0 else min(_MOST_TERMS, math.ceil(math.log(_SERIES) / math.log(rho)))
-        return [xy**j / math.factorial(j) for j in range(count)]
+        return mehler_series(self._kernel)
+
+
+def mehler_series(kernel: FloatArray) -> list[float]:
+    """c^j / j!, c the kernel's covariance of the two directions, (2, 2), as far as terms matter."""
+    (xx, xy), (_, yy) = kernel
+    rho = abs(xy) / math.sqrt(xx * yy)
+    count = 1 if rho == 0 else min(_MOST_TERMS, math.ceil(math.log(_SERIES) / math.log(rho)))
+    return [xy**j / math.factorial(j) for j in range(count)]
 
 
 @lru_cache(maxsize=16)

@@ -69,7 +69,7 @@ def _summed(sensor: SpotSensor, light: NDArray[np.float32]) -> FloatArray:
 
 def measure_spots(
     sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, orders: Sequence[int] | None,
-    flux: Flux, *, least_usable: float, least_significance: FloatArray | float,
+    flux: Flux, *, least_usable: float, least_significance: FloatArray | float, least_spots: float = 1.0,
 ) -> tuple[Measurement | Profile | SpotWindows | None, str]:  # fmt: skip
     """What a frame says of each axis, or nothing; and how many axes it says nothing of, and why.
 
@@ -84,6 +84,8 @@ def measure_spots(
         Share of a profile's pixels that the profiles themselves can do with.
     least_significance:
         By how many standard deviations of noise a spot must stand out, (n_outputs,) or one for all.
+    least_spots:
+        Share of the spots of one copy of the plant that must be usable; of the others' windows nothing is.
     """
     saturated = is_saturated(sensor, pixels) & arrived
     light = None if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)
@@ -101,7 +103,15 @@ def measure_spots(
     lit = spot_significance(sensor.profile, density) >= least_significance
     if orders and flux == "measured":
         lit &= _enough_light(sensor.profile, found.counts)
-    usable: BoolArray = np.asarray((whole & lit).reshape(plant.axes, plant.n_outputs).all(axis=1))
+    good: BoolArray = np.asarray((whole & lit).reshape(plant.axes, plant.n_outputs))
+    usable: BoolArray = np.asarray(good.all(axis=1))
+    left_out = 0
+    if seen is not None and least_spots < 1:
+        of_spot: BoolArray = np.asarray(good.reshape(plant.axes, -1, 2).all(axis=2))
+        usable = np.asarray(of_spot.mean(axis=1) >= least_spots)
+        left_out = int(np.count_nonzero(~of_spot[usable]))
+        kept = of_spot[:, :, None, None]
+        seen = replace(seen, density=np.where(kept, seen.density, 0.0), mask=seen.mask & kept)
     reasons = [
         (np.count_nonzero(spot_windows(sensor, ~arrived)), f"of {pixels.size} pixels are missing"),
         (np.count_nonzero(spot_windows(sensor, saturated)), f"of {pixels.size} pixels are at an end of the scale"),
@@ -110,6 +120,8 @@ def measure_spots(
     remark = ", ".join(f"{count} {what}" for count, what in reasons if count)
     if not usable.all():
         remark = f"{int((~usable).sum())} of {plant.axes} axes predicted: {remark}"
+    elif left_out:
+        remark = f"{left_out} of {sensor.spots} spots left out: {remark}"
     elif remark:
         remark += ": left out"
     if not usable.any():

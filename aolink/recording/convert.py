@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame
@@ -112,7 +113,7 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
     """An estimate as it is recorded: the path as coefficients of the exposure basis."""
     axes, n_states = estimate.end_state.shape
     spread = estimate.innovation_covariance.ravel()
-    return pb.Estimate(
+    message = pb.Estimate(
         estimator=estimate.estimator,
         frame_id=estimate.frame_id,
         first_step=estimate.first_step,
@@ -124,14 +125,30 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
         n_coefficients=estimate.coefficients.shape[1],
         n_measurements=estimate.innovation.shape[1],
         end_state=estimate.end_state.ravel(),
-        end_covariance=estimate.end_covariance.ravel(),
         coefficients=estimate.coefficients.ravel(),
-        coefficient_covariance=estimate.coefficient_covariance.ravel(),
         innovation=estimate.innovation.ravel(),
         innovation_covariance=spread if estimate.innovation_covariance.ndim == 3 else None,
         innovation_variance=spread if estimate.innovation_covariance.ndim == 2 else None,
         nis=estimate.nis,
     )
+    for name in ("end_covariance", "coefficient_covariance"):
+        _fill(message, name, getattr(estimate, name))
+    return message
+
+
+def _fill(message: Message, field: str, values: NDArray[np.float64]) -> None:
+    """Numbers as the bytes that they have on the wire: of half a million it takes a tenth of the time."""
+    data = np.ascontiguousarray(values, dtype="<f8").tobytes()
+    packed = 8 * message.DESCRIPTOR.fields_by_name[field].number + 2
+    message.MergeFromString(_varint(packed) + _varint(len(data)) + data)
+
+
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 127:
+        out.append(value & 127 | 128)
+        value >>= 7
+    return bytes([*out, value])
 
 
 def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: Exposure) -> Estimate:

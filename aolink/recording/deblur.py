@@ -88,7 +88,10 @@ def motion(
     for axis in range(axes):
         if weights[:, axis].any():
             mixed = weights[:, axis] if outputs is None else weights[:, axis] @ outputs
-            rows = np.tensordot(mixed, paths[:, :, :count], axes=1)
+            if paths.ndim == 2:  # courses of the coefficients, the outputs their patterns
+                rows = mixed[:, None, :count] * paths[:, :count]
+            else:
+                rows = np.tensordot(mixed, paths[:, :, :count], axes=1)
             if after:
                 end = weights[:, axis] @ model.plant.C @ model.end_rows[:, :count]
                 rows = np.concatenate([rows, end[:, None]], axis=1)

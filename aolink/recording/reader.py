@@ -17,7 +17,7 @@ from mcap.records import Message as McapMessage
 from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
-from aolink.estimation import Estimate, ExposureModel
+from aolink.estimation import Estimate, ExposureModel, exposure_model
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
@@ -145,7 +145,7 @@ class Recording:
     @cached_property
     def model(self) -> ExposureModel:
         """The exposure model that expands the recorded coefficients."""
-        return ExposureModel(self.rig.plant, self.rig.timing.exposure_steps)
+        return exposure_model(self.rig.plant, self.rig.timing.exposure_steps)
 
     def messages(
         self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None

@@ -23,7 +23,7 @@ from google.protobuf.message import Message
 from mcap.records import Schema
 
 from aolink.errors import RecordingError
-from aolink.estimation import ExposureModel
+from aolink.estimation import exposure_model
 from aolink.recording import topics
 from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
@@ -55,7 +55,7 @@ def begin_recording(
     Of ``attachments``, by name, those are added that are not of its own.
     """
     file.start()
-    model = ExposureModel(rig.plant, rig.timing.exposure_steps)
+    model = exposure_model(rig.plant, rig.timing.exposure_steps)
     outputs, basis = model.factors
     # Of a large one only the columns of the start state, which are all that o1 to o3 have.
     basis = basis if basis.nbytes <= _LARGEST_BASIS else basis[..., : rig.plant.n_states]

@@ -24,7 +24,7 @@ from aolink.exposure import Exposure, Picture
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
-from aolink.rig import Rig
+from aolink.rig import MirrorDriver, Rig
 from aolink.session.report import LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.clock import QUERY_PERIOD_S, WARM_UP_QUERIES
@@ -32,7 +32,8 @@ from aolink.wire.hub import Hub
 from aolink.wire.link import Link
 
 LEAD_BLOCKS = 3
-"""Command blocks that are queued on the device ahead of time."""
+"""Command blocks that are queued on the device ahead of time; of a queue of more than eight, all but five."""
+_ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
 """Real time: from the first command to its first step."""
 _LINK_PERIOD_S = 1.0
@@ -49,6 +50,14 @@ Inputs = Callable[[int, int], NDArray[np.float64]]
 
 Watch = Callable[[Exposure, Sequence[Estimate]], None]
 """Told each exposure with its estimates; must not take time."""
+
+
+def lead_steps(mirror: MirrorDriver) -> int:
+    """How far ahead of the device commands are sent, fast steps.
+
+    A queue of more than eight blocks is time for estimators that take longer than three.
+    """
+    return max(LEAD_BLOCKS * mirror.block_steps, mirror.queue_steps - _ROOM_BLOCKS * mirror.block_steps)
 
 
 class SessionLoop:
@@ -177,7 +186,7 @@ class SessionLoop:
             self._send_commands(self._device_step())
         if hub.virtual:
             return 0.0
-        ahead = self._queued_until - self._device_step() - LEAD_BLOCKS * self._rig.mirror.block_steps
+        ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
         due = [self._next_query_ns - now, max(ahead, 0) * self._step_ns]
         if (timeout_ns := self._mirror.next_timeout_ns()) is not None:
             due.append(timeout_ns - now)
@@ -185,7 +194,7 @@ class SessionLoop:
 
     def _send_commands(self, device_step: int) -> None:
         block_steps, end_step = self._rig.mirror.block_steps, self._end_step
-        horizon = device_step + LEAD_BLOCKS * block_steps
+        horizon = device_step + lead_steps(self._rig.mirror)
         while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
             n_steps = block_steps if end_step is None else min(block_steps, end_step - self._queued_until)
             since_start = self._queued_until - self._first_step

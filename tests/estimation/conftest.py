@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aolink.rig import Plant, Rig, load_rig
+from aolink.rig import Plant, Rig, load_rig, parse_rig
 
 
 @pytest.fixture(scope="session")
@@ -36,3 +36,17 @@ def with_axes():
         return dataclasses.replace(plant, axes=axes)
 
     return change
+
+
+@pytest.fixture(scope="session")
+def small_membrane() -> Rig:
+    """membrane-12x12 with 6 x 6 actuators and 4 x 4 lenslets: 72 states, 32 slopes, small enough for dense models."""
+    text = load_rig("membrane-12x12").toml
+    for old, new in (
+        ("actuators = [12, 12]", "actuators = [6, 6]"), ("grid = [10, 10]", "grid = [4, 4]"),
+        ("pitch_m = 1.0e-3", "pitch_m = 2.0e-3"), ("pad_radius_m = 0.45e-3", "pad_radius_m = 0.9e-3"),
+        ("process_noise = 300.0", "process_noise = 6.0"),
+    ):  # fmt: skip
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    return parse_rig(text)

@@ -66,6 +66,8 @@ def test_the_command_recommends_the_best(aolink):
 def test_what_has_no_steady_state_or_is_too_large_is_refused():
     with pytest.raises(EstimatorError, match="256 outputs at most"):
         exposure_scan(load_rig("sh-30x30"))
+    with pytest.raises(EstimatorError, match="64 states of one plant at most, membrane-12x12 has 288"):
+        exposure_scan(load_rig("membrane-12x12"))
     text = LIVELY.toml.replace("C = [[1.0, 0.0]]", "C = [[1.0, 0.0, 0.0]]").replace(
         "A = [[1.0000, 0.0010], [-0.0197, 0.9704]]", "A = [[0.9, 0, 0], [0, 0.9, 0], [0, 0, 1]]"
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from aolink.demo import simulated_rig
 from aolink.estimation import run
 from aolink.recording import convert
+from aolink.recording.deblur import motion
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
@@ -50,6 +52,31 @@ def test_the_attached_arrays_expand_the_recorded_coefficients(pupil: Session) ->
         path = np.tensordot(outputs, basis[..., :count] @ estimate.coefficients[0], axes=1)
         response = estimate.model.response(estimate.inputs).path[0]
         np.testing.assert_allclose(estimate.path, path + response, atol=1e-10)
+
+
+def test_a_plant_of_hundreds_of_states_is_recorded_as_patterns_and_courses(tmp_path: Path) -> None:
+    """144 actuators before 100 lenslets: what expands the coefficients takes two megabytes."""
+    names, path = ("o3", "profile"), tmp_path / "session.mcap"
+    with simulated_rig("membrane-12x12") as (camera, mirror):
+        record(load_rig("membrane-12x12"), camera, mirror, path, estimators=names, exposures=2)
+    recording = Recording(path)
+    attached = [recording.attachments[f"exposure_{name}.npy"] for name in ("outputs", "basis")]
+    assert sum(map(len, attached)) < 3e6
+    patterns, courses = (np.load(io.BytesIO(each)) for each in attached)
+    for name, again in reestimate(recording, names).items():
+        recorded = recording.estimates(name)
+        assert first_difference(recorded, again) is None
+        estimate = recorded[-1]
+        z = estimate.coefficients[0]
+        path_of_z = patterns[:, : len(z)] @ (z * courses[:, : len(z)]).T
+        np.testing.assert_allclose(
+            estimate.path, path_of_z + estimate.model.response(estimate.inputs).path[0], atol=1e-10
+        )
+    mix = np.eye(2, 200)
+    mixed, covariance = motion(estimate, mix)
+    np.testing.assert_allclose(mixed, estimate.path[:2], atol=1e-12)
+    missing = estimate.path_sd[:2].ravel() ** 2 - np.diag(covariance)
+    np.testing.assert_allclose(missing, np.repeat(estimate.model.noise.left_out[:2], 200), atol=1e-12)
 
 
 def test_a_whole_innovation_covariance_of_an_older_file_is_read() -> None:

@@ -12,10 +12,16 @@ from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
 from aolink.session import open_devices
-from aolink.session.loop import SessionLoop
+from aolink.session.loop import SessionLoop, lead_steps
 from aolink.wire import messages_pb2 as pb
 
 RIG = load_rig("section-vi")
+
+
+def test_a_long_queue_is_kept_full_and_others_are_three_blocks_ahead() -> None:
+    assert lead_steps(RIG.mirror) == 3 * RIG.mirror.block_steps
+    slow = load_rig("membrane-12x12").mirror
+    assert 200 < lead_steps(slow) == slow.queue_steps - 5 * slow.block_steps
 
 
 def test_on_virtual_time_one_line_waits_for_the_other() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import statistics
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -190,3 +192,44 @@ def profile_of_many_axes() -> Row:
 def mixture_of_many_axes() -> Row:
     """1800 mixtures."""
     return _of_many_axes("mixture", 400)
+
+
+def membrane_in_real_time() -> list[Row]:
+    """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and what memory it takes."""
+    from aolink.estimation import ExposureModel, make_estimator
+    from aolink.plant import alike_systems
+    from aolink.simulation.model import simulate
+
+    rig = load_rig("membrane-12x12")
+    exposures = simulate(rig, 24)
+    estimators = {name: make_estimator(rig, name) for name in ("o3", "moments", "profile")}
+    times: dict[str, list[float]] = {name: [] for name in estimators}
+    for number, exposure in enumerate(exposures[:-1]):
+        for name, estimator in estimators.items():
+            took = timed(lambda estimator=estimator, exposure=exposure: estimator.step(exposure))  # type: ignore[misc]
+            if number >= 5:  # the first ones make the model, and are wider
+                times[name].append(took)
+    rows = [
+        Row(
+            f"{name} of 288 states, 100 lenslets",
+            f"{1e3 * statistics.median(each):.0f} ms, slowest {1e3 * max(each):.0f}",
+            "5 Hz: 200 ms",
+            0.2 / statistics.median(each),
+            1,
+        )
+        for name, each in times.items()
+    ]
+    together = statistics.median(sum(each) for each in zip(*times.values(), strict=True))
+    rows.append(Row("the three of them together", f"{1e3 * together:.0f} ms", "5 Hz: 200 ms", 0.2 / together, 1))
+    tracemalloc.start()
+    for estimator in estimators.values():
+        estimator.step(exposures[-1])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    systems, steps = alike_systems(rig.plant), rig.timing.exposure_steps
+    assert systems is not None
+    coefficients = rig.n_inputs * ExposureModel(systems.one, steps).n_coefficients
+    dense = 8 * rig.n_outputs * steps * coefficients
+    figure = "their memory, beside a dense basis"
+    rows.append(Row(figure, f"{peak / 1e6:.0f} MB", f"{dense / 1e6:.0f} MB", dense / peak, 5))
+    return rows

@@ -1,0 +1,198 @@
+"""All spots of one plant with hundreds of states, as a function of the coefficients of a factored model.
+
+A spot's pixels depend on its own two paths, and these, but for what inputs do, on few numbers each: the shares of the
+courses. So the Jacobian of its pixels is small, (pixels, 2 m), and what the frame tells of all coefficients,
+the information J' R^-1 J, is a sum over spots of small blocks between the rows of two patterns: nothing is as large
+as pixels times coefficients.
+
+Of the noise coefficients, which come with the largest first, those are kept that move the spots by something that the
+kernel does not hide, as in `aolink.estimation.pixels`; the rest widens the kernel.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink import tiles
+from aolink.estimation import large
+from aolink.estimation.exposure_model import InputResponse
+from aolink.estimation.factored_model import FactoredModel
+from aolink.estimation.pixels import _FEWEST_NODES, _SPACING
+from aolink.estimation.windowed import Nodes
+from aolink.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+# Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
+# out, for many spots tell a displacement of all of them more finely.
+_LEFT_OUT = 0.05
+
+
+class JointPaths:
+    """Paths of all spots at nodes, blocks of fast steps, of the first ``size`` coefficients.
+
+    Parameters
+    ----------
+    sensor:
+        Says how finely the path is to be known.
+    """
+
+    def __init__(self, model: FactoredModel, sensor: SpotSensor) -> None:
+        self.model = model
+        n = model.plant.n_states
+        variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
+        energy = (model.patterns[:, n:] ** 2).sum(axis=0) * (model.functions**2).mean(axis=0)[model.course_of[n:]]
+        rest = np.append(np.cumsum(energy[::-1])[::-1], 0.0) + model.noise.left_out.sum()
+        enough = np.flatnonzero(rest <= _LEFT_OUT**2 * variance * model.plant.n_outputs)
+        kept = int(enough[0]) if len(enough) else len(energy)
+        self.widening = float(rest[kept]) / model.plant.n_outputs
+        """Mean variance of the path that is left out, which the kernel is to be widened by."""
+        self.size = n + kept
+        """Coefficients."""
+        course_of = model.course_of[: self.size]
+        used = int(course_of.max()) + 1
+        self.order = np.argsort(course_of, kind="stable")
+        self.groups = [np.flatnonzero(course_of == c) for c in range(used)]
+        """Coefficients of each course."""
+        self.patterns = np.ascontiguousarray(model.patterns[:, : self.size])
+        """(n_outputs, size)"""
+        self._by_course = [np.ascontiguousarray(self.patterns[:, own]) for own in self.groups]
+        self._transposed = [np.ascontiguousarray(own.T) for own in self._by_course]
+        self._gram = tiles.gram(self.patterns)
+        self._starts = np.cumsum([0] + [len(own) for own in self.groups[:-1]])
+        self.course_of = course_of
+        functions = model.functions[:, :used]
+        count = _node_count(model, functions, self, variance + sensor.pixel_width**2 / 12)
+        length = -(-model.n_steps // count)
+        self._first = np.arange(0, model.n_steps, length)
+        self._sizes = np.diff(np.append(self._first, model.n_steps))
+        self.functions = np.add.reduceat(functions, self._first, axis=0) / self._sizes[:, None]
+        """The courses' means over each node, (nodes, m)."""
+        self.weights = self._sizes / model.n_steps
+        """Each node's share of the exposure, (nodes,)."""
+        self._late = model.moved
+        if model.moved:
+            # So much of the first step is not in the exposure, but in the step after its last.
+            self.functions = np.vstack([self.functions, functions[0], model.after[:used]])
+            self.weights = np.append(self.weights, [-model.moved, model.moved])
+        self.inputs = np.zeros((model.plant.n_outputs, len(self.weights)))
+        """Means of the response to the inputs, (n_outputs, nodes)."""
+
+    def with_inputs(self, response: InputResponse, axis: int) -> JointPaths:
+        """The same with what the inputs of an exposure do."""
+        paths, path = copy(self), response.path[axis]
+        paths.inputs = np.add.reduceat(path, self._first, axis=1) / self._sizes
+        if self._late:
+            late = [path[:, 0], self.model.last_response(response.end)[axis]]
+            paths.inputs = np.concatenate([paths.inputs, np.stack(late, axis=1)], axis=1)
+        return paths
+
+    @property
+    def spots(self) -> int:
+        return len(self.patterns) // 2
+
+    def shares(self, t: FloatArray) -> FloatArray:
+        """The courses' shares of each output's path, (n_outputs, m)."""
+        return np.asarray(np.add.reduceat((self.patterns * t)[:, self.order], self._starts, axis=1))
+
+    def positions(self, t: FloatArray) -> FloatArray:
+        """Where the spots are at the nodes, (spots, 2, nodes)."""
+        path = tiles.matmul(self.shares(t), np.ascontiguousarray(self.functions.T)) + self.inputs
+        return path.reshape(self.spots, 2, -1)
+
+    def score(self, of_shares: FloatArray) -> FloatArray:
+        """Derivative by the coefficients from that by the courses' shares, (spots, 2, m) -> (size,)."""
+        return np.asarray((self.patterns * of_shares.reshape(len(self.patterns), -1)[:, self.course_of]).sum(axis=0))
+
+    def information(self, of_shares: FloatArray) -> FloatArray:
+        """Information on the coefficients from that on each spot's shares, (spots, 2, m, 2, m) -> (size, size)."""
+        m = len(self.groups)
+        by_course = np.empty((self.size, self.size))  # in the order of courses
+        flat = of_shares.reshape(self.spots, 2 * m, 2, m)
+        right = [flat[..., d] @ self._by_course[d].reshape(self.spots, 2, -1) for d in range(m)]
+        rows = np.concatenate(right, axis=2).reshape(self.spots, 2, m, -1)
+        for c, start in enumerate(self._starts):
+            end = start + len(self.groups[c])
+            mine = np.ascontiguousarray(rows[:, :, c, :end]).reshape(2 * self.spots, -1)
+            by_course[start:end, :end] = tiles.matmul(self._transposed[c], mine)
+        lower = np.tril(by_course)
+        out = np.empty_like(lower)
+        out[np.ix_(self.order, self.order)] = lower + np.tril(lower, -1).T
+        return out
+
+    def spread(self, covariance: FloatArray) -> FloatArray:
+        """Covariance of the shares of each spot, from that of the coefficients, (spots, 2, m, 2, m)."""
+        m = len(self.groups)
+        out = np.empty((self.spots, 2, m, 2, m))
+        turned = [own.reshape(self.spots, 2, -1).swapaxes(1, 2) for own in self._by_course]
+        sorted_ = covariance[np.ix_(self.order, self.order)]
+        for c, start in enumerate(self._starts):
+            end = start + len(self.groups[c])
+            left = tiles.matmul(self._by_course[c], sorted_[start:end, :end]).reshape(self.spots, 2, -1)
+            for d, first in enumerate(self._starts[: c + 1]):
+                block = left[:, :, first : first + len(self.groups[d])] @ turned[d]
+                out[:, :, c, :, d] = block
+                out[:, :, d, :, c] = block.swapaxes(1, 2)
+        return out
+
+    def of_one_spot(self) -> Nodes:
+        """The shares of a spot as coefficients of a basis of its own; each spot is an axis."""
+        nodes, m = self.functions.shape
+        basis = np.zeros((2, nodes, 2, m))
+        basis[0, :, 0] = basis[1, :, 1] = self.functions
+        return Nodes(
+            basis=basis.reshape(2, nodes, 2 * m), weights=self.weights, inputs=self.inputs.reshape(self.spots, 2, nodes)
+        )
+
+    def shares_of_spots(self, t: FloatArray) -> FloatArray:
+        """`shares` of each spot, (spots, 2 m)."""
+        return self.shares(t).reshape(self.spots, -1)
+
+    def spread_of_spots(self, covariance: FloatArray) -> FloatArray:
+        """`spread`, (spots, 2 m, 2 m)."""
+        m = len(self.groups)
+        return self.spread(covariance).reshape(self.spots, 2 * m, 2 * m)
+
+    def rms_spread(self, state_covariance: FloatArray) -> float:
+        """Standard deviation of the paths before the exposure, rms over outputs and nodes."""
+        summed = (self._gram * self.prior_covariance(state_covariance))[np.ix_(self.order, self.order)]
+        own = np.add.reduceat(np.add.reduceat(summed, self._starts, axis=0), self._starts, axis=1)
+        variance = (self.weights * ((self.functions @ own) * self.functions).sum(axis=1)).sum()
+        return float(np.sqrt(max(variance, 0.0) / len(self.patterns)))
+
+    def prior_covariance(self, state_covariance: FloatArray) -> FloatArray:
+        """The coefficients' covariance before the exposure, (size, size)."""
+        n = len(state_covariance)
+        out = np.eye(self.size)
+        out[:n, :n] = state_covariance
+        return out
+
+    def prior_information(self, state_covariance: FloatArray) -> FloatArray:
+        """Inverse of the coefficients' covariance before the exposure, (size, size)."""
+        n = len(state_covariance)
+        out = np.eye(self.size)
+        out[:n, :n] = large.information(state_covariance)
+        return out
+
+
+@lru_cache(maxsize=16)
+def joint_paths(model: FactoredModel, sensor: SpotSensor) -> JointPaths:
+    """`JointPaths`, made once."""
+    return JointPaths(model, sensor)
+
+
+def _node_count(model: FactoredModel, functions: FloatArray, paths: JointPaths, blurred: float) -> int:
+    """As for few states: by how far a spot of twice the prior's rms speed moves."""
+    covariance = np.eye(paths.size)
+    n = model.plant.n_states
+    covariance[:n, :n] = model.plant.initial_covariance
+    moves = np.diff(functions, axis=0)
+    own = np.einsum("sdcde->sdce", paths.spread(covariance)).reshape(-1, *(functions.shape[1],) * 2)
+    square = np.einsum("kc,oce,ke->ok", moves, own, moves)
+    speed = float(np.sqrt(square.mean(axis=1).max())) if square.size else 0.0
+    wanted = np.ceil(2 * speed * model.n_steps / (_SPACING * np.sqrt(blurred)))
+    return int(min(model.n_steps, max(_FEWEST_NODES, wanted)))

@@ -1,0 +1,273 @@
+"""The pixels of all spots of one large plant: one mode of the joint posterior, by Levenberg and Marquardt's method.
+
+As `aolink.estimation.profile`, but for hundreds of coefficients and in information form: the objective is
+(t - m)' P^-1 (t - m) / 2 minus the pixels' log-likelihood, Fisher's information in the place of the Hessian. At the
+mode its inverse is the covariance.
+
+It starts from where the prior has it, and from nowhere else. A spot by itself does not tell its path from its
+reversal; spots that one membrane moves do, once the states are known a little: on the rig membrane-12x12 paths run
+backwards or mirrored and backwards were worse by 200 and more (in log posterior) in every exposure but the first, and a
+start from the truth found nothing better in nine of ten. Where the prior leaves paths uncertain by more than two fifths
+of what a spot is wide there are many modes, and one of them says little: there, as in the first exposures of a
+recording, windowed moments of all spots (`JointMoments`) are taken instead, whose covariance says what they cannot
+tell apart.
+
+36 actuators before 16 lenslets are few enough for the dense `profile` with all its starts: path RMSE 0.090 there, 0.088
+here, 3 s and 20 ms a frame. The covariance at a mode is a little small: NEES of the start state 330 for 288 states, of
+the end state 285, and no better with more coefficients or nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink import tiles
+from aolink.estimation import large
+from aolink.estimation.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.factored_model import FactoredModel
+from aolink.estimation.joint import JointPaths, joint_paths
+from aolink.estimation.joint_moments import JointMoments, by_spot
+from aolink.estimation.observation import Belief, Correction
+from aolink.estimation.pixels import _masses, mehler_series
+from aolink.estimation.windowed_spots import SpotWindows
+from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+_PASSES = 12
+_FIRST_DAMPING = 0.01
+_LARGEST_DAMPING = 1e6
+_FREE_DAMPING = 0.1
+# The objective, which is of hundreds of coefficients, changes by less than this at a mode.
+_CONVERGED = 0.3
+# Rms of a path's prior, in standard deviations of the kernel, up to which there is one mode that matters.
+_LARGEST_SPREAD = 0.4
+# Relative to the information of a spot: one without pixels has none.
+_NO_LIGHT = 1e-9
+
+
+class JointPixels:
+    """What the pixels of one frame say of the coefficients of all spots together.
+
+    Parameters
+    ----------
+    density, mask, light:
+        Of one copy of the plant: (spots, rows, columns) twice, and (spots,) or None, as of `SpotWindows`.
+    """
+
+    def __init__(
+        self, sensor: SpotSensor, paths: JointPaths, density: FloatArray, mask: NDArray[np.bool_],
+        light: FloatArray | None,
+    ) -> None:  # fmt: skip
+        self.paths, self._edges, self._area = paths, sensor.profile.edges, sensor.pixel_size
+        self.y, self.mask = density.reshape(len(density), -1), mask.reshape(len(mask), -1)
+        share = 1.0 if light is None else light[:, None]
+        self._read = np.broadcast_to(effective_noise_density(sensor) / self._area / share**2, self.y.shape)
+        self._gain = np.broadcast_to(shot_gain(sensor) / share, self.y.shape)
+        self._kernel = sensor.kernel.covariance + paths.widening * np.eye(2)
+        self._terms = mehler_series(self._kernel)
+
+    @property
+    def kernel_variance(self) -> float:
+        """Of the narrowest direction, slope units squared."""
+        return float(np.linalg.eigvalsh(self._kernel)[0])
+
+    def predicted(self, t: FloatArray) -> FloatArray:
+        """Densities of the pixels without noise, (spots, pixels)."""
+        path, w, terms = self.paths.positions(t), self.paths.weights, self._terms
+        X, Y = (_masses(self._kernel[d, d], self._edges, path[:, d], len(terms) - 1) for d in (0, 1))
+        light = sum(c * (Y[j].swapaxes(1, 2) @ (X[j] * w[:, None])) for j, c in enumerate(terms))
+        return np.asarray(light).reshape(len(path), -1) / self._area
+
+    def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The same, their Jacobian by the courses' shares, and by the displacement of each spot.
+
+        (spots, pixels), (spots, pixels, 2, m) and (spots, pixels, 2)
+        """
+        path, w, terms = self.paths.positions(t), self.paths.weights[:, None], self._terms
+        X, Y = (_masses(self._kernel[d, d], self._edges, path[:, d], len(terms)) for d in (0, 1))
+        # A displacement is one more course.
+        courses = np.column_stack([self.paths.functions, np.ones(len(w))])
+        spots, m = len(path), courses.shape[1]
+        side = X[0].shape[-1]
+        f = np.zeros((spots, side, side))
+        J = np.zeros((spots, side, side, 2, m))
+        for j, c in enumerate(terms):
+            left, below = Y[j].swapaxes(1, 2), X[j].swapaxes(1, 2)
+            f += c * (left @ (X[j] * w))
+            by_x = left @ ((X[j + 1] * w)[..., None] * courses[:, None]).reshape(spots, len(w), -1)
+            by_y = below @ ((Y[j + 1] * w)[..., None] * courses[:, None]).reshape(spots, len(w), -1)
+            J[..., 0, :] += c * by_x.reshape(spots, side, side, m)
+            J[..., 1, :] += c * by_y.reshape(spots, side, side, m).swapaxes(1, 2)
+        f, J = f.reshape(spots, -1) / self._area, J.reshape(spots, -1, 2, m) / self._area
+        return f, J[..., :-1], J[..., -1]
+
+    def log_likelihood(self, f: FloatArray) -> float:
+        """Of the usable pixels where these are expected, up to a constant."""
+        R, e = self._read + self._gain * np.maximum(f, 0.0), self.y - f
+        return float(-0.5 * np.where(self.mask, e * e / R + np.log(R / self._read), 0.0).sum())
+
+    def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Score and Fisher information of each pixel by what is expected of it, (spots, pixels) both."""
+        R, e = self._read + self._gain * np.maximum(f, 0.0), self.y - f
+        grows = np.where(f > 0, self._gain, 0.0)
+        score = e / R + grows * (e * e / R - 1) / (2 * R)
+        return np.where(self.mask, score, 0.0), np.where(self.mask, 1 / R + grows**2 / (2 * R * R), 0.0)
+
+    def at(self, t: FloatArray) -> Linearised:
+        """All that is known of the neighbourhood of a point."""
+        f, J, displaced = self.linearised(t)
+        score, information = self.information(f)
+        spots, pixels = f.shape
+        flat = J.reshape(spots, pixels, -1)
+        weighted = (flat * information[..., None]).swapaxes(1, 2)
+        shape = J.shape[2:]
+        return Linearised(
+            log_likelihood=self.log_likelihood(f),
+            score=(score[:, None] @ flat).reshape(spots, *shape),
+            information=(weighted @ flat).reshape(spots, *shape, *shape),
+            displaced=np.asarray(weighted @ displaced).reshape(spots, *shape, 2),
+            of_displacement=(displaced * information[..., None]).swapaxes(1, 2) @ displaced,
+            displacement_score=(score[:, None] @ displaced)[:, 0],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Linearised:
+    """Pixels about a point, by the courses' shares of each spot's path (2, m) and by its displacement (2)."""
+
+    log_likelihood: float
+    score: FloatArray
+    """(spots, 2, m)"""
+    information: FloatArray
+    """(spots, 2, m, 2, m)"""
+    displaced: FloatArray
+    """(spots, 2, m, 2)"""
+    of_displacement: FloatArray
+    """(spots, 2, 2)"""
+    displacement_score: FloatArray
+    """(spots, 2)"""
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """Where the posterior is largest."""
+
+    t: FloatArray
+    """(size,)"""
+    precision: FloatArray
+    """(size, size)"""
+    objective: float
+    """-log p(t, y) up to a constant."""
+    passes: int
+    """How often the pixels were linearised on the way."""
+    at: Linearised
+
+
+def find_mode(
+    view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray, passes: int = _PASSES
+) -> Mode:
+    """Where a start leads, for a prior with this mean and information."""
+    paths, damping = view.paths, _FIRST_DAMPING
+
+    def pulled(t: FloatArray, log_likelihood: float) -> tuple[FloatArray, float]:
+        """By the prior, and the objective."""
+        pull = tiles.matvec(precision, t - mean)
+        return pull, 0.5 * float((t - mean) @ pull) - log_likelihood
+
+    t, at, used = start, view.at(start), 1
+    pull, now = pulled(t, at.log_likelihood)
+    H = precision + paths.information(at.information)
+    while used < passes:
+        g = paths.score(at.score) - pull
+        damped = H.copy()
+        np.fill_diagonal(damped, np.diagonal(H) * (1 + damping))
+        step = large.solve(damped, g)
+        free = damping <= _FREE_DAMPING
+        # What a step would gain says when it is at a mode, before the pixels are looked at again.
+        if free and 0.5 * step @ g < _CONVERGED:
+            break
+        there = view.at(t + step)
+        used += 1
+        pull_there, value = pulled(t + step, there.log_likelihood)
+        if value < now:
+            gain, now, t, at, pull = now - value, value, t + step, there, pull_there
+            H, damping = precision + paths.information(at.information), damping / 8
+            if free and gain < _CONVERGED:
+                break
+        else:
+            damping = max(damping, 1e-3) * 8
+            if damping > _LARGEST_DAMPING:
+                break
+    return Mode(t, H, now, used, at)
+
+
+class JointProfile:
+    """The estimator `profile` of a plant with hundreds of states, as an observation of `BlurFilter`.
+
+    Its innovation is what the pixels, linearised at the mode, tell of each spot's displacement beyond the prediction:
+    one number for each output, chi-square together if all is well.
+    """
+
+    models_noise = True
+
+    def __init__(self, sensor: SpotSensor, n_outputs: int) -> None:
+        self.sensor, self.n_measurements = sensor, n_outputs
+        self._moments = JointMoments(sensor, n_outputs)
+
+    def correct(
+        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
+    ) -> Correction:
+        """The mode of the posterior, copy by copy of the plant."""
+        assert isinstance(model, FactoredModel)
+        paths, n = joint_paths(model, self.sensor), model.plant.n_states
+        mean, covariance = prior.mean.copy(), prior.covariance.copy()
+        found = []
+        for axis in range(len(mean)):
+            light = None if measured.light is None else measured.light[axis]
+            view = JointPixels(
+                self.sensor, paths.with_inputs(response, axis), measured.density[axis], measured.mask[axis], light
+            )
+            before, P = prior.mean[axis, : paths.size], prior.covariance[axis, :n, :n]
+            if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
+                mode = find_mode(view, before, paths.prior_information(P), before)
+                t, after, at = mode.t, tiles.gram(large.inverse_root(mode.precision)), mode.at
+            else:
+                t, after, *_ = self._moments.corrected(model, view.paths, Belief(before, P), by_spot(measured, axis))
+                at = view.at(t)
+            mean[axis, : paths.size], covariance[axis, : paths.size, : paths.size] = t, after
+            found.append(innovation(view.paths, before, P, t, at))
+        new, S, nis = (np.stack(each) for each in zip(*found, strict=True))
+        return Correction(Belief(mean, covariance), new, S, nis)
+
+
+def innovation(
+    paths: JointPaths, mean: FloatArray, state_covariance: FloatArray, t: FloatArray, at: Linearised
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Displacement of each spot from its prediction as the pixels tell it, linearised at a point.
+
+    Returns
+    -------
+    (n_outputs,), its variance (n_outputs,), and its NIS.
+    """
+    spots, n = paths.spots, len(state_covariance)
+    told = at.of_displacement
+    most = np.einsum("sdd->s", told).max()
+    told = told + (_NO_LIGHT * most) * np.eye(2)
+    noise = np.linalg.inv(told)
+    # How much each share displaces its spot, (spots, 2, 2, m), and so each coefficient.
+    by_share = noise @ at.displaced.transpose(0, 3, 1, 2).reshape(spots, 2, -1)
+    by_share = by_share.reshape(spots, 2, 2, -1)
+    H = np.einsum("sdej,sej->sdj", by_share[..., paths.course_of], paths.patterns.reshape(spots, 2, -1))
+    H = H.reshape(2 * spots, -1)
+    new = (noise @ at.displacement_score[..., None]).ravel() + tiles.matvec(H, t - mean)
+    S = tiles.matmul(tiles.matmul(H[:, :n], state_covariance), np.ascontiguousarray(H[:, :n].T))
+    S += tiles.gram(np.ascontiguousarray(H[:, n:].T))
+    for s in range(spots):
+        S[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += noise[s]
+    white = tiles.matvec(large.inverse_root((S + S.T) / 2), new)
+    return new, np.diagonal(S).copy(), np.asarray(white @ white)

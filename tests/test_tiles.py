@@ -1,0 +1,55 @@
+"""Large products in pieces, against NumPy's in one."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aolink import tiles
+
+sizes = st.integers(0, 130)
+
+
+def random(*shape: int) -> np.ndarray:
+    return np.random.default_rng(sum(shape)).standard_normal(shape)
+
+
+@settings(deadline=None, max_examples=40)
+@given(sizes, sizes, sizes)
+def test_products_are_those_of_whole_matrices(n: int, k: int, m: int) -> None:
+    a, b = random(n, k), random(k, m)
+    np.testing.assert_allclose(tiles.matmul(a, b), a @ b, atol=1e-12)
+    np.testing.assert_allclose(tiles.matmul(b.T, a.T), b.T @ a.T, atol=1e-12)
+    np.testing.assert_allclose(
+        tiles.matvec(a, b[:, 0] if m else np.zeros(k)), a @ (b[:, 0] if m else np.zeros(k)), atol=1e-12
+    )
+    gram = tiles.gram(a)
+    np.testing.assert_allclose(gram, a.T @ a, atol=1e-12)
+    np.testing.assert_array_equal(gram, gram.T)
+
+
+@pytest.mark.parametrize("n", [1, 47, 48, 49, 200])
+def test_the_inverse_of_a_root_gives_the_inverse(n: int) -> None:
+    a = random(n, n + 5)
+    a = a @ a.T
+    W = tiles.inverse_root(a)
+    np.testing.assert_array_equal(W, np.tril(W))
+    np.testing.assert_allclose(W @ np.linalg.cholesky(a), np.eye(n), atol=1e-8)
+    np.testing.assert_allclose(tiles.inverse(a) @ a, np.eye(n), atol=1e-7)
+    x = random(n)
+    np.testing.assert_allclose(tiles.solve(a, a @ x), x, atol=1e-7)
+
+
+def test_a_matrix_without_a_root_is_refused() -> None:
+    a = np.eye(100)
+    a[70, 70] = -1
+    with pytest.raises(np.linalg.LinAlgError):
+        tiles.inverse_root(a)
+
+
+@pytest.mark.parametrize("share", [0.01, 1.0])
+def test_congruence_by_entries_and_by_pieces(share: float) -> None:
+    a, p = random(90, 150) * (np.random.default_rng(1).random((90, 150)) < share), random(150, 150)
+    p = p + p.T
+    np.testing.assert_allclose(tiles.congruence(a, p), a @ p @ a.T, atol=1e-11)
+    np.testing.assert_array_equal(tiles.congruences(a, p[None])[0], tiles.congruence(a, p))
