@@ -24,13 +24,13 @@ from aolink.estimation import (
 )
 from aolink.estimation import filter as filters
 from aolink.estimation.centroids import centroid_covariance
-from aolink.estimation.estimators import measure
 from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.factored_model import FactoredModel
 from aolink.estimation.filter import BlurFilter
 from aolink.estimation.joint import JointPaths
 from aolink.estimation.joint_moments import JointMoments
 from aolink.estimation.joint_profile import JointPixels, find_mode
+from aolink.estimation.measuring import measure
 from aolink.estimation.observation import Belief, PathMoments, steady_gain
 from aolink.estimation.pixels import PixelView, Reduction
 from aolink.estimation.profile import find_modes, whitened
