@@ -27,7 +27,7 @@ _ROUNDS = 2
 # Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
 # is too sure. And steps of the search for the power.
 _LEAST_EFFECTIVE = 64.0
-_HALVINGS = 10
+_HALVINGS = 6
 # Points of a round for each pair of coefficients; as many as the next power of two.
 _POINTS = 6
 _MOST_POINTS = 2048
@@ -50,10 +50,13 @@ def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, w
 
 
 def importance_corrected(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, rounds: int = _ROUNDS
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, rounds: int = _ROUNDS, share: float = 1.0
 ) -> tuple[Hypotheses, FloatArray]:
-    """The posterior of t as the mixture that fits it, and the effective number of points, (axes,)."""
-    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(_POINTS * view.reduced.size**2)))
+    """The posterior of t as the mixture that fits it, and the effective number of points, (axes,).
+
+    ``share`` is that of the usual number of points.
+    """
+    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * _POINTS * view.reduced.size**2)))
     if (line := view.line) is not None:
         numbers = [_quasi_random(points, view.reduced.size, k) for k in range(rounds)]
         fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))

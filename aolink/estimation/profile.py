@@ -5,7 +5,8 @@ log-likelihood, Fisher's information in the place of the Hessian. At a mode its 
 (Laplace) the log-evidence is log p(y | s) - |s|^2 / 2 - log |H| / 2.
 
 It starts where windowed moments have it, and from there along the directions in which they leave the path most
-uncertain: a path and its reversal in time give the same blur.
+uncertain: a path and its reversal in time give the same blur. A mode is not Gaussian, where the path moves by more than
+the kernel is wide: so mean and covariance are those of points drawn about the modes (`aolink.estimation.importance`).
 """
 
 from __future__ import annotations
@@ -32,16 +33,18 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _PASSES = 16
-_BROAD_PASSES = 3
+_BROAD_PASSES = 2
 _FIRST_DAMPING = 0.01
 _LARGEST_DAMPING = 1e6
 _FREE_DAMPING = 0.1
 _NO_NOISE = 1e-14
-# The objective changes by less than this at a mode.
-_CONVERGED = 1e-4
+# The objective changes by less than this at a mode, which is near enough to draw points about it.
+_CONVERGED = 0.01
 # Modes that are nearer to each other than so many standard deviations are one.
 _APART = 0.7
-_START_DIRECTIONS = 2
+_START_DIRECTIONS = 1
+# Of the points that a mixture draws in a round.
+_POINTS_SHARE = 0.5
 _START_REACH = 1.3
 # A reversed path is met to so many standard deviations of the kernel, if the prior allows.
 _REVERSED_TO = 0.2
@@ -73,7 +76,9 @@ class Modes:
         return np.asarray(np.argmin(self.objective, axis=1))
 
 
-def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES) -> Modes:
+def find_modes(
+    view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES, converged: float = _CONVERGED
+) -> Modes:
     """Where each start leads.
 
     Parameters
@@ -85,7 +90,7 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
     """
     axes, count, n = starts.shape
     if (line := view.line) is not None:
-        return _found_compiled(line, prior, starts, passes)
+        return _found_compiled(line, prior, starts, passes, converged)
     if prior.mean.ndim == 2:
         prior = Belief(
             np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
@@ -114,7 +119,7 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
         damping[active] = np.where(better, damping[active] / 8, np.maximum(damping[active], 1e-3) * 8)
         # A short step says nothing where it is the damping that made it short.
         free = before <= _FREE_DAMPING
-        settled = (free & better & (gain < _CONVERGED)) | (free & (stacked.dot(step, g) < _CONVERGED))
+        settled = (free & better & (gain < converged)) | (free & (stacked.dot(step, g) < converged))
         settled |= damping[active] > _LARGEST_DAMPING
         active = active[~settled]
     covariance = stacked.congruence(L, stacked.symmetric(np.asarray(np.linalg.inv(at.H), dtype=np.float64)))
@@ -128,14 +133,14 @@ def find_modes(view: PixelView, prior: Belief, starts: FloatArray, passes: int =
     )  # fmt: skip
 
 
-def _found_compiled(line: Line, prior: Belief, starts: FloatArray, passes: int) -> Modes:
+def _found_compiled(line: Line, prior: Belief, starts: FloatArray, passes: int, converged: float) -> Modes:
     axes, count, n = starts.shape
     found = Modes(
         np.empty((axes, count, n)), np.empty((axes, count, n, n)), *(np.empty((axes, count)) for _ in range(3))
     )
     compiled_line.find_modes(
         line, np.ascontiguousarray(prior.mean), cholesky(prior.covariance), np.ascontiguousarray(starts), passes,
-        _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, _CONVERGED, found.mean, found.covariance, found.log_evidence,
+        _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged, found.mean, found.covariance, found.log_evidence,
         found.distance, found.objective,
     )  # fmt: skip
     return found
@@ -274,7 +279,7 @@ def _linear_fit(
 
 
 class ProfileUpdates:
-    """One Gaussian in, one Gaussian out: the modes that were found, weighted with their evidence."""
+    """One Gaussian in, one Gaussian out: mean and covariance of the posterior about the modes that were found."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
@@ -290,16 +295,12 @@ class ProfileUpdates:
         found = find_modes(view, before, whitened(before, starts))
         modes = without_repeats(with_reversals(view, before, found))
         log_weight = modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None]
-        after = Hypotheses(log_weight, modes.mean, modes.covariance).belief
+        proposal = proposed(
+            modes.log_evidence, Belief(modes.mean, modes.covariance),
+            np.zeros((len(wide.mean), 1)), Belief(wide.mean[:, None], wide.covariance[:, None]),
+        )  # fmt: skip
+        fit, _ = importance_corrected(view, prior, proposal, rounds=1, share=_POINTS_SHARE)
+        after = fit.belief
         several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
-        at = np.flatnonzero(several)
-        if len(at):
-            # Where there are several the posterior is far from Gaussian about each, and what is between them counts.
-            proposal = proposed(
-                modes.log_evidence[at], Belief(modes.mean[at], modes.covariance[at]),
-                np.zeros((len(at), 1)), Belief(wide.mean[at, None], wide.covariance[at, None]),
-            )  # fmt: skip
-            fit, _ = importance_corrected(view.part(at), prior.part(at), proposal, rounds=1)
-            after.mean[at], after.covariance[at] = fit.belief.mean, fit.belief.covariance
         new = innovation(view, before, modes)
         return Update(after, single(view.reduced.end(after)), new, several)

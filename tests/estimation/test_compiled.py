@@ -119,7 +119,8 @@ def test_every_start_leads_to_the_same_mode(pair):
 def test_a_mode_is_where_the_gradient_is_zero(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    found = profile.find_modes(view, prior, profile.whitened(prior, profile.broad(view, prior).mean[:, None]), 60)
+    start = profile.whitened(prior, profile.broad(view, prior).mean[:, None])
+    found = profile.find_modes(view, prior, start, 60, 1e-5)
     t, root = found.mean[1:], np.linalg.cholesky(found.covariance[1:, 0])
     inverse, rest = np.linalg.inv(prior.covariance[1:]), in_numpy.part(slice(1, None))
 

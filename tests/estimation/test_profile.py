@@ -59,7 +59,7 @@ def test_the_gradient_is_zero_at_a_mode():
     prior = view.reduced.prior(state)
     start = profile.whitened(prior, profile.broad(view, prior).mean[:, None])
     view.compiled = False  # its error function is exact; what is compiled has a test of its own
-    modes = profile.find_modes(view, prior, start, passes=60)
+    modes = profile.find_modes(view, prior, start, passes=60, converged=1e-5)
     inverse = np.linalg.inv(prior.covariance[0])
 
     def objective(t):
@@ -105,14 +105,14 @@ def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
 
 @pytest.mark.parametrize("seed", [10, 11])
 def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
-    """Gaussians about the modes alone are 0.4 and 0.7 standard deviations off."""
+    """Gaussians about the modes alone are up to 0.7 standard deviations off."""
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=seed)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 200
     update = profile.ProfileUpdates().update(view, single(state), 0)
     assert update.several[0]
     sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.32)
+    np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.45)
     np.testing.assert_allclose(np.sqrt(np.diag(update.coefficients.covariance[0])) / sd, 1.0, atol=0.35)
 
 
