@@ -1,6 +1,7 @@
 """Points drawn from a mixture of Gaussians, weighted by the posterior over the density that they were drawn from.
 
-After a round the mixture is fitted to the weighted points, and the next round is drawn from that. The points of all
+After a round the mixture is fitted to the weighted points, and the next round is drawn from that, until enough points
+count: a posterior that has a mode where none was looked for is found by the few points that fall there. The points of all
 rounds are weighted against all densities together (Veach's balance heuristic; in this use Cornuet et al., Adaptive
 multiple importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and
 frame.
@@ -23,7 +24,10 @@ from aolink.estimation.pixels import PixelView
 
 FloatArray = NDArray[np.float64]
 
-_ROUNDS = 2
+# Rounds at least, and at most where fewer points than these count.
+_LEAST_ROUNDS = 2
+_ROUNDS = 7
+_ENOUGH = 32.0
 # Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
 # is too sure. And steps of the search for the power.
 _LEAST_EFFECTIVE = 64.0
@@ -63,12 +67,14 @@ def importance_corrected(
         effective = np.empty(len(prior.mean))
         compiled_mixtures.importance_corrected(
             line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
-            np.stack([e for _, e in numbers]), _LEAST_EFFECTIVE, _HALVINGS, _PRIOR_POINTS, effective,
+            np.stack([e for _, e in numbers]), _LEAST_ROUNDS, _ENOUGH, _LEAST_EFFECTIVE, _HALVINGS, _PRIOR_POINTS,
+            effective,
         )  # fmt: skip
         return fit, effective
     proposals: list[Hypotheses] = []
     t = np.zeros((len(prior.mean), 0, view.reduced.size))
-    target = np.zeros(t.shape[:2])
+    target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
+    fit, going_on = proposal, np.ones(len(t), dtype=bool)
     for k in range(rounds):
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
@@ -77,7 +83,21 @@ def importance_corrected(
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         proposal = _refitted(proposal, t, _tempered(log_weight, _LEAST_EFFECTIVE))
-    return proposal, np.exp(-log_sum(2 * log_weight, axis=1))
+        fit = _where(going_on, proposal, fit)
+        effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
+        going_on &= (k + 1 < _LEAST_ROUNDS) | (effective < _ENOUGH)
+        if not going_on.any():
+            break
+    return fit, effective
+
+
+def _where(which: NDArray[np.bool_], first: Hypotheses, second: Hypotheses) -> Hypotheses:
+    """The first in these axes, the second in the others."""
+    return Hypotheses(
+        np.where(which[:, None], first.log_weight, second.log_weight),
+        np.where(which[:, None, None], first.mean, second.mean),
+        np.where(which[:, None, None, None], first.covariance, second.covariance),
+    )
 
 
 def _tempered(log_weight: FloatArray, least: float) -> FloatArray:

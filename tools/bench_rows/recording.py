@@ -8,6 +8,7 @@ import statistics
 import tempfile
 import time
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -191,22 +192,27 @@ def record_long(path: Path, exposures: int) -> None:
 
 def reestimation_rate() -> Row:
     """o3 over a recording, against reading the same file and decoding its frames, no more."""
-    from aolink.recording import topics
-    from aolink.recording.reader import Recording
+    from aolink.recording import convert
     from aolink.recording.reestimate import reestimate
 
     with tempfile.TemporaryDirectory() as folder:
         record_long(Path(folder) / "a.mcap", 1500)
         recording = Recording(Path(folder) / "a.mcap")
-        estimating, reading = median_s(
-            lambda: reestimate(recording, ["o3"]),
-            5,
-            lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)),
-        )
+
+        def read() -> None:
+            info: Any = None
+            for raw in recording.raw_messages():
+                if raw.topic == topics.EXPOSURE:
+                    info = recording.decoded(raw)
+                elif raw.topic == topics.IMAGE:
+                    convert.frame_from_messages(info, cast(Any, recording.decoded(raw)))
+
+        estimating, reading = median_s(lambda: reestimate(recording, ["o3"]), 5, read)
+        skipping = median_s(lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)), 5)[0]
     return Row(
         "re-estimation with o3",
         f"{1500 / estimating:.0f} frames/s",
-        f"reading {1500 / reading:.0f}",
+        f"reading {1500 / reading:.0f}; past the mirror's reports {1500 / skipping:.0f}",
         reading / estimating,
         0.5,
     )

@@ -128,8 +128,8 @@ def _densities(
 @compiled
 def importance_corrected(
     line: Line, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray, log_weight: FloatArray,
-    mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, least_effective: float,
-    halvings: int, prior_points: float, effective: FloatArray,
+    mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, least_rounds: int,
+    enough: float, least_effective: float, halvings: int, prior_points: float, effective: FloatArray,
 ) -> None:  # fmt: skip
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
@@ -175,12 +175,14 @@ def importance_corrected(
                     total[q] = drawn[q, k]
                 weight[k] = target[k] - log_sum(total[: r + 1])
             weight[:end] -= log_sum(weight[:end])
+            square = 0.0
+            for k in range(end):
+                square += math.exp(2 * weight[k])
+            effective[axis] = 1.0 / square
             _temper(weight[:end], least_effective, halvings, tempered[:end])
             _refit(w, x, P, t[:end], tempered[:end], logs[:end], drawn[r, :end], prior_points)
-        square = 0.0
-        for k in range(many):
-            square += math.exp(2 * weight[k])
-        effective[axis] = 1.0 / square
+            if r + 1 >= least_rounds and effective[axis] >= enough:
+                break
 
 
 @compiled
