@@ -1,10 +1,9 @@
 """Points drawn from a mixture of Gaussians, weighted by the posterior over the density that they were drawn from.
 
 After a round the mixture is fitted to the weighted points, and the next round is drawn from that, until enough points
-count: a posterior that has a mode where none was looked for is found by the few points that fall there. The points of all
-rounds are weighted against all densities together (Veach's balance heuristic; in this use Cornuet et al., Adaptive
-multiple importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and
-frame.
+count: a mode where none was looked for is found by the few points that fall there. The points of all rounds are
+weighted against all densities together (Veach's balance heuristic; in this use Cornuet et al., Adaptive multiple
+importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and frame.
 """
 
 from __future__ import annotations
