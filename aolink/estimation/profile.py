@@ -52,7 +52,7 @@ _REVERSED_TO = 0.2
 _DIRECTIONS = 4
 _GATE_PROBABILITY = 1e-9
 # Information of a direction, as a share of the largest, that is rounding.
-_TELLS_NOTHING = 1e-8
+_TELLS_NOTHING = 1e-13
 # A second mode is one if the posterior gives it this much.
 LEAST_SHARE = 0.05
 
