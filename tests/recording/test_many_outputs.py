@@ -11,7 +11,7 @@ import pytest
 from aolink.demo import simulated_rig
 from aolink.estimation import run
 from aolink.recording import convert
-from aolink.recording.deblur import motion
+from aolink.recording.deblur import coefficient_roots, motion
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
@@ -73,9 +73,9 @@ def test_a_plant_of_hundreds_of_states_is_recorded_as_patterns_and_courses(tmp_p
             estimate.path, path_of_z + estimate.model.response(estimate.inputs).path[0], atol=1e-10
         )
     mix = np.eye(2, 200)
-    mixed, covariance = motion(estimate, mix)
+    mixed, root = motion(estimate, mix, coefficient_roots(estimate))
     np.testing.assert_allclose(mixed, estimate.path[:2], atol=1e-12)
-    missing = estimate.path_sd[:2].ravel() ** 2 - np.diag(covariance)
+    missing = estimate.path_sd[:2].ravel() ** 2 - np.sum(root**2, axis=1)
     np.testing.assert_allclose(missing, np.repeat(estimate.model.noise.left_out[:2], 200), atol=1e-12)
 
 

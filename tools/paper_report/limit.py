@@ -208,7 +208,10 @@ def limit_section(table: Sequence[Scene], effort: Effort) -> list[Block]:
         Text("Exposures in which profile saw one mode: their share, its distance and its NEES there:"),
         Table(
             ["scene", "share", "distance", "NEES"],
-            [[scene.name, *(format(x, ".2f") for x in scene.found["profile"].one_mode)] for scene in table],
+            [
+                [scene.name, *(format(x, ".2f") if math.isfinite(x) else "-" for x in scene.found["profile"].one_mode)]
+                for scene in table
+            ],
         ),
         Text("RMSE of the end state's norm:"),
         Table(["scene", *NAMES], rows("end")),
