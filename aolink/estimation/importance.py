@@ -23,8 +23,7 @@ from aolink.estimation.pixels import PixelView
 
 FloatArray = NDArray[np.float64]
 
-# Rounds at least, and at most where fewer points than these count.
-_LEAST_ROUNDS = 2
+# Rounds at most, where fewer points than these count.
 _ROUNDS = 7
 _ENOUGH = 32.0
 # Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
@@ -53,20 +52,21 @@ def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, w
 
 
 def importance_corrected(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, rounds: int = _ROUNDS, share: float = 1.0
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, least_rounds: int = 2, share: float = 1.0
 ) -> tuple[Hypotheses, FloatArray]:
     """The posterior of t as the mixture that fits it, and the effective number of points, (axes,).
 
-    ``share`` is that of the usual number of points.
+    It takes ``least_rounds`` at least, each of ``share`` of the usual number of points.
     """
+    enough = share * _ENOUGH
     points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * _POINTS * view.reduced.size**2)))
     if (line := view.line) is not None:
-        numbers = [_quasi_random(points, view.reduced.size, k) for k in range(rounds)]
+        numbers = [_quasi_random(points, view.reduced.size, k) for k in range(_ROUNDS)]
         fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))
         effective = np.empty(len(prior.mean))
         compiled_mixtures.importance_corrected(
             line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
-            np.stack([e for _, e in numbers]), _LEAST_ROUNDS, _ENOUGH, _LEAST_EFFECTIVE, _HALVINGS, _PRIOR_POINTS,
+            np.stack([e for _, e in numbers]), least_rounds, enough, _LEAST_EFFECTIVE, _HALVINGS, _PRIOR_POINTS,
             effective,
         )  # fmt: skip
         return fit, effective
@@ -74,7 +74,7 @@ def importance_corrected(
     t = np.zeros((len(prior.mean), 0, view.reduced.size))
     target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
     fit, going_on = proposal, np.ones(len(t), dtype=bool)
-    for k in range(rounds):
+    for k in range(_ROUNDS):
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
         t = np.concatenate([t, new], axis=1)
@@ -84,7 +84,7 @@ def importance_corrected(
         proposal = _refitted(proposal, t, _tempered(log_weight, _LEAST_EFFECTIVE))
         fit = _where(going_on, proposal, fit)
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
-        going_on &= (k + 1 < _LEAST_ROUNDS) | (effective < _ENOUGH)
+        going_on &= (k + 1 < least_rounds) | (effective < enough)
         if not going_on.any():
             break
     return fit, effective

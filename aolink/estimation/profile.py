@@ -299,7 +299,7 @@ class ProfileUpdates:
             modes.log_evidence, Belief(modes.mean, modes.covariance),
             np.zeros((len(wide.mean), 1)), Belief(wide.mean[:, None], wide.covariance[:, None]),
         )  # fmt: skip
-        fit, _ = importance_corrected(view, prior, proposal, rounds=1, share=_POINTS_SHARE)
+        fit, _ = importance_corrected(view, prior, proposal, least_rounds=1, share=_POINTS_SHARE)
         after = fit.belief
         several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
         new = innovation(view, before, modes)
