@@ -34,7 +34,7 @@ BoolArray = NDArray[np.bool_]
 _PATIENCE = 3
 # Chunks of axes: what NumPy computes for them together fits into the cache; compiled code has fewer calls to pay for.
 _AT_ONCE = 32
-_AT_ONCE_COMPILED = 150
+_AT_ONCE_COMPILED = 450
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ _LARGEST_DAMPING = 1e6
 _FREE_DAMPING = 0.1
 _NO_NOISE = 1e-14
 # The objective changes by less than this at a mode, which is near enough to draw points about it.
-_CONVERGED = 0.01
+_CONVERGED = 0.03
 # Modes that are nearer to each other than so many standard deviations are one.
 _APART = 0.7
 _START_DIRECTIONS = 1

@@ -106,10 +106,10 @@ def test_every_start_leads_to_the_same_mode(pair):
     prior = view.reduced.prior(state)
     starts = profile.spread_starts(in_numpy, profile.broad(in_numpy, prior), 2, 1.3)
     white = profile.whitened(prior, starts)
-    ours, theirs = (profile.find_modes(each, prior, white) for each in (view, in_numpy))
+    ours, theirs = (profile.find_modes(each, prior, white, 40, 1e-4) for each in (view, in_numpy))
     # A long search may end in another mode, as one that begins 1e-6 away may.
     settled = np.abs(ours.objective - theirs.objective) < 0.02
-    assert settled.mean() > 0.9
+    assert settled.mean() > 0.85
     sd = np.sqrt(np.einsum("asii->asi", theirs.covariance))
     apart = np.abs(ours.mean - theirs.mean) / sd
     assert np.quantile(apart[settled], 0.95) < 0.15

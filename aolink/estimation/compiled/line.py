@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 # Squared distance from a mode, in its standard deviations, at which a search ends there.
-_NEXT_TO = 0.01
+_NEXT_TO = 0.05
 _ORDERS = 4  # of `WindowedMoments` as `broad` uses them: u^0 to u^3
 
 
