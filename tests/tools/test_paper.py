@@ -20,7 +20,7 @@ from aolink.rig import Rig, load_rig
 pytest.importorskip("matplotlib", reason="tools/paper draws with it: install aolink[plot]")
 
 TOOLS = Path(__file__).parents[2] / "tools"
-FIGURES = ("figure-4.png", "figure-5.png", "figure-6.png", "figure-7.png", "remarks.png", "map.png")
+FIGURES = ("figure-4.png", "figure-5.png", "figure-6.png", "figure-7.png", "remarks.png", "map.png", "limit.png")
 SECTIONS = (
     "Every printed number beside ours",
     "Figures 4 to 7",

@@ -24,6 +24,8 @@ from aolink.optics.camera import to_density
 from aolink.rig import Rig
 from aolink.viewing.palette import estimator_colour
 from paper_report.ensemble import Cell, Measured, clean_exposures, errors, side_by_side, with_pixel_noise
+from paper_report.limit import NAMES, Found
+from paper_report.limit import Scene as LimitScene
 from paper_report.numbers import Effort, Remark1, Remark2
 
 FloatArray = NDArray[np.float64]
@@ -297,3 +299,27 @@ def _annotate(ax: Axes, grid: Sequence[Sequence[Measured]], decimals: int) -> No
                     color="white" if dark else "black" if clear else "0.45")  # fmt: skip
             ax.text(column, row - 0.26, f"±{half:.3f}", ha="center", va="center", fontsize=5.5,
                     color="white" if dark else "0.3")  # fmt: skip
+
+
+_MARKERS = {"open-loop": "|", "o1": "o", "o3": "s", "moments": "D", "profile": "^", "mixture": "P", "sampled": "*"}
+
+
+def figure_limit(path: Path, table: Sequence[LimitScene], dpi: int) -> None:
+    """A row for each scene: path RMSE of all estimators, and how far they are from the sampler."""
+    rows = np.arange(len(table))[::-1]
+    with _figure(path, dpi, (9.5, 2.0 + 0.36 * len(table)), 1, 2, sharey=True) as (figure, ((left, right),)):
+        for name in NAMES:
+            style = {"marker": _MARKERS[name], "color": _colour(name), "linestyle": "none", "markersize": 6.0}
+            found: list[Found] = [scene.found[name] for scene in table]
+            left.plot([each.path for each in found], rows, label=name, **style)
+            if name != "sampled":
+                right.plot([max(each.distance, 0.01) for each in found], rows, **style)
+        left.set(xscale="log", xlabel="path RMSE (slope units)", yticks=rows)
+        left.set_yticklabels([scene.name for scene in table])
+        right.set(xscale="log", xlabel="distance from sampled (its standard deviations)")
+        for at, cost, side in ((0.32, "5 % ", "right"), (0.46, " 10 %", "left")):
+            right.axvline(at, color="0.5", linewidth=0.9, linestyle=":")
+            right.text(at, 1.01, cost, transform=right.get_xaxis_transform(), ha=side, va="bottom", fontsize=7.5)
+        for ax in (left, right):
+            ax.grid(axis="y", **_GRID)
+        figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=len(NAMES))

@@ -89,6 +89,7 @@ def draw(out: Path, results: Results) -> None:
     figures.figure_7(out / "figure-7.png", scenes, dpi)
     figures.figure_remarks(out / "remarks.png", results.remark_1, results.remark_2, dpi)
     figures.figure_map(out / "map.png", results.cells, dpi)
+    figures.figure_limit(out / "limit.png", results.limit, dpi)
 
 
 def write_map(path: Path, cells: Sequence[Cell]) -> None:
