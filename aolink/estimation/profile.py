@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation import stacked
-from aolink.estimation.compiled import line as compiled_line
-from aolink.estimation.compiled.line import Line, mark_repeats
+from aolink.estimation.compiled import modes as compiled_modes
+from aolink.estimation.compiled import moments as compiled_moments
+from aolink.estimation.compiled.line import Line
 from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, lower_inverse, single
 from aolink.estimation.hypothesis_filter import Innovation, Update
@@ -138,7 +139,7 @@ def _found_compiled(line: Line, prior: Belief, starts: FloatArray, passes: int, 
     found = Modes(
         np.empty((axes, count, n)), np.empty((axes, count, n, n)), *(np.empty((axes, count)) for _ in range(3))
     )
-    compiled_line.find_modes(
+    compiled_modes.find_modes(
         line, np.ascontiguousarray(prior.mean), cholesky(prior.covariance), np.ascontiguousarray(starts), passes,
         _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged, found.mean, found.covariance, found.log_evidence,
         found.distance, found.objective,
@@ -166,7 +167,7 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
 def without_repeats(modes: Modes) -> Modes:
     """The same, log-evidence minus infinity for modes that a better start, or an earlier one, led to as well."""
     evidence = modes.log_evidence.copy()
-    mark_repeats(modes.mean, modes.covariance, _APART, evidence)
+    compiled_modes.mark_repeats(modes.mean, modes.covariance, _APART, evidence)
     return replace(modes, log_evidence=evidence)
 
 
@@ -174,7 +175,7 @@ def broad(view: PixelView, prior: Belief) -> Belief:
     """What windowed moments make of the prior of t: wide where the blur has several readings."""
     if (line := view.line) is not None:
         after = Belief(np.empty_like(prior.mean), np.empty_like(prior.covariance))
-        compiled_line.broad(
+        compiled_moments.broad(
             line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), _BROAD_PASSES, _NO_NOISE,
             PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
         )  # fmt: skip
@@ -268,7 +269,7 @@ def _linear_fit(
     axes, n = s.shape
     if (line := view.line) is not None:
         gram, pull, square = np.empty((axes, n, n)), np.empty((axes, n)), np.empty(axes)
-        compiled_line.linear_fits(line, np.ascontiguousarray(prior.mean), L, s, gram, pull, square)
+        compiled_modes.linear_fits(line, np.ascontiguousarray(prior.mean), L, s, gram, pull, square)
         return gram, pull, square
     f, J = view.linearised((prior.mean + stacked.matvec(L, s))[:, None])
     score, information = (each[:, 0] for each in view.information(f))

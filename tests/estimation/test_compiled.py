@@ -1,6 +1,7 @@
 """Compiled code against its twins in NumPy, on frames of every kind; and nothing left to compile in a session."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 from aolink.estimation import exposure_model, make_estimator, pixels, profile
-from aolink.estimation.compiled import line, small
+from aolink.estimation.compiled import forget_stale, small
+from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.hypotheses import Hypotheses, log_determinant, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
 from aolink.estimation.importance import importance_corrected
@@ -142,7 +144,7 @@ def test_repeats():
     evidence = rng.standard_normal((20, 7))
     evidence[0, 2] = -np.inf
     ours = evidence.copy()
-    line.mark_repeats(mean, covariance, 0.7, ours)
+    compiled_modes.mark_repeats(mean, covariance, 0.7, ours)
     for axis in range(20):
         for j in range(1, 7):
             white = np.linalg.solve(root, (mean[axis, :j] - mean[axis, j]).T)
@@ -253,12 +255,12 @@ def test_small_matrices_are_those_of_numpy():
 FIRST_SESSION = """
 import dataclasses, sys
 from aolink.estimation import make_estimator
-from aolink.estimation.compiled import line, mixtures, small
+from aolink.estimation.compiled import line, mixtures, modes, moments, small
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 def overloads():
-    each = [value for module in (small, line, mixtures) for value in vars(module).values()]
+    each = [value for module in (small, line, modes, moments, mixtures) for value in vars(module).values()]
     return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
 
 rig = load_rig("section-vi-lively")
@@ -281,6 +283,18 @@ def test_nothing_is_compiled_in_a_session(name):
     before, after, several = map(int, out.split())
     assert before == after > 4
     assert several
+
+
+def test_machine_code_is_not_older_than_any_source(tmp_path):
+    kept = tmp_path / "__pycache__"
+    kept.mkdir()
+    files = kept / "of_old.nbi", tmp_path / "one.py", tmp_path / "two.py", kept / "of_new.nbi"
+    for age, name in enumerate(files):
+        name.touch()
+        os.utime(name, (age, age))
+    forget_stale(tmp_path)
+    assert [each.name for each in kept.iterdir()] == ["of_new.nbi"]
+    forget_stale(tmp_path / "not there")
 
 
 @pytest.mark.parametrize("updates", [profile.ProfileUpdates(), MixtureUpdates()])

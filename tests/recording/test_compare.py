@@ -181,7 +181,7 @@ def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tm
             if hasattr(message, name):
                 setattr(message, name, getattr(message, name) + 12345)
         if topic == topics.IMAGE:
-            message.timestamp.nanos += 1  # type: ignore[attr-defined]
+            message.timestamp.nanos += 1  # type: ignore[attr-defined] # an image's
         return [message]
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)

@@ -297,7 +297,7 @@ def test_small_messages_in_a_large_chunk_cost_no_memory() -> None:
 def other_writer(source: Recording, path: Path, **options: bool) -> None:
     """A recording by the stock writer, as other software may set it up."""
     with path.open("wb") as file:
-        writer = Writer(file, **options)  # type: ignore[arg-type]
+        writer = Writer(file, **options)  # type: ignore[arg-type] # of each kind its own
         writer.start()
         writer.add_attachment(0, 0, topics.RIG_ATTACHMENT, "application/toml", source.rig.toml.encode())
         channels: dict[str, int] = {}

@@ -57,7 +57,7 @@ def test_a_kernel_that_is_not_round(correlation: float) -> None:
     """Against quadrature over each pixel."""
     covariance = np.array([[0.05**2, correlation * 0.05 * 0.03], [correlation * 0.05 * 0.03, 0.03**2]])
     width = linalg.sqrtm(2 * covariance).real
-    kernel = Kernel(shape="gaussian", sigma=0.06, matrix=tuple(map(tuple, width)))  # type: ignore[arg-type]
+    kernel = Kernel(shape="gaussian", sigma=0.06, matrix=tuple(map(tuple, width)))  # type: ignore[arg-type] # two by two
     path = np.stack([PATH, 0.1 * np.cos(4 * STEPS)])
     psf = motion_psf(path, None, kernel, SCALE)
     edges = (np.arange(-30, 32) - 0.5) * SCALE

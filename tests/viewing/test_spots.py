@@ -100,7 +100,7 @@ def test_no_view_is_empty(saved: Path) -> None:
 
 def test_windows_in_the_dark_have_no_paths(tmp_path: Path) -> None:
     rig = load_rig("sh-8x8")
-    saved = save_rrd(Simulated(rig, ["o1"]), tmp_path / "pupil.rrd")  # type: ignore[arg-type]
+    saved = save_rrd(Simulated(rig, ["o1"]), tmp_path / "pupil.rrd")  # type: ignore[arg-type] # it has what is asked of a recording
     (strips, *_) = read_rrd(saved)["/camera/image/path/truth"]["LineStrips2D:strips"]
     assert rig.optics is not None
     lit = np.argwhere(rig.optics.lenslets.light.reshape(8, 8) >= 0.4)

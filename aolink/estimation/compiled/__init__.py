@@ -6,3 +6,23 @@ in the processor's cache. Each has a twin in NumPy that tests hold it to: those 
 comes out for one axis does not depend on how many are beside it, bit for bit. Machine code is kept beside the
 source or in the user's cache, and made when an estimator is made, not in the session that it is made for.
 """
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+
+def forget_stale(folder: Path) -> None:
+    """Remove what is kept of compiled functions from before any source in their folder was changed.
+
+    Numba looks at a function's own file only, but has the functions that it calls from the others inside it.
+    """
+    with suppress(OSError, ValueError):  # nothing kept, or not to be removed by this user
+        changed = max(source.stat().st_mtime for source in folder.glob("*.py"))
+        for kept in (folder / "__pycache__").glob("*.nbi"):
+            if kept.stat().st_mtime < changed:
+                kept.unlink(missing_ok=True)
+
+
+forget_stale(Path(__file__).parent)

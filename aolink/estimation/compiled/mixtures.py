@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.compiled.line import Line, _expected, _log_likelihood, _path
+from aolink.estimation.compiled.line import Line, expected_light, log_likelihood_of, path_of
 from aolink.estimation.compiled.small import cholesky, compiled, log_sum, lower_inverse
 
 FloatArray = NDArray[np.float64]
@@ -162,9 +162,9 @@ def importance_corrected(
                 target[k] = log_sum(prior_logs) - 0.5 * (n - states) * _LOG_2PI
                 for i in range(states, n):
                     target[k] -= 0.5 * t[k, i] * t[k, i]
-                _path(line, axis, line.basis, t[k], path)
-                _expected(line, path, f)
-                target[k] += _log_likelihood(line, axis, f)
+                path_of(line, axis, line.basis, t[k], path)
+                expected_light(line, path, f)
+                target[k] += log_likelihood_of(line, axis, f)
                 for q in range(r):
                     _densities(old_weight[q], old_mean[q], old_inverse[q], old_constant[q], t[k], logs[k])
                     drawn[q, k] = log_sum(logs[k])
