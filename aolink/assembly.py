@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
+from aolink.wire.runs_pb2 import Run
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,6 +170,7 @@ class TruthReassembly:
         return pb.Truth.FromString(bytes(self._data)) if len(self._data) == chunk.total else None
 
 
+_DOUBLE = np.dtype("<f8")
 _Blocks = list[tuple[int, NDArray[np.float64]]]
 """First steps and inputs of runs of steps, (k, n_inputs), in the order in which they came."""
 
@@ -184,17 +186,18 @@ class _InputHistory:
         self.reported_until = 0
         """First step that no report covers yet."""
 
-    def add_applied(self, message: pb.Applied) -> None:
+    def add_applied(self, message: pb.Applied | Run) -> None:
         self._add(self._applied, message)
         self.reported_until = max(self.reported_until, message.first_step + message.n_steps)
 
-    def add_command(self, message: pb.CommandBlock) -> None:
+    def add_command(self, message: pb.CommandBlock | Run) -> None:
         self._add(self._commanded, message)
 
-    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock) -> None:
-        n_steps, u = message.n_steps, np.array(message.u, dtype=np.float64)
-        if n_steps and u.size == n_steps * self._n_inputs:
-            blocks.append((message.first_step, u.reshape(n_steps, self._n_inputs)))
+    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> None:
+        n_steps, u = message.n_steps, message.u
+        inputs = np.frombuffer(u, _DOUBLE) if isinstance(u, bytes) else np.array(u, dtype=np.float64)
+        if n_steps and inputs.size == n_steps * self._n_inputs:
+            blocks.append((message.first_step, inputs.reshape(n_steps, self._n_inputs)))
 
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
         """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
@@ -247,12 +250,12 @@ class Assembler:
         self._frames: deque[Frame] = deque()
         self._end: int | None = None
 
-    def add_applied(self, message: pb.Applied) -> list[Exposure]:
+    def add_applied(self, message: pb.Applied | Run) -> list[Exposure]:
         """Take a report of the mirror; gives the exposures that are complete with it."""
         self._history.add_applied(message)
         return self._ready()
 
-    def add_command(self, message: pb.CommandBlock) -> None:
+    def add_command(self, message: pb.CommandBlock | Run) -> None:
         """Take a command: it stands in where the mirror's report is lost."""
         self._history.add_command(message)
 

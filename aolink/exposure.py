@@ -14,6 +14,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.plain import plain_data
 from aolink.rig import Rig
 
 
@@ -39,7 +40,7 @@ class Picture:
     """True where the pixel arrived, (rows, columns)."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@plain_data
 class Exposure:
     """One camera integration."""
 

@@ -169,7 +169,9 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
     for b in range(n_blocks):
         starts[:, b] = state[:, 0]
         state = state @ transition + pushed[:, b, None]
-    path = (_times(blocks, toeplitz) + _times(starts, rows)).reshape(axes, n_blocks * length, plant.n_outputs)
+    path = _times(blocks, toeplitz)
+    path += _times(starts, rows)
+    path = path.reshape(axes, n_blocks * length, plant.n_outputs)
     return np.ascontiguousarray(path[:, n_blocks * length - k :].transpose(0, 2, 1)), state[:, 0]
 
 

@@ -50,10 +50,12 @@ class Block:
 def blocks(rig: Rig, exposures: Iterable[Exposure]) -> Iterator[Block]:
     """Some exposures at a time, a few megabytes of them."""
     some: list[Exposure] = []
+    numbers = 0
     for exposure in exposures:
         some.append(exposure)
-        if len(some) >= min(_AT_ONCE, _NUMBERS_AT_ONCE // (1 + exposure.inputs.size + exposure.pixels.size)):
+        numbers += exposure.inputs.size + exposure.pixels.size
+        if len(some) == _AT_ONCE or numbers >= _NUMBERS_AT_ONCE:
             yield Block(rig, some)
-            some = []
+            some, numbers = [], 0
     if some:
         yield Block(rig, some)

@@ -35,7 +35,7 @@ class Driver:
     def _steps(self, block: Block) -> Iterator[tuple[Exposure, list[Estimate]]]:
         series = [estimator.steps(block) for estimator in self.estimators]
         for exposure in block.exposures:
-            yield exposure, [next(each) for each in series]
+            yield exposure, list(map(next, series))
 
 
 def run(rig: Rig, exposures: Iterable[Exposure], names: Sequence[str]) -> dict[str, list[Estimate]]:

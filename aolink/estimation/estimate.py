@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.exposure_model import ExposureModel, path_from_coefficients
+from aolink.plain import plain_data
 
 FloatArray = NDArray[np.float64]
 
@@ -31,7 +32,7 @@ class Status(enum.IntEnum):
     """The estimator does not look at the camera (`open-loop`)."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@plain_data
 class Estimate:
     """Start state, end state and path of one exposure, with their covariances.
 

@@ -264,7 +264,8 @@ def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:
     Of several exposures, (exposures, k, axes * n_inputs) -> (exposures * axes, k, n_inputs). What is not a number is
     taken as zero: it must not poison every estimate that follows.
     """
-    finite = np.where(np.isfinite(inputs), inputs, 0.0)
+    known = np.isfinite(inputs)
+    finite = inputs if known.all() else np.where(known, inputs, 0.0)
     split = finite.reshape(-1, inputs.shape[-2], plant.axes, plant.n_inputs).transpose(0, 2, 1, 3)
     return split.reshape(-1, inputs.shape[-2], plant.n_inputs)
 

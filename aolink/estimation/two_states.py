@@ -113,7 +113,7 @@ def run(
     (first_weights, cross_weights, second_weights) = _weights(model.transition)
     (q0, _), (q1, q2) = process_noise.tolist()
     (x, v), ((p, q), (_, r)) = state.tolist(), covariance.tolist()
-    rows: list[tuple[float, ...]] = []
+    rows: list[float] = []
     given = zip(
         values.tolist(), noises.reshape(-1, 4).tolist(), responses.mean[:, 0].tolist(),
         responses.slope[:, 0].tolist(), responses.square[:, 0].tolist(), responses.end.tolist(), strict=True,
@@ -134,7 +134,7 @@ def run(
         p = _weighted(first_weights, p0, q0_, r0) + q0
         q = _weighted(cross_weights, p0, q0_, r0) + q1
         r = _weighted(second_weights, p0, q0_, r0) + q2
-        rows.append((*after, x, v, p, q, r, z1, z2))
+        rows.extend((*after, x, v, p, q, r, z1, z2))
     table = np.array(rows).reshape(-1, 1, 16)
     return Run(
         coefficients=table[..., :2],

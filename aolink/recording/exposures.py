@@ -15,6 +15,7 @@ from aolink.exposure import Exposure, Picture, Truth
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as wire
+from aolink.wire.runs_pb2 import Run
 
 
 class ExposureAssembly:
@@ -26,15 +27,18 @@ class ExposureAssembly:
 
     def take(self, topic: str, message: Message) -> list[Exposure]:
         """Take any message; gives the exposures that are complete with it."""
-        if isinstance(message, wire.Applied):
-            return self._assembler.add_applied(message)
-        if isinstance(message, wire.CommandBlock):
+        if topic == topics.IMAGE:
+            if isinstance(message, RawImage) and self._info is not None:
+                info, self._info = self._info, None
+                return self._assembler.add_frame(convert.frame_from_messages(info, message))
+        elif topic == topics.EXPOSURE:
+            if isinstance(message, schemas_pb2.ExposureInfo):
+                self._info = message
+        elif topic == topics.APPLIED:
+            if isinstance(message, (Run, wire.Applied)):
+                return self._assembler.add_applied(message)
+        elif topic == topics.COMMAND and isinstance(message, (Run, wire.CommandBlock)):
             self._assembler.add_command(message)
-        elif topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
-            self._info = message
-        elif topic == topics.IMAGE and isinstance(message, RawImage) and self._info is not None:
-            info, self._info = self._info, None
-            return self._assembler.add_frame(convert.frame_from_messages(info, message))
         return []
 
     def flush(self) -> list[Exposure]:
@@ -46,27 +50,22 @@ class Companions:
     """Exposures that wait for what is recorded beside them: truth and scene."""
 
     def __init__(self, counts: Container[str]) -> None:
-        self.waiting: deque[Exposure] = deque()
+        self._waiting: deque[Exposure] = deque()
         self._truths: dict[int, Truth] = {}
         self._scenes: dict[int, Picture] = {}
         kept: list[tuple[str, dict[int, Any]]] = [(topics.TRUTH, self._truths), (topics.SCENE, self._scenes)]
         self._expected = [found for topic, found in kept if topic in counts]
         self._info: schemas_pb2.ExposureInfo | None = None
 
-    @property
-    def has_next(self) -> bool:
-        """Whether the next exposure has all that it will get."""
-        waiting = self.waiting
-        return bool(waiting) and (len(waiting) > 1 or all(waiting[0].frame_id in found for found in self._expected))
+    def add(self, exposures: list[Exposure]) -> list[Exposure]:
+        """Take the next exposures; gives those that have all that they will get."""
+        if not self._expected:
+            return exposures
+        self._waiting.extend(exposures)
+        return self._ready()
 
-    def next(self) -> Exposure:
-        """The next exposure, with what came for it."""
-        exposure = self.waiting.popleft()
-        truth, scene = self._truths.pop(exposure.frame_id, None), self._scenes.pop(exposure.frame_id, None)
-        return replace(exposure, truth=truth, scene=scene) if truth or scene else exposure
-
-    def take(self, topic: str, message: Message) -> None:
-        """Take a message that belongs to an exposure."""
+    def take(self, topic: str, message: Message) -> list[Exposure]:
+        """Take a message that belongs to an exposure; gives as `add` does."""
         if isinstance(message, wire.Truth):
             self._truths[message.frame_id] = convert.truth_from_message(message)
         elif topic == topics.SCENE_EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
@@ -74,3 +73,20 @@ class Companions:
         elif topic == topics.SCENE and isinstance(message, RawImage) and self._info is not None:
             frame = convert.frame_from_messages(self._info, message)
             self._scenes[frame.frame_id], self._info = Picture(pixels=frame.pixels, mask=frame.mask), None
+        return self._ready()
+
+    def flush(self) -> list[Exposure]:
+        """The exposures that still wait, with what came for them."""
+        return [self._next() for _ in range(len(self._waiting))]
+
+    def _ready(self) -> list[Exposure]:
+        # What is beside an exposure may come after it, but not after the next one.
+        ready, waiting = [], self._waiting
+        while len(waiting) > 1 or (waiting and all(waiting[0].frame_id in found for found in self._expected)):
+            ready.append(self._next())
+        return ready
+
+    def _next(self) -> Exposure:
+        exposure = self._waiting.popleft()
+        truth, scene = self._truths.pop(exposure.frame_id, None), self._scenes.pop(exposure.frame_id, None)
+        return replace(exposure, truth=truth, scene=scene) if truth or scene else exposure

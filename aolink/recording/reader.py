@@ -23,6 +23,8 @@ from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
+from aolink.wire.messages_pb2 import Applied, CommandBlock
+from aolink.wire.runs_pb2 import Run
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +172,17 @@ class Recording:
             self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
             return None
 
+    def decoded_run(self, raw: RawMessage) -> Run | None:
+        """A command or what the mirror did with it, its inputs as bytes; None if it is neither, or not laid out so."""
+        if _RUNS.get(raw.topic) != raw.schema:
+            return None
+        try:
+            run = Run.FromString(raw.data)
+        except DecodeError:
+            return None
+        # A writer may have split the row, or put each number by itself: that is for the message's own class.
+        return run if len(run.u) == 8 * run.n_steps * self.rig.n_inputs else None
+
     def raw_messages(
         self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
@@ -197,20 +210,14 @@ class Recording:
         """The exposures in order, with their truth and their scene where the file has them."""
         assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
         for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE):
-            if (message := self.decoded(raw)) is None:
+            if (message := self.decoded_run(raw) or self.decoded(raw)) is None:
                 continue
             if raw.topic in _BESIDE:
-                beside.take(raw.topic, message)
+                yield from beside.take(raw.topic, message)
             elif completed := assembly.take(raw.topic, message):
-                beside.waiting.extend(completed)
-            elif not beside.waiting:
-                continue
-            # What is beside an exposure may come after it, but not after the next one.
-            while beside.has_next:
-                yield beside.next()
-        beside.waiting.extend(assembly.flush())
-        while beside.waiting:
-            yield beside.next()
+                yield from beside.add(completed)
+        yield from beside.add(assembly.flush())
+        yield from beside.flush()
 
     @property
     def true_scene(self) -> NDArray[np.uint16] | None:
@@ -373,5 +380,10 @@ def _scene_shape(rig: Rig) -> tuple[int, int]:
     return rig.scene.shape if rig.scene else (0, 0)
 
 
+_RUNS = {
+    topics.COMMAND: CommandBlock.DESCRIPTOR.full_name,
+    topics.APPLIED: Applied.DESCRIPTOR.full_name,
+}
+"""Where runs of steps are, and the schema that they have there."""
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
-_BESIDE = (topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE)
+_BESIDE = frozenset({topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE})

@@ -139,7 +139,7 @@ def _with_estimates(recording: Recording, driver: Driver) -> Iterator[RawMessage
     for raw in recording.raw_messages():
         if raw.topic.startswith((topics.ESTIMATE, topics.RESTORED)):
             continue
-        message = recording.decoded(raw)
+        message = recording.decoded_run(raw) or recording.decoded(raw)
         if message is None and raw.schema in topics.SCHEMAS:
             continue  # it is among the losses
         completed = assembly.take(raw.topic, message) if message is not None else []

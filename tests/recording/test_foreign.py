@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,8 @@ from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate, write_reestimated
 from aolink.recording.writer import begin_recording
+from aolink.wire.messages_pb2 import Applied, CommandBlock
+from aolink.wire.runs_pb2 import Run
 from tests.conftest import Session
 
 ROOT = Path(__file__).parents[2]
@@ -38,6 +42,45 @@ def test_another_reader_finds_nothing_wrong(recorded: Session, tmp_path: Path) -
         rows = [line for line in said.splitlines() if re.search(r" /\w", line)]
         assert len(rows) == len(Recording(path).counts)
         assert all(line.split()[0] == "ok" for line in rows), said
+
+
+def split(data: bytes) -> bytes:
+    """The same message with its row in two pieces, as protobuf allows."""
+    message = Applied.FromString(data)
+    first, rest = Applied(u=message.u[:70]), Applied(u=message.u[70:])
+    del message.u[:]
+    return b"".join(part.SerializeToString() for part in (first, message, rest))
+
+
+def one_by_one(data: bytes) -> bytes:
+    """The same message with each number by itself, as writers of old do it."""
+    message = Applied.FromString(data)
+    numbers = b"".join(b"\x21" + struct.pack("<d", value) for value in message.u)  # field 4, eight bytes
+    del message.u[:]
+    return message.SerializeToString() + numbers
+
+
+@pytest.mark.parametrize("written", [split, one_by_one])
+def test_rows_of_inputs_are_read_however_they_are_written(
+    recorded: Session, tmp_path: Path, written: Callable[[bytes], bytes]
+) -> None:
+    source = Recording(recorded.path)
+    file = McapFile(tmp_path / "a.mcap", WriteOptions())
+    begin_recording(file, source.rig, source.metadata, source.start_ns, {})
+    for number, raw in enumerate(source.raw_messages(), 1):
+        data = written(raw.data) if raw.topic == topics.APPLIED else raw.data
+        file.add(raw.topic, schema_of(topics.SCHEMAS[raw.schema]), data, raw.log_time_ns, number)
+    file.finish()
+    other = Recording(tmp_path / "a.mcap")
+    for ours, theirs in zip(other.exposures(), source.exposures(), strict=True):
+        assert ours.inputs.tobytes() == theirs.inputs.tobytes()
+        assert ours.inputs_assumed == theirs.inputs_assumed == 0
+
+
+def test_a_run_has_the_fields_of_commands_and_reports() -> None:
+    for field in Run.DESCRIPTOR.fields:
+        for kind in (CommandBlock, Applied):
+            assert kind.DESCRIPTOR.fields_by_name[field.name].number == field.number
 
 
 def test_messages_of_other_software_come_along(recorded: Session, tmp_path: Path) -> None:

@@ -178,7 +178,7 @@ def test_estimates_survive_the_recording(recorded: Session) -> None:
             assert ours.status == theirs.status
 
 
-@pytest.mark.parametrize("room", ["wire/messages", "recording/schemas"])
+@pytest.mark.parametrize("room", ["wire/messages", "wire/runs", "recording/schemas"])
 def test_the_generated_classes_are_those_of_the_proto_files(room: str, tmp_path: Path) -> None:
     import importlib
 

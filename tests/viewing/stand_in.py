@@ -15,6 +15,7 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.exposure_model import exposure_model
 from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
+from aolink.plain import plain_data
 from aolink.recording import schemas_pb2 as schemas
 from aolink.recording.reader import RestoredPictures
 from aolink.rig import Rig, load_rig
@@ -34,7 +35,7 @@ class Recorded:
     message: Any
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@plain_data
 class Drawn(Estimate):
     """An estimate whose path is given."""
 
