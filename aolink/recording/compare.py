@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
+import sqlite3
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import IO, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from google.protobuf.message import DecodeError, Message
@@ -22,7 +22,7 @@ RELATIVE = 1e-9
 ABSOLUTE = 1e-12
 _BYTES_KEPT = 32 << 20
 """Of messages whose counterpart has not come yet; more of them are in a temporary file."""
-_Key = tuple[str, object]
+_Key = tuple[str, str]
 """Topic, and what a message is of."""
 
 
@@ -104,7 +104,7 @@ def compare(
     Raises
     ------
     RecordingError
-        Neither recording has any of the topics.
+        Neither recording has any of the topics; what waits for its counterpart does not fit on the disk.
     """
     names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, only)}
     if not names:
@@ -132,55 +132,102 @@ def compare(
 
 
 def _called(key: _Key, frame_id: int | None) -> str:
-    return f"frame {frame_id}" if frame_id is not None else str(key[1])
+    return f"frame {frame_id}" if frame_id is not None else key[1]
+
+
+class _Kept(NamedTuple):
+    """A message whose counterpart has not come yet."""
+
+    is_first: bool
+    frame_id: int | None
+    kind: str
+    """Full name of its type."""
+    data: bytes
+
+    def message(self) -> Message:
+        return topics.SCHEMAS.get(self.kind, BytesValue).FromString(self.data)
 
 
 class _Waiting:
-    """Messages whose counterpart has not come yet: the first megabytes in memory, what is more in a file."""
+    """Messages whose counterpart has not come yet: the first megabytes in memory, what comes then in a temporary file.
+
+    Of messages with the same name the first comes out first; what is in the file came after all that is in memory.
+    """
 
     def __init__(self) -> None:
-        self._kept: dict[_Key, tuple[bool, int | None, type[Message], bytes | tuple[int, int]]] = {}
+        self._memory: dict[_Key, deque[_Kept]] = {}
         self._bytes = 0
-        self._file: IO[bytes] | None = None
+        self._file = sqlite3.connect("", isolation_level=None)
+        self._in_file = 0
+        self._file.execute("PRAGMA journal_mode = OFF")
+        self._file.execute(
+            "CREATE TABLE kept (topic TEXT, name TEXT, is_first INT, frame_id TEXT, kind TEXT, data BLOB)"
+        )
+        self._file.execute("CREATE INDEX by_name ON kept (topic, name)")
+        self._file.execute("BEGIN")
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            self._file.close()
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        self._file.close()
+        if isinstance(error, sqlite3.Error):
+            raise RecordingError(
+                f"what waits for its counterpart does not go into a temporary file: {error}; make room, or name another"
+                " folder as SQLITE_TMPDIR"
+            ) from None
 
     def put(self, key: _Key, message: Message, frame_id: int | None, *, is_first: bool) -> None:
         """Keep a message."""
-        data = message.SerializeToString()
-        place: bytes | tuple[int, int] = data
-        if self._bytes + len(data) > _BYTES_KEPT:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile()  # noqa: SIM115 # it lives as long as this
-            place = (self._file.seek(0, os.SEEK_END), len(data))
-            self._file.write(data)
+        kept = _Kept(is_first, frame_id, message.DESCRIPTOR.full_name, message.SerializeToString())
+        if self._in_file or self._bytes + _size(kept) > _BYTES_KEPT:
+            frame = None if frame_id is None else str(frame_id)  # it may need all of 64 bits
+            self._file.execute("INSERT INTO kept VALUES (?, ?, ?, ?, ?, ?)", (*key, is_first, frame, *kept[2:]))
+            self._in_file += 1
         else:
-            self._bytes += len(data)
-        self._kept[key] = (is_first, frame_id, type(message), place)
+            self._memory.setdefault(key, deque()).append(kept)
+            self._bytes += _size(kept)
 
     def partner(self, key: _Key, *, is_first: bool) -> Message | None:
         """Take out what the other recording has under a name; None if it has not come."""
-        kept = self._kept.get(key)
-        if kept is None or kept[0] == is_first:
+        if key in self._memory:
+            of_name = self._memory[key]
+            if of_name[0].is_first == is_first:
+                return None
+            kept = of_name.popleft()
+            self._bytes -= _size(kept)
+            if not of_name:
+                del self._memory[key]
+            return kept.message()
+        if not self._in_file:
             return None
-        del self._kept[key]
-        _, _, kind, data = kept
-        if isinstance(data, bytes):
-            self._bytes -= len(data)
-            return kind.FromString(data)
-        assert self._file is not None
-        self._file.seek(data[0])
-        return kind.FromString(self._file.read(data[1]))
+        row = self._file.execute(
+            f"SELECT rowid, {_COLUMNS} FROM kept WHERE topic = ? AND name = ? ORDER BY rowid LIMIT 1", key
+        ).fetchone()
+        if row is None or row[1] == is_first:
+            return None
+        self._file.execute("DELETE FROM kept WHERE rowid = ?", row[:1])
+        self._in_file -= 1
+        return _Kept(*row[1:]).message()
 
     def left(self) -> Iterator[tuple[_Key, bool, int | None]]:
         """What has no counterpart: its name, whether it is in the first recording, its exposure."""
-        for key, (is_first, frame_id, _, _) in self._kept.items():
-            yield key, is_first, frame_id
+        for key, of_name in self._memory.items():
+            for kept in of_name:
+                yield key, kept.is_first, kept.frame_id
+        for topic, name, is_first, frame_id in self._file.execute(
+            "SELECT topic, name, is_first, frame_id FROM kept ORDER BY rowid"
+        ):
+            yield (topic, name), bool(is_first), None if frame_id is None else int(frame_id)
+
+
+_COLUMNS = "is_first, frame_id, kind, data"
+_ENTRY_BYTES = 500
+"""What Python takes for a message besides its data, about."""
+
+
+def _size(kept: _Kept) -> int:
+    return len(kept.data) + _ENTRY_BYTES
 
 
 def _is_wanted(topic: str, only: Sequence[str]) -> bool:
@@ -189,7 +236,7 @@ def _is_wanted(topic: str, only: Sequence[str]) -> bool:
 
 def _alternating(
     first: Recording, second: Recording, names: Sequence[str], relative_to_start: bool
-) -> Iterator[tuple[bool, tuple[str, object], Message, int | None]]:
+) -> Iterator[tuple[bool, _Key, Message, int | None]]:
     """The messages of both, a little of each in turn, so that only what has no partner yet is kept."""
     sides = []
     for is_first, recording in ((True, first), (False, second)):
@@ -230,24 +277,25 @@ def _from_start(messages: Iterator[tuple[str, Message]], recording: Recording) -
         yield topic, message
 
 
-def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[tuple[str, object], Message, int | None]]:
+def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[_Key, Message, int | None]]:
     """Each message with a name that its counterpart has too, and the exposure that it belongs to."""
-    places: dict[tuple[str, object], int] = {}
+    places: dict[str, int] = {}
     exposures: dict[str, int] = {}
     for topic, message in messages:
         frame_id = None
-        name: object = ""
         if isinstance(message, schemas_pb2.ExposureInfo | schemas_pb2.Restoration):
             exposures |= dict.fromkeys(topics.PICTURES.get(topic, ()), message.frame_id)
         if topic in exposures:
-            frame_id = name = exposures[topic]
+            frame_id = exposures[topic]
         elif isinstance(value := getattr(message, "frame_id", None), int):
-            frame_id = name = value
+            frame_id = value
+        if frame_id is not None:
+            name = str(frame_id)
         elif isinstance(message, wire.CommandBlock | wire.Applied):
             name = f"block {message.block_id} at fast step {message.first_step}"
-        place = places[topic, name] = places.get((topic, name), 0) + 1
-        if place > 1 or name == "":
-            name = f"{name or 'message'}, number {place}"
+        else:
+            places[topic] = places.get(topic, 0) + 1
+            name = f"message, number {places[topic]}"
         yield (topic, name), message, frame_id
 
 
@@ -313,7 +361,7 @@ def _shown(x: Any, y: Any) -> str:
     def short(value: Any) -> str:
         if isinstance(value, bytes):
             return f"{len(value)} bytes"
-        text = str(value)
+        text = " ".join(str(value).split())
         return text if len(text) < 60 else text[:57] + "..."
 
     if isinstance(x, bytes) and isinstance(y, bytes) and len(x) == len(y):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from google.protobuf.message import Message
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aolink.errors import RecordingError
 from aolink.recording import compare as module
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
@@ -161,7 +163,7 @@ def test_what_does_not_fit_into_memory_waits_in_a_file(
 
     def watched(self: module._Waiting, *args: Any, **kwargs: Any) -> None:
         put(self, *args, **kwargs)
-        peak.append((self._bytes, len(self._kept)))
+        peak.append((self._bytes, len(self._memory)))
 
     monkeypatch.setattr(module._Waiting, "put", watched)
     expected = compare(one, two)
@@ -173,6 +175,51 @@ def test_what_does_not_fit_into_memory_waits_in_a_file(
     # What one of them alone has is counted, not kept.
     assert expected["/estimate/o3"].missing == one.counts["/estimate/o3"]
     assert entries <= sum(two.counts.values())
+
+
+def test_what_has_no_counterpart_waits_in_a_file_too(
+    recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the second every frame is twice, first as in the first recording, and the odd ones have other numbers."""
+
+    def change(topic: str, message: Message) -> list[Message]:
+        if topic != topics.EXPOSURE or not isinstance(message, pb.ExposureInfo):
+            return [message] if topic == topics.IMAGE else []
+        other = pb.ExposureInfo.FromString(message.SerializeToString())
+        other.chunks_lost += 1
+        if message.frame_id % 2:
+            message.frame_id = other.frame_id = 2**63 + message.frame_id
+        return [message, other]
+
+    one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
+    expected = compare(one, two, only=["/camera/"])
+    monkeypatch.setattr(module, "_BYTES_KEPT", 0)
+    found = compare(one, two, only=["/camera/"])
+    assert found == expected
+    of = found[topics.EXPOSURE]
+    odd = sum(message.frame_id % 2 for message in exposure_infos(one))
+    assert (of.compared, of.missing, of.added) == (EXPOSURES - odd, odd, EXPOSURES + odd)
+    assert not of.fields, "the first of each name is compared with the first"
+    assert of.first_missing == "frame 1"
+    assert of.first_added == f"frame {2**63 + 1}"
+
+
+def exposure_infos(recording: Recording) -> list[pb.ExposureInfo]:
+    return [each.message for each in recording.messages(topics.EXPOSURE) if isinstance(each.message, pb.ExposureInfo)]
+
+
+def test_a_full_temporary_folder_is_said(recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    connect = sqlite3.connect
+
+    def of_few_pages(*args: Any, **kwargs: Any) -> sqlite3.Connection:
+        file = connect(*args, **kwargs)
+        file.execute("PRAGMA max_page_count = 8")
+        return file
+
+    monkeypatch.setattr(module, "_BYTES_KEPT", 0)
+    monkeypatch.setattr(sqlite3, "connect", of_few_pages)
+    with pytest.raises(RecordingError, match=r"full.*SQLITE_TMPDIR"):
+        compare(Recording(recorded.path), Recording(recorded.path))
 
 
 def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tmp_path: Path) -> None:
