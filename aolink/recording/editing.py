@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,7 +121,7 @@ def cut(
         As `recover`; or there is no exposure between the two times.
     """
     if not -1e9 < start_s < end_s:
-        raise RecordingError(f"nothing is between {start_s:g} s and {end_s:g} s: the end must be after the start")
+        raise RecordingError(f"nothing is {between(start_s, end_s)}: the end must be after the start")
     recording = Recording(source)
     low, high = (recording.start_ns + round(t * 1e9) for t in (min(start_s, 1e9), min(end_s, 1e9)))
     notes = _begun(recording) | {"cut_from": source.name, "cut": f"{start_s:g} s to {end_s:g} s"}
@@ -128,11 +129,14 @@ def cut(
         result = _copied(recording, partial, _between(recording, low, high), notes, None, progress)
         if not result.exposures:
             duration_s = (recording.end_ns - recording.start_ns) / 1e9
-            raise RecordingError(
-                f"{source} has no exposure between {start_s:g} s and {end_s:g} s: it is {duration_s:.3g} s long"
-            )
+            raise RecordingError(f"{source} has no exposure {between(start_s, end_s)}: it is {duration_s:.3g} s long")
     result.path = target
     return result
+
+
+def between(start_s: float, end_s: float) -> str:
+    """A span of time in words."""
+    return f"between {start_s:g} s and {'the end' if end_s == math.inf else f'{end_s:g} s'}"
 
 
 def merge(

@@ -114,11 +114,17 @@ def replacing(target: Path, sources: Iterable[Path], *, overwrite: bool) -> Iter
         text = str(error).replace(str(partial), str(target)).removesuffix(_KEPT)
         raise RecordingError(text) from None
     except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        what = "the disk is full" if full else os.strerror(error.errno or 0).lower()
-        raise RecordingError(f"cannot write {target}: {what}") from None
+        raise RecordingError(f"cannot write {target}: {why_not(error)}") from None
     finally:
         partial.unlink(missing_ok=True)
+
+
+def why_not(error: OSError) -> str:
+    """Why a file cannot be written, in words."""
+    if error.errno == errno.EFBIG:
+        return "it would be larger than the disk or a limit (ulimit -f) lets a file be"
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return "the disk is full" if full else os.strerror(error.errno or 0).lower()
 
 
 _KEPT = "; what was recorded until then is in it and can be read"

@@ -7,9 +7,7 @@ it is bounded; when it is full, or when the disk is, the session gets an error: 
 from __future__ import annotations
 
 import contextlib
-import errno
 import io
-import os
 import re
 import threading
 import time
@@ -26,7 +24,7 @@ from aolink.errors import RecordingError
 from aolink.estimation import exposure_model
 from aolink.recording import topics
 from aolink.recording.lead import Lead
-from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of, why_not
 from aolink.rig import Rig
 
 _QUEUE_BYTES = 256 << 20
@@ -288,10 +286,7 @@ class RecordingWriter:
         if isinstance(error, RecordingError):
             self._error = error
             return
-        what = repr(error)
-        if isinstance(error, OSError):
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-            what = "the disk is full" if full else os.strerror(error.errno or 0).lower()
+        what = why_not(error) if isinstance(error, OSError) else repr(error)
         self._error = RecordingError(
             f"cannot write {self.paths[-1]}: {what}; what was recorded until then is in it and can be read"
         )

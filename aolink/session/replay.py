@@ -12,6 +12,7 @@ from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
 from aolink.recording import topics
+from aolink.recording.editing import between
 from aolink.recording.reader import Recording
 from aolink.wire import messages_pb2 as wire
 
@@ -68,7 +69,7 @@ def replay(
                 break
         yield exposure, driver.step(exposure)
     if began is None and not stop():
-        raise RecordingError(f"{recording.path} has no exposure between {start_s:g} s and {end_s:g} s")
+        raise RecordingError(f"{recording.path} has no exposure {between(start_s, end_s)}")
 
 
 class RecordedCommands:

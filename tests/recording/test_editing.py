@@ -160,7 +160,8 @@ def test_a_command_that_fails_leaves_the_target_as_it_was(aolink: Run, recorded:
     for command in (("recover",), ("cut", "--end", "99"), ("estimate", "-e", "o1")):
         full = aolink(command[0], recorded.path, *command[1:], "-o", "kept.mcap", "--overwrite", preexec_fn=small_files)
         assert full.returncode == 5
-        assert full.stderr == "aolink: cannot write kept.mcap: the disk is full\n"
+        why = "it would be larger than the disk or a limit (ulimit -f) lets a file be"
+        assert full.stderr == f"aolink: cannot write kept.mcap: {why}\n"
     assert [each.name for each in tmp_path.iterdir()] == ["kept.mcap"]
     assert (tmp_path / "kept.mcap").read_bytes() == b"something of mine"
 
@@ -185,3 +186,10 @@ def test_nothing_is_recovered_from_nothing(recorded: Session, tmp_path: Path) ->
         assert not (tmp_path / "b.mcap").exists()
     else:
         pytest.fail("the first chunk is in the first 30 kB: cut earlier")
+
+
+@pytest.mark.parametrize("command", [["cut", "-o", "c.mcap"], ["replay", "-e", "o1"]])
+def test_a_start_after_the_end_of_a_recording_is_said(aolink: Run, recorded: Session, command: list[str]) -> None:
+    refused = aolink(command[0], recorded.path, *command[1:], "--start", "100")
+    assert refused.returncode == 5
+    assert "has no exposure between 100 s and the end" in refused.stderr
