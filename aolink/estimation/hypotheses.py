@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +78,26 @@ class Hypotheses:
         merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
+    def with_components(self, count: int) -> Hypotheses:
+        """The same with components that are not there after its own."""
+        more = count - self.mean.shape[1]
+        if more <= 0:
+            return self
+        log_weight = np.concatenate([self.log_weight, np.full((len(self.mean), more), -np.inf)], axis=1)
+        mean, covariance = (
+            np.concatenate([each, np.repeat(each[:, :1], more, axis=1)], axis=1)
+            for each in (self.mean, self.covariance)
+        )
+        return Hypotheses(log_weight, mean, covariance)
+
+    def replaced(self, axes: NDArray[np.intp], by: Hypotheses) -> Hypotheses:
+        """The same with these axes' mixtures replaced."""
+        count = max(self.mean.shape[1], by.mean.shape[1])
+        old, new = self.with_components(count), by.with_components(count)
+        out = Hypotheses(old.log_weight.copy(), old.mean.copy(), old.covariance.copy())
+        out.log_weight[axes], out.mean[axes], out.covariance[axes] = new.log_weight, new.mean, new.covariance
+        return out
+
     def ordered(self, most: int | None = None) -> Hypotheses:
         """The heaviest components first, without columns of which none is there."""
         order = np.argsort(-self.log_weight, axis=1, kind="stable")[:, :most]
@@ -99,6 +120,15 @@ def joined(*mixtures: Hypotheses) -> Hypotheses:
         log_weight - log_sum(log_weight, axis=1)[:, None],
         np.concatenate([each.mean for each in mixtures], axis=1),
         np.concatenate([each.covariance for each in mixtures], axis=1),
+    )
+
+
+def stacked_axes(mixtures: Sequence[Hypotheses]) -> Hypotheses:
+    """Mixtures of different axes, one after the other."""
+    return Hypotheses(
+        np.concatenate([each.log_weight for each in mixtures]),
+        np.concatenate([each.mean for each in mixtures]),
+        np.concatenate([each.covariance for each in mixtures]),
     )
 
 

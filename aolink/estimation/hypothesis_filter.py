@@ -109,6 +109,7 @@ class HypothesisFilter:
         view = PixelView(self.sensor, model, response, dark, updates.reduction(model, self.sensor))
         one = slice(0, 1)
         updates.update(view.part(one), self.belief.part(one), 0)
+        view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
 
     def bridge(self, inputs: FloatArray) -> None:
         """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
@@ -143,7 +144,7 @@ class HypothesisFilter:
                 after = [np.concatenate(each)[trusted] for each in zip(*(_arrays(d, most) for d in done), strict=True)]
                 coefficients.mean[took], coefficients.covariance[took], several[took] = after[3], after[4], after[5]
                 kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
-                end = _replaced(end, took, kicked)
+                end = end.replaced(took, kicked)
             self._missed[seen] = np.where(trusted, 0, np.where(lost[seen], 1, self._missed[seen] + 1))
             status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
             status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
@@ -157,7 +158,7 @@ class HypothesisFilter:
 
 
 def _arrays(done: Update, components: int) -> tuple[NDArray[Any], ...]:
-    e, c = _with_components(done.end, components), done.coefficients
+    e, c = done.end.with_components(components), done.coefficients
     return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several)
 
 
@@ -182,25 +183,6 @@ def _moved(h: Hypotheses, transition: FloatArray, noise: FloatArray, kick: Float
     )
 
 
-def _with_components(h: Hypotheses, count: int) -> Hypotheses:
-    """The same with components that are not there after its own."""
-    more = count - h.mean.shape[1]
-    if more <= 0:
-        return h
-    log_weight = np.concatenate([h.log_weight, np.full((len(h.mean), more), -np.inf)], axis=1)
-    repeat = [np.concatenate([each, np.repeat(each[:, :1], more, axis=1)], axis=1) for each in (h.mean, h.covariance)]
-    return Hypotheses(log_weight, repeat[0], repeat[1])
-
-
-def _replaced(h: Hypotheses, axes: NDArray[np.intp], by: Hypotheses) -> Hypotheses:
-    """The same with these axes' mixtures replaced."""
-    count = max(h.mean.shape[1], by.mean.shape[1])
-    h, by = _with_components(h, count), _with_components(by, count)
-    out = Hypotheses(h.log_weight.copy(), h.mean.copy(), h.covariance.copy())
-    out.log_weight[axes], out.mean[axes], out.covariance[axes] = by.log_weight, by.mean, by.covariance
-    return out
-
-
 def _chosen(which: BoolArray, first: Hypotheses, second: Hypotheses) -> Hypotheses:
     rows = np.flatnonzero(which)
-    return _replaced(second, rows, first.part(rows)) if len(rows) else second
+    return second.replaced(rows, first.part(rows)) if len(rows) else second

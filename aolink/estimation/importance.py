@@ -4,11 +4,15 @@ After a round the mixture is fitted to the weighted points, and the next round i
 count: a mode where none was looked for is found by the few points that fall there. The points of all rounds are
 weighted against all densities together (Veach's balance heuristic; in this use Cornuet et al., Adaptive multiple
 importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and frame.
+
+Some posteriors no such mixture comes near: of a spot that hardly moves, seen through little noise, the blur fixes the
+sum of many squares, and the posterior is a shell. There points are annealed (`aolink.estimation.annealing`).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -16,29 +20,41 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation import stacked
+from aolink.estimation.annealing import annealed, fitted
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.hypotheses import Hypotheses, cholesky, joined, log_sum
+from aolink.estimation.hypotheses import Hypotheses, cholesky, joined, log_sum, stacked_axes
 from aolink.estimation.observation import Belief
 from aolink.estimation.pixels import PixelView
 
 FloatArray = NDArray[np.float64]
 
 # Rounds at most, where fewer points than these count.
-_ROUNDS = 7
-_ENOUGH = 32.0
+_ROUNDS = 4
+_ENOUGH = 100.0
+# If it is fewer still, so many are annealed, and their end states described by so many Gaussians.
+_ANNEALED = 600
+_COMPONENTS = 6
 # Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
 # is too sure. And steps of the search for the power.
-_LEAST_EFFECTIVE = 64.0
+_LEAST_EFFECTIVE = 128.0
 _HALVINGS = 6
 # Points of a round for each pair of coefficients; as many as the next power of two.
-_POINTS = 6
+_POINTS = 14
 _MOST_POINTS = 2048
 # Share of the points that come from the wide Gaussians.
 _WIDE = 0.3
-# Modes are flattened by this much: tails that are too thin cost more than ones that are too thick.
+# Modes are flattened by this much: tails that are too thin cost more than ones that are too thick. And of how much
+# better one is than another so much is believed, in logarithms, for Laplace's evidence of what is bent is rough.
 _INFLATION = 1.5
-# A component's covariance counts as so many points beside those that it is fitted to.
-_PRIOR_POINTS = 20.0
+_EVIDENCE = 0.5
+# A component's covariance counts as so many points for each coefficient beside those that it is fitted to. From round
+# to round few, so that it finds its place soon; at last many, and those of a mixture that was fitted already as so much
+# wider: a covariance of few points is too narrow, and all that comes after it too sure.
+_PRIOR_POINTS = 2.0
+_LAST_PRIOR_POINTS = 10.0
+_LOOSENED = 2.0
+# A component of less than this share is not drawn from any more.
+_NEGLIGIBLE = 1e-3
 
 
 def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, wide: Belief) -> Hypotheses:
@@ -46,32 +62,47 @@ def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, w
 
     Both weights are logarithms; covariances and means (axes, components, ...).
     """
-    weight = modes_weight - log_sum(modes_weight, axis=1)[:, None] + math.log(1 - _WIDE)
+    weight = _EVIDENCE * (modes_weight - np.maximum.reduce(modes_weight, axis=1, keepdims=True))
+    weight += math.log(1 - _WIDE) - log_sum(weight, axis=1)[:, None]
     narrow = Hypotheses(weight, modes.mean, modes.covariance * _INFLATION)
     return joined(narrow, Hypotheses(wide_weight + math.log(_WIDE), wide.mean, wide.covariance)).ordered()
 
 
-def importance_corrected(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, *, least_rounds: int = 2, share: float = 1.0
-) -> tuple[Hypotheses, FloatArray]:
-    """The posterior of t as the mixture that fits it, and the effective number of points, (axes,).
+def posterior(view: PixelView, prior: Hypotheses, proposal: Hypotheses, number: int, share: float = 1.0) -> Hypotheses:
+    """The posterior of t in the exposure of this number as the mixture that fits it.
 
-    It takes ``least_rounds`` at least, each of ``share`` of the usual number of points.
+    Of the usual number of points each round has this ``share``.
     """
-    enough = share * _ENOUGH
-    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * _POINTS * view.reduced.size**2)))
+    fit, effective = importance_corrected(view, prior, proposal, share)
+    few = np.flatnonzero(effective < share * _ENOUGH)
+    if not len(few):
+        return fit
+    rows = view.reduced.end_rows
+    points = (
+        annealed(view.part(few[k : k + 1]), prior.part(few[k : k + 1]), _ANNEALED, (number, int(view.axes[few[k]])))
+        for k in range(len(few))
+    )
+    return fit.replaced(few, stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points]))
+
+
+def importance_corrected(
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, share: float = 1.0
+) -> tuple[Hypotheses, FloatArray]:
+    """The mixture that fits weighted points, and how many of them count, (axes,)."""
+    enough, n = share * _ENOUGH, view.reduced.size
+    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * _POINTS * n**2)))
     if (line := view.line) is not None:
-        numbers = [_quasi_random(points, view.reduced.size, k) for k in range(_ROUNDS)]
+        numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]
         fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))
         effective = np.empty(len(prior.mean))
         compiled_mixtures.importance_corrected(
             line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
-            np.stack([e for _, e in numbers]), least_rounds, enough, _LEAST_EFFECTIVE, _HALVINGS, _PRIOR_POINTS,
-            effective,
+            np.stack([e for _, e in numbers]), enough, _LEAST_EFFECTIVE, _HALVINGS, n * _PRIOR_POINTS,
+            n * _LAST_PRIOR_POINTS, _LOOSENED, _NEGLIGIBLE, effective,
         )  # fmt: skip
         return fit, effective
     proposals: list[Hypotheses] = []
-    t = np.zeros((len(prior.mean), 0, view.reduced.size))
+    t = np.zeros((len(prior.mean), 0, n))
     target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
     fit, going_on = proposal, np.ones(len(t), dtype=bool)
     for k in range(_ROUNDS):
@@ -81,12 +112,14 @@ def importance_corrected(
         target = np.concatenate([target, _log_prior(prior, new) + view.log_likelihoods(new)], axis=1)
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
-        proposal = _refitted(proposal, t, _tempered(log_weight, _LEAST_EFFECTIVE))
-        fit = _where(going_on, proposal, fit)
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
-        going_on &= (k + 1 < least_rounds) | (effective < enough)
+        tempered = _tempered(log_weight, _LEAST_EFFECTIVE)
+        loosened = replace(proposal, covariance=proposal.covariance * (_LOOSENED if k else 1.0))
+        fit = _where(going_on, _refitted(proposal, t, tempered, loosened, n * _LAST_PRIOR_POINTS), fit)
+        going_on &= effective < enough
         if not going_on.any():
             break
+        proposal = _refitted(proposal, t, tempered, proposal, n * _PRIOR_POINTS)
     return fit, effective
 
 
@@ -143,8 +176,10 @@ def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
     return np.asarray(prior.log_density(t[..., :states]) + noise)
 
 
-def _refitted(mixture: Hypotheses, points: FloatArray, log_weight: FloatArray) -> Hypotheses:
-    """One step of expectation and maximisation with weighted points."""
+def _refitted(
+    mixture: Hypotheses, points: FloatArray, log_weight: FloatArray, beside: Hypotheses, prior_points: float
+) -> Hypotheses:
+    """One step of expectation and maximisation with weighted points, and the covariances of ``beside`` as some more."""
     logs = mixture.component_log_densities(points)
     share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
     mass = np.add.reduce(share, axis=2)
@@ -154,7 +189,8 @@ def _refitted(mixture: Hypotheses, points: FloatArray, log_weight: FloatArray) -
     mean = np.where(mass[..., None] > 1e-9, mean, mixture.mean)
     away = points[:, None] - mean[:, :, None]
     spread = stacked.long_matmul(stacked.transpose(away * share[..., None]), away) / safe[..., None]
-    trust = (effective / (effective + _PRIOR_POINTS))[..., None, None]
-    covariance = stacked.symmetric(trust * spread + (1 - trust) * mixture.covariance)
+    trust = (effective / (effective + prior_points))[..., None, None]
+    covariance = stacked.symmetric(trust * spread + (1 - trust) * beside.covariance)
+    mass = np.where(mass > _NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
     with np.errstate(divide="ignore"):
         return Hypotheses(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

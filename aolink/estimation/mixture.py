@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.hypotheses import Hypotheses, log_sum
 from aolink.estimation.hypothesis_filter import Update
-from aolink.estimation.importance import importance_corrected, proposed
+from aolink.estimation.importance import posterior, proposed
 from aolink.estimation.observation import Belief
 from aolink.estimation.pixels import PixelView, Reduction, reduction
 from aolink.estimation.profile import (
@@ -52,7 +52,7 @@ class MixtureUpdates:
         """The posterior of axes with a prior of their start states."""
         reduced = view.reduced
         modes, proposal = explored(view, prior)
-        after, _ = importance_corrected(view, prior, proposal)
+        after = posterior(view, prior, proposal, number)
         new = innovation(view, reduced.prior(prior.belief), modes)
         end = reduced.end(Belief(after.mean, after.covariance))
         carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(_CARRIED, _FREE)

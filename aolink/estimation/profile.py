@@ -24,7 +24,7 @@ from aolink.estimation.compiled.line import Line
 from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, lower_inverse, single
 from aolink.estimation.hypothesis_filter import Innovation, Update
-from aolink.estimation.importance import importance_corrected, proposed
+from aolink.estimation.importance import posterior, proposed
 from aolink.estimation.observation import Belief, corrected
 from aolink.estimation.pixels import PixelView, Reduction, reduction
 from aolink.estimation.windowed import KERNEL_REACH, PATH_REACH
@@ -45,7 +45,7 @@ _CONVERGED = 0.03
 _APART = 0.7
 _START_DIRECTIONS = 1
 # Of the points that a mixture draws in a round.
-_POINTS_SHARE = 0.5
+_POINTS_SHARE = 0.25
 _START_REACH = 1.3
 # A reversed path is met to so many standard deviations of the kernel, if the prior allows.
 _REVERSED_TO = 0.2
@@ -300,8 +300,7 @@ class ProfileUpdates:
             modes.log_evidence, Belief(modes.mean, modes.covariance),
             np.zeros((len(wide.mean), 1)), Belief(wide.mean[:, None], wide.covariance[:, None]),
         )  # fmt: skip
-        fit, _ = importance_corrected(view, prior, proposal, least_rounds=1, share=_POINTS_SHARE)
-        after = fit.belief
+        after = posterior(view, prior, proposal, number, _POINTS_SHARE).belief
         several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
         new = innovation(view, before, modes)
         return Update(after, single(view.reduced.end(after)), new, several)

@@ -7,10 +7,11 @@ import pytest
 from scipy import stats
 
 from aolink.estimation import exposure_model, make_estimator, pixels
+from aolink.estimation.annealing import fitted
 from aolink.estimation.hypotheses import single
 from aolink.estimation.measuring import measure
 from aolink.estimation.observation import Belief, corrected
-from aolink.estimation.sampled import SampledUpdates, fitted
+from aolink.estimation.sampled import SampledUpdates
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
@@ -108,7 +109,7 @@ def test_simulation_based_calibration(count, particles):
 def test_a_mixture_is_fitted_to_points():
     rng = np.random.default_rng(2)
     points = np.concatenate([rng.standard_normal((600, 2)) * 0.2 + [2, 0], rng.standard_normal((300, 2)) * 0.4])
-    fit = fitted(points, 0, 4)
+    fit = fitted(points, np.eye(2), 4, 0)
     np.testing.assert_allclose(fit.belief.mean[0], points.mean(axis=0), atol=1e-6)
     np.testing.assert_allclose(fit.belief.covariance[0], np.cov(points.T), rtol=0.02, atol=0.01)
     truth = np.log(

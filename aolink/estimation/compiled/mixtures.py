@@ -128,12 +128,13 @@ def _densities(
 @compiled
 def importance_corrected(
     line: Line, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray, log_weight: FloatArray,
-    mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, least_rounds: int,
-    enough: float, least_effective: float, halvings: int, prior_points: float, effective: FloatArray,
+    mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, enough: float,
+    least_effective: float, halvings: int, prior_points: float, last_prior_points: float, loosened: float,
+    negligible: float, effective: FloatArray,
 ) -> None:  # fmt: skip
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
-    As `aolink.estimation.mixture.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds, points, n)
+    As `aolink.estimation.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds, points, n)
     are the points' random numbers.
     """
     axes, count, n = mean.shape
@@ -180,8 +181,12 @@ def importance_corrected(
                 square += math.exp(2 * weight[k])
             effective[axis] = 1.0 / square
             _temper(weight[:end], least_effective, halvings, tempered[:end])
-            _refit(w, x, P, t[:end], tempered[:end], logs[:end], drawn[r, :end], prior_points)
-            if r + 1 >= least_rounds and effective[axis] >= enough:
+            last = r + 1 == rounds or effective[axis] >= enough
+            if last and r > 0:
+                P *= loosened
+            beside = last_prior_points if last else prior_points
+            _refit(w, x, P, t[:end], tempered[:end], logs[:end], drawn[r, :end], beside, negligible)
+            if last:
                 break
 
 
@@ -236,7 +241,7 @@ def _temper(log_weight: FloatArray, least: float, halvings: int, out: FloatArray
 @compiled
 def _refit(
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, t: FloatArray, weight: FloatArray,
-    logs: FloatArray, density: FloatArray, prior_points: float,
+    logs: FloatArray, density: FloatArray, prior_points: float, negligible: float,
 ) -> None:  # fmt: skip
     """One step of expectation and maximisation with weighted points, in place.
 
@@ -278,5 +283,8 @@ def _refit(
             for j in range(i + 1):
                 fitted = trust * spread[i, j] + (1 - trust) * covariance[c, i, j]
                 covariance[c, i, j] = covariance[c, j, i] = fitted
+    left = 0.0
     for c in range(count):
-        log_weight[c] = math.log(new[c] / whole) if new[c] > 0.0 else -math.inf
+        left += new[c] if new[c] > negligible * whole else 0.0
+    for c in range(count):
+        log_weight[c] = math.log(new[c] / left) if new[c] > negligible * whole else -math.inf
