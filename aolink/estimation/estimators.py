@@ -266,16 +266,15 @@ def _observation(rig: Rig, name: str, options: Options) -> Observation[Any] | No
 def _of_pixels(rig: Rig, name: str, options: Options) -> HypothesisFilter:
     """The filters of the pixels themselves; the code that they compile is loaded when one is wanted."""
     from aolink.estimation.hypothesis_filter import HypothesisFilter, Updates
-    from aolink.estimation.mixture import MixtureUpdates
-    from aolink.estimation.profile import ProfileUpdates
+    from aolink.estimation.pixel_updates import MIXTURE, PROFILE
     from aolink.estimation.sampled import SampledUpdates
 
     updates: Updates = SampledUpdates(options.particles, options.seed)
     if name != "sampled":
-        updates = ProfileUpdates() if name == "profile" else MixtureUpdates()
+        updates = PROFILE if name == "profile" else MIXTURE
     pixels = HypothesisFilter(rig.plant, rig.sensor, updates, gate=options.gate)
     # What profile compiles when a blur has several readings, mixture does at once.
-    pixels.warm_up(MixtureUpdates())
+    pixels.warm_up(MIXTURE)
     return pixels
 
 

@@ -70,8 +70,11 @@ class Updates(Protocol):
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
 
-    def update(self, view: PixelView, prior: Hypotheses, number: int) -> Update:
-        """The posterior of axes with a prior of their start states, in the exposure of this number."""
+    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+        """The posterior of axes with a prior of their start states, in the exposure of this number.
+
+        ``unseen`` is what the start states would be without a camera.
+        """
 
 
 class HypothesisFilter:
@@ -108,7 +111,7 @@ class HypothesisFilter:
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updates.reduction(model, self.sensor))
         one = slice(0, 1)
-        updates.update(view.part(one), self.belief.part(one), 0)
+        updates.update(view.part(one), self.belief.part(one), _part(self._unseen, one), 0)
         view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
 
     def bridge(self, inputs: FloatArray) -> None:
@@ -135,7 +138,9 @@ class HypothesisFilter:
             seen = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
             at_once = min(_AT_ONCE_COMPILED if view.compiled else _AT_ONCE, -(-len(seen) // thread_count()) or 1)
             parts = [seen[k : k + at_once] for k in range(0, len(seen), at_once)]
-            done = in_threads(lambda p: self._updates.update(view.part(p), prior.part(p), self._number), parts)
+            done = in_threads(
+                lambda p: self._updates.update(view.part(p), prior.part(p), _part(self._unseen, p), self._number), parts
+            )
             new = _spread([each.innovation for each in done], seen, axes)
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
@@ -155,6 +160,10 @@ class HypothesisFilter:
             coefficients=reduced.coefficients(coefficients), end=end.belief, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several,
         )  # fmt: skip
+
+
+def _part(belief: Belief, axes: slice | NDArray[np.intp]) -> Belief:
+    return Belief(belief.mean[axes], belief.covariance[axes])
 
 
 def _arrays(done: Update, components: int) -> tuple[NDArray[Any], ...]:

@@ -1,6 +1,6 @@
 """The pixels of all spots of one large plant: one mode of the joint posterior, by Levenberg and Marquardt's method.
 
-As `aolink.estimation.profile`, but for hundreds of coefficients and in information form: the objective is
+As `aolink.estimation.modes`, but for hundreds of coefficients and in information form: the objective is
 (t - m)' P^-1 (t - m) / 2 minus the pixels' log-likelihood, Fisher's information in the place of the Hessian. At the
 mode its inverse is the covariance.
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from aolink.estimation import stacked
 from aolink.estimation.annealing import annealed, fitted
 from aolink.estimation.exposure_model import ExposureModel
-from aolink.estimation.hypotheses import Hypotheses, log_sum, stacked_axes
+from aolink.estimation.hypotheses import Hypotheses, stacked_axes
 from aolink.estimation.hypothesis_filter import Update
-from aolink.estimation.mixture import explored
+from aolink.estimation.modes import innovation
 from aolink.estimation.observation import Belief
+from aolink.estimation.pixel_updates import explored, several_readings
 from aolink.estimation.pixels import PixelView, Reduction, reduction
-from aolink.estimation.profile import LEAST_SHARE, innovation
 from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
@@ -39,7 +39,7 @@ class SampledUpdates:
         """The coefficients that it works with."""
         return reduction(model, sensor, left_out=_LEFT_OUT, all_steps=True)
 
-    def update(self, view: PixelView, prior: Hypotheses, number: int) -> Update:
+    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
         """The posterior of axes with a prior of their start states."""
         t = self.sample(view, prior, number)
         reduced, before = view.reduced, view.reduced.prior(prior.belief)
@@ -50,9 +50,8 @@ class SampledUpdates:
         new = innovation(view, before, modes)
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         end = reduced.end(Belief(fit.mean, fit.covariance))
-        share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
         return Update(
-            after, Hypotheses(fit.log_weight, end.mean, end.covariance), new, (share > LEAST_SHARE).sum(axis=1) > 1
+            after, Hypotheses(fit.log_weight, end.mean, end.covariance), new, several_readings(view, modes, after)
         )
 
     def sample(self, view: PixelView, prior: Hypotheses, number: int) -> FloatArray:

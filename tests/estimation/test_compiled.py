@@ -8,14 +8,15 @@ import sys
 import numpy as np
 import pytest
 
-from aolink.estimation import exposure_model, make_estimator, pixels, profile
+from aolink.estimation import exposure_model, make_estimator, pixels
 from aolink.estimation.compiled import forget_stale, small
 from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.hypotheses import Hypotheses, log_determinant, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
 from aolink.estimation.importance import importance_corrected
-from aolink.estimation.mixture import MixtureUpdates, explored
+from aolink.estimation.modes import broad, find_modes, innovation, spread_starts, whitened
 from aolink.estimation.observation import Belief
+from aolink.estimation.pixel_updates import MIXTURE, PROFILE, explored
 from aolink.estimation.windowed import Profile
 from aolink.optics.camera import to_density
 from aolink.rig import load_rig
@@ -97,7 +98,7 @@ def test_likelihood_of_many_points(pair):
 def test_windowed_moments(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    ours, theirs = profile.broad(view, prior), profile.broad(in_numpy, prior)
+    ours, theirs = broad(view, prior), broad(in_numpy, prior)
     sd = np.sqrt(np.einsum("aii->ai", theirs.covariance))
     np.testing.assert_allclose(ours.mean / sd, theirs.mean / sd, atol=3e-5)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-5 * sd.max() ** 2)
@@ -106,9 +107,9 @@ def test_windowed_moments(pair):
 def test_every_start_leads_to_the_same_mode(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    starts = profile.spread_starts(in_numpy, profile.broad(in_numpy, prior), 2, 1.3)
-    white = profile.whitened(prior, starts)
-    ours, theirs = (profile.find_modes(each, prior, white, 40, 1e-4) for each in (view, in_numpy))
+    starts, _ = spread_starts(in_numpy, broad(in_numpy, prior), 2, 1.3)
+    white = whitened(prior, starts)
+    ours, theirs = (find_modes(each, prior, white, 40, 1e-4) for each in (view, in_numpy))
     # A long search may end in another mode, as one that begins 1e-6 away may.
     settled = np.abs(ours.objective - theirs.objective) < 0.02
     assert settled.mean() > 0.85
@@ -121,8 +122,8 @@ def test_every_start_leads_to_the_same_mode(pair):
 def test_a_mode_is_where_the_gradient_is_zero(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    start = profile.whitened(prior, profile.broad(view, prior).mean[:, None])
-    found = profile.find_modes(view, prior, start, 60, 1e-5)
+    start = whitened(prior, broad(view, prior).mean[:, None])
+    found = find_modes(view, prior, start, 60, 1e-5)
     t, root = found.mean[1:], np.linalg.cholesky(found.covariance[1:, 0])
     inverse, rest = np.linalg.inv(prior.covariance[1:]), in_numpy.part(slice(1, None))
 
@@ -157,8 +158,8 @@ def test_repeats():
 def test_innovation(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    modes = profile.find_modes(view, prior, profile.whitened(prior, profile.broad(view, prior).mean[:, None]))
-    ours, theirs = (profile.innovation(each, prior, modes) for each in (view, in_numpy))
+    found = find_modes(view, prior, whitened(prior, broad(view, prior).mean[:, None]))
+    ours, theirs = (innovation(each, prior, found) for each in (view, in_numpy))
     # Of a direction of next to no information it is the noise along any direction of the pixels.
     information = np.einsum("aii->ai", theirs.covariance) - 1
     tells = information > 1e-5 * information[:, :1]
@@ -297,12 +298,12 @@ def test_machine_code_is_not_older_than_any_source(tmp_path):
     forget_stale(tmp_path / "not there")
 
 
-@pytest.mark.parametrize("updates", [profile.ProfileUpdates(), MixtureUpdates()])
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
 def test_a_plant_without_process_noise(updates):
     plant = dataclasses.replace(LIVELY.plant, process_noise=0.0 * LIVELY.plant.process_noise)
     HypothesisFilter(plant, LIVELY.sensor, updates).warm_up(updates)
     rig = dataclasses.replace(LIVELY, plant=plant)
-    name = "profile" if isinstance(updates, profile.ProfileUpdates) else "mixture"
+    name = "profile" if updates is PROFILE else "mixture"
     estimator = make_estimator(rig, name)
     for exposure in simulate(rig, 12, seed=2):
         estimate = estimator.step(exposure)

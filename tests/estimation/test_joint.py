@@ -31,10 +31,10 @@ from aolink.estimation.joint import JointPaths
 from aolink.estimation.joint_moments import JointMoments
 from aolink.estimation.joint_profile import JointPixels, find_mode
 from aolink.estimation.measuring import measure
+from aolink.estimation.modes import find_modes, whitened
 from aolink.estimation.observation import Belief, PathMoments, steady_gain
 from aolink.estimation.options import Options
 from aolink.estimation.pixels import PixelView, Reduction
-from aolink.estimation.profile import find_modes, whitened
 from aolink.estimation.windowed import Regression
 from aolink.estimation.windowed_spots import WindowedSpots
 from aolink.exposure import Exposure

@@ -134,8 +134,8 @@ def importance_corrected(
 ) -> None:  # fmt: skip
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
-    As `aolink.estimation.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds, points, n)
-    are the points' random numbers.
+    As `aolink.estimation.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds,
+    points, n) are the points' random numbers.
     """
     axes, count, n = mean.shape
     states = prior_mean.shape[2]

@@ -47,7 +47,7 @@ def find_modes(
 ) -> None:  # fmt: skip
     """Where starts (rows, starts, n), whitened, lead by Levenberg and Marquardt's method.
 
-    As `aolink.estimation.profile.find_modes`; ``mean`` and ``roots`` are the prior's, (rows, n) and (rows, n, n).
+    As `aolink.estimation.modes.find_modes`; ``mean`` and ``roots`` are the prior's, (rows, n) and (rows, n, n).
     """
     nodes, n = line.basis.shape
     width = line.y.shape[1] + 2 * line.table.shape[2]

@@ -22,7 +22,7 @@ def broad(
 ) -> None:  # fmt: skip
     """Priors (rows, n) and (rows, n, n) corrected with windowed moments, linearised about what came before.
 
-    As `aolink.estimation.profile.broad` with `WindowedMoments` of orders 0 to 3.
+    As `aolink.estimation.modes.broad` with `WindowedMoments` of orders 0 to 3.
     """
     nodes, n = line.basis.shape
     path, spread, BC = np.empty(nodes), np.empty((nodes, nodes)), np.empty((nodes, n))

@@ -21,14 +21,11 @@ from aolink.estimation import stacked
 from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.compiled import moments as compiled_moments
 from aolink.estimation.compiled.line import Line
-from aolink.estimation.exposure_model import ExposureModel
-from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, lower_inverse, single
-from aolink.estimation.hypothesis_filter import Innovation, Update
-from aolink.estimation.importance import posterior, proposed
+from aolink.estimation.hypotheses import cholesky, lower_inverse
+from aolink.estimation.hypothesis_filter import Innovation
 from aolink.estimation.observation import Belief, corrected
-from aolink.estimation.pixels import PixelView, Reduction, reduction
+from aolink.estimation.pixels import PixelView
 from aolink.estimation.windowed import KERNEL_REACH, PATH_REACH
-from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -43,10 +40,6 @@ _NO_NOISE = 1e-14
 _CONVERGED = 0.03
 # Modes that are nearer to each other than so many standard deviations are one.
 _APART = 0.7
-_START_DIRECTIONS = 1
-# Of the points that a mixture draws in a round.
-_POINTS_SHARE = 0.25
-_START_REACH = 1.3
 # A reversed path is met to so many standard deviations of the kernel, if the prior allows.
 _REVERSED_TO = 0.2
 # Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
@@ -54,8 +47,6 @@ _DIRECTIONS = 4
 _GATE_PROBABILITY = 1e-9
 # Information of a direction, as a share of the largest, that is rounding.
 _TELLS_NOTHING = 1e-13
-# A second mode is one if the posterior gives it this much.
-LEAST_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,14 +181,21 @@ def broad(view: PixelView, prior: Belief) -> Belief:
     return about
 
 
-def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float) -> FloatArray:
-    """The mean of a belief and points beside it along the path's most uncertain directions, (axes, 1 + 2d, n)."""
+def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float) -> tuple[FloatArray, FloatArray]:
+    """The mean of a belief and points on both sides of it along the path's most uncertain directions.
+
+    Returns
+    -------
+    The points, (axes, 1 + 2 directions, n): the mean, and a pair for each direction. And the mean square of the path
+    along each direction at one standard deviation, the largest first, (axes, n).
+    """
     L = cholesky(belief.covariance)
-    _, V = np.linalg.eigh(stacked.symmetric(stacked.matmul(stacked.transpose(L), stacked.matmul(view.gram, L))))
+    values, V = np.linalg.eigh(stacked.symmetric(stacked.matmul(stacked.transpose(L), stacked.matmul(view.gram, L))))
     V = stacked.transpose(V[:, :, ::-1])
     along = stacked.matmul(V[:, :directions], stacked.transpose(L)) * reach
     mean = belief.mean[:, None]
-    return np.concatenate([mean, mean + along, mean - along], axis=1)
+    pairs = np.stack([mean + along, mean - along], axis=2).reshape(len(mean), -1, mean.shape[2])
+    return np.concatenate([mean, pairs], axis=1), values[:, ::-1] / view.whole_nodes
 
 
 def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> FloatArray:
@@ -225,8 +223,20 @@ def with_reversals(view: PixelView, prior: Belief, modes: Modes) -> Modes:
     """The same modes, and those that the reversal of the best one and its mirror images lead to."""
     back = reversed_starts(view, prior, modes.mean[np.arange(len(modes.mean)), modes.best][:, None])
     more = find_modes(view, prior, back)
-    each = [(getattr(modes, f.name), getattr(more, f.name)) for f in fields(Modes)]
-    return Modes(*(np.concatenate(pair, axis=1) for pair in each))
+    return with_more(modes, slice(None), more)
+
+
+def with_more(modes: Modes, axes: slice | NDArray[np.intp], more: Modes) -> Modes:
+    """The same modes, and after them those that more starts of some axes led to."""
+    nothing = {"mean": 0.0, "covariance": 0.0, "log_evidence": -np.inf, "distance": 0.0, "objective": np.inf}
+
+    def both(name: str) -> FloatArray:
+        old, new = getattr(modes, name), getattr(more, name)
+        spread = np.full((len(old), *new.shape[1:]), nothing[name])
+        spread[axes] = new
+        return np.concatenate([old, spread], axis=1)
+
+    return Modes(*(both(f.name) for f in fields(Modes)))
 
 
 def whitened(prior: Belief, points: FloatArray) -> FloatArray:
@@ -277,30 +287,3 @@ def _linear_fit(
     A = stacked.matmul(J[:, 0] * root[..., None], L)
     e = score / np.where(root > 0, root, 1.0)
     return stacked.matmul(stacked.transpose(A), A), stacked.matvec(stacked.transpose(A), e), stacked.dot(e, e)
-
-
-class ProfileUpdates:
-    """One Gaussian in, one Gaussian out: mean and covariance of the posterior about the modes that were found."""
-
-    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
-        """The coefficients that it works with."""
-        return reduction(model, sensor)
-
-    def update(self, view: PixelView, prior: Hypotheses, number: int) -> Update:
-        """The posterior of axes with a prior of their start states."""
-        before = view.reduced.prior(prior.belief)
-        wide = broad(view, before)
-        starts = np.concatenate(
-            [spread_starts(view, wide, _START_DIRECTIONS, _START_REACH), before.mean[:, None]], axis=1
-        )
-        found = find_modes(view, before, whitened(before, starts))
-        modes = without_repeats(with_reversals(view, before, found))
-        log_weight = modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None]
-        proposal = proposed(
-            modes.log_evidence, Belief(modes.mean, modes.covariance),
-            np.zeros((len(wide.mean), 1)), Belief(wide.mean[:, None], wide.covariance[:, None]),
-        )  # fmt: skip
-        after = posterior(view, prior, proposal, number, _POINTS_SHARE).belief
-        several = (np.exp(log_weight) > LEAST_SHARE).sum(axis=1) > 1
-        new = innovation(view, before, modes)
-        return Update(after, single(view.reduced.end(after)), new, several)

@@ -5,13 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aolink.estimation import Status, exposure_model, make_estimator, pixels, profile, run, score
+from aolink.estimation import Status, exposure_model, make_estimator, pixels, run, score
 from aolink.estimation.hypotheses import Hypotheses, cholesky, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
 from aolink.estimation.importance import importance_corrected
 from aolink.estimation.measuring import measure
-from aolink.estimation.mixture import MixtureUpdates, explored
+from aolink.estimation.modes import broad, find_modes, whitened
 from aolink.estimation.observation import Belief
+from aolink.estimation.pixel_updates import MIXTURE, PROFILE, explored
 from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.optics.camera import to_counts
 from aolink.optics.kernel import exposure_density
@@ -19,7 +20,7 @@ from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 RIG = load_rig("section-vi-lively")
-UPDATES = {"profile": profile.ProfileUpdates, "mixture": MixtureUpdates}
+UPDATES = {"profile": PROFILE, "mixture": MIXTURE}
 PIXEL_ESTIMATORS = list(UPDATES)
 
 
@@ -57,9 +58,9 @@ def by_importance(view, state, count=60_000, seed=1):
 def test_the_gradient_is_zero_at_a_mode():
     view, state = seen(quiet(RIG, 0.001), width=0.3)
     prior = view.reduced.prior(state)
-    start = profile.whitened(prior, profile.broad(view, prior).mean[:, None])
+    start = whitened(prior, broad(view, prior).mean[:, None])
     view.compiled = False  # its error function is exact; what is compiled has a test of its own
-    modes = profile.find_modes(view, prior, start, passes=60, converged=1e-5)
+    modes = find_modes(view, prior, start, passes=60, converged=1e-5)
     inverse = np.linalg.inv(prior.covariance[0])
 
     def objective(t):
@@ -84,7 +85,7 @@ def test_posterior_is_that_of_importance_sampling(photoelectrons):
     view, state = seen(rig)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 300
-    update = profile.ProfileUpdates().update(view, single(state), 0)
+    update = PROFILE.update(view, single(state), state, 0)
     sd = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.25)
     np.testing.assert_allclose(np.sqrt(np.diag(update.coefficients.covariance[0])) / sd, 1.0, atol=0.15)
@@ -109,7 +110,7 @@ def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=seed)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 200
-    update = profile.ProfileUpdates().update(view, single(state), 0)
+    update = PROFILE.update(view, single(state), state, 0)
     assert update.several[0]
     sd = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.45)
@@ -134,7 +135,7 @@ def test_points_are_drawn_from_the_wide_gaussian_too():
     view, state = seen(quiet(RIG, 0.01), width=0.5)
     _, proposal = explored(view, single(state))
     prior = view.reduced.prior(state)
-    wide = profile.broad(view, prior)
+    wide = broad(view, prior)
     same = np.abs(proposal.mean[0] - wide.mean[0]).max(axis=1) < 1e-12
     assert np.exp(proposal.log_weight[0, same]).sum() == pytest.approx(0.3)
 
@@ -150,9 +151,10 @@ def test_a_path_and_its_reversal_are_two_readings():
     measured = Profile(density=density[None], mask=np.ones((1, 40), bool))
     view = pixels.PixelView(rig.sensor, model, model.response(np.zeros((200, 1))), measured, reduced)
     P = np.diag([0.04, 25.0])
-    update = profile.ProfileUpdates().update(view, single(Belief(np.zeros((1, 2)), P[None])), 0)
+    state = Belief(np.zeros((1, 2)), P[None])
+    update = PROFILE.update(view, single(state), state, 0)
     assert update.several[0]
-    modes, _ = explored(view, single(Belief(np.zeros((1, 2)), P[None])))
+    modes, _ = explored(view, single(state))
     there = np.isfinite(modes.log_evidence[0])
     ends = view.paths(modes.mean)[0, there][:, 0, [0, -1]]
     evidence = modes.log_evidence[0, there]
@@ -245,7 +247,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(40))))
-        own = HypothesisFilter(plant, RIG.sensor, UPDATES[name]())
+        own = HypothesisFilter(plant, RIG.sensor, UPDATES[name])
         model = exposure_model(plant, 200)
         response = model.response(np.zeros((200, plant.axes)))
         return [own.step(model, response, Profile(density=d[rows], mask=np.ones(d[rows].shape, bool))) for d in density]

@@ -1,0 +1,137 @@
+"""The posterior of the pixels as Gaussians: `profile` carries one of them from exposure to exposure, `mixture` several.
+
+Modes are not Gaussian: the blur fixes how much a path moves and leaves open which way, and such a posterior is
+bent. So the modes, and the wide Gaussians of windowed moments about them, are where points are drawn from only;
+what counts is the points' weights (`aolink.estimation.importance`).
+
+A mode that was lost is found again: a thousandth of the prior is what the plant would be without a camera. It is
+searched where the best mode is further from the rest than chance brings it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.estimation.exposure_model import ExposureModel
+from aolink.estimation.hypotheses import Hypotheses, joined, log_sum, single
+from aolink.estimation.hypothesis_filter import Update
+from aolink.estimation.importance import posterior, proposed
+from aolink.estimation.modes import (
+    Modes,
+    broad,
+    find_modes,
+    innovation,
+    spread_starts,
+    whitened,
+    with_more,
+    with_reversals,
+    without_repeats,
+)
+from aolink.estimation.observation import Belief
+from aolink.estimation.pixels import PixelView, Reduction, reduction
+from aolink.sensor import BaseSensor
+
+FloatArray = NDArray[np.float64]
+
+# Mergers that lose less than this, in nats, cost nothing that matters.
+_FREE = 1e-3
+# Starts lie on both sides along the most uncertain direction of the path; where that is wider than so many variances of
+# the kernel, along so many.
+_WIDE_PATH = 0.5
+_DIRECTIONS = 3
+_START_REACH = 1.3
+# Of the prior is what the plant would be without a camera; and how rarely chance makes it looked at.
+_DOUBT = 1e-3
+_DOUBTED = 1e-3
+# A second mode is one if the posterior gives it this much.
+_LEAST_SHARE = 0.05
+
+
+@dataclass(frozen=True)
+class PixelUpdates:
+    """A mixture in, a mixture out."""
+
+    carried: int
+    """Gaussians from exposure to exposure, at most."""
+    share: float
+    """Of the usual number of points."""
+
+    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
+        """The coefficients that it works with."""
+        return reduction(model, sensor)
+
+    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+        """The posterior of axes with a prior of their start states."""
+        reduced = view.reduced
+        modes, proposal = explored(view, prior)
+        new = innovation(view, reduced.prior(prior.belief), modes)
+        doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
+        if len(doubted):
+            _, more = explored(view.part(doubted), single(Belief(unseen.mean[doubted], unseen.covariance[doubted])))
+            proposal = proposal.replaced(doubted, joined(proposal.part(doubted), more))
+        rest = Hypotheses(prior.log_weight + math.log1p(-_DOUBT), prior.mean, prior.covariance)
+        wide = Hypotheses(
+            np.full((len(unseen.mean), 1), math.log(_DOUBT)), unseen.mean[:, None], unseen.covariance[:, None]
+        )
+        after = posterior(view, joined(rest, wide), proposal, number, self.share)
+        end = reduced.end(Belief(after.mean, after.covariance))
+        carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(self.carried, _FREE)
+        several = several_readings(view, modes, after.belief)
+        several[doubted] = True
+        return Update(after.belief, carried, new, several)
+
+
+PROFILE = PixelUpdates(carried=1, share=0.25)
+MIXTURE = PixelUpdates(carried=6, share=1.0)
+
+
+def several_readings(view: PixelView, modes: Modes, after: Belief) -> NDArray[np.bool_]:
+    """Whether the blur has more than one reading, (axes,).
+
+    A second mode that matters, or a path that is known no better than the kernel is wide.
+    """
+    share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
+    square = np.einsum("ij,aij->a", view.gram, after.covariance) / (view.whole_nodes * view.outputs)
+    return np.asarray(((share > _LEAST_SHARE).sum(axis=1) > 1) | (square > view.kernel_variance))
+
+
+def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
+    """The modes that each component of a prior of the start state leads to, and a mixture to draw points from.
+
+    The modes' log-evidence has the weights of the components in it.
+    """
+    before = view.reduced.prior(Belief(prior.mean, prior.covariance))
+    axes, count, _ = before.mean.shape
+    there = np.nonzero(np.isfinite(prior.log_weight))
+    rows, each = view.part(there[0]), Belief(before.mean[there], before.covariance[there])
+    wide = broad(rows, each)
+    starts, squares = spread_starts(rows, wide, _DIRECTIONS, _START_REACH)
+    starts = whitened(each, starts)
+    found = find_modes(rows, each, starts[:, :3])
+    many = np.flatnonzero(squares[:, 0] > _WIDE_PATH * rows.kernel_variance)
+    if len(many):
+        some = Belief(each.mean[many], each.covariance[many])
+        found = with_more(found, many, find_modes(rows.part(many), some, starts[many, 3:]))
+    found = with_reversals(rows, each, found)
+    of_each = found.mean.shape[1]
+    found = replace(found, log_evidence=found.log_evidence + prior.log_weight[there][:, None])
+
+    def placed(values: FloatArray, empty: float) -> FloatArray:
+        out = np.full((axes, count, *values.shape[1:]), empty)
+        out[there] = values
+        return out.reshape(axes, count * of_each, *values.shape[2:])
+
+    modes = without_repeats(
+        Modes(
+            placed(found.mean, 0.0), placed(found.covariance, 0.0), placed(found.log_evidence, -math.inf),
+            placed(found.distance, 0.0), placed(found.objective, math.inf),
+        )
+    )  # fmt: skip
+    flat = Belief(np.zeros_like(before.mean), np.zeros_like(before.covariance))
+    flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
+    return modes, proposed(modes.log_evidence, Belief(modes.mean, modes.covariance), prior.log_weight, flat)
