@@ -51,7 +51,7 @@ _EVIDENCE = 0.5
 # to round few, so that it finds its place soon; at last many, and those of a mixture that was fitted already as so much
 # wider: a covariance of few points is too narrow, and all that comes after it too sure.
 _PRIOR_POINTS = 2.0
-_LAST_PRIOR_POINTS = 10.0
+_LAST_PRIOR_POINTS = 3.0
 _LOOSENED = 2.0
 # A component of less than this share is not drawn from any more.
 _NEGLIGIBLE = 1e-3

@@ -257,3 +257,40 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
         assert alone.coefficients.mean.tobytes() == together.coefficients.mean[some].tobytes()
         assert alone.coefficients.covariance.tobytes() == together.coefficients.covariance[some].tobytes()
         assert alone.nis.tobytes() == together.nis[some].tobytes()
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_lost_mode_is_found_again(name, seed):
+    """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
+    rig = load_rig("jitter")
+    exposures = simulate(rig, 9, seed=seed)
+    filter_ = HypothesisFilter(rig.plant, rig.sensor, UPDATES[name])
+    how = WindowedMoments(rig.sensor)
+    errors = []
+    for k, exposure in enumerate(exposures):
+        if k == 5:
+            h = filter_.belief
+            filter_.belief = Hypotheses(h.log_weight, -h.mean, 0.3 * h.covariance)
+        model = exposure_model(rig.plant, exposure.n_steps)
+        measured, _ = measure(rig, exposure, how, make_estimator(rig, "moments").options)
+        response = model.response(exposure.inputs)
+        posterior = filter_.step(model, response, measured)
+        path = model.path(posterior.coefficients.mean, response.path)
+        errors.append(np.sqrt(np.mean((path[0] - exposure.truth.path) ** 2)))
+    assert max(errors[7:]) < 2.5 * np.sqrt(np.mean(np.square(errors[1:5])))
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+def test_where_few_points_count_others_are_annealed(updates, monkeypatch):
+    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=11)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 200
+    monkeypatch.setattr("aolink.estimation.importance._ENOUGH", np.inf)
+    done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
+    assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(done.coefficients.mean[0] / sd, mean / sd, atol=0.25)
+    np.testing.assert_allclose(np.sqrt(np.diag(done.coefficients.covariance[0])) / sd, 1.0, atol=0.2)
+    end = view.reduced.end(Belief(mean[None], covariance[None]))
+    np.testing.assert_allclose(done.end.belief.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
