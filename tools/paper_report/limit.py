@@ -48,8 +48,8 @@ class Found:
     """RMS distance of the path from the limit's, in its standard deviations, without the sampler's own noise."""
     time_ms: float
     """For an axis and exposure."""
-    one_mode: tuple[float, float, float]
-    """Of exposures in which `profile` saw one mode: their share, the distance and the NEES there."""
+    single: tuple[float, float, float]
+    """Of exposures in which `profile` saw one reading of the blur: their share, the distance and the NEES there."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def limit_table(effort: Effort) -> list[Scene]:
     table = []
     every = islice(scenes(effort.limit_runs, effort.limit_exposures), 0, None, effort.limit_every)
     for name, rig, exposures in every:
-        estimates, seconds, one_mode = {}, {}, []
+        estimates, seconds, single = {}, {}, []
         for each in (*NAMES, "again"):
             options = {"particles": effort.particles, "seed": int(each == "again")}
             estimator = make_estimator(rig, "sampled" if each == "again" else each, **options)
@@ -105,13 +105,13 @@ def limit_table(effort: Effort) -> list[Scene]:
             for exposure in exposures:
                 estimates[each].append(estimator.step(exposure))
                 if each == "profile" and estimator.several is not None:
-                    one_mode.append(~estimator.several)
+                    single.append(~estimator.several)
             seconds[each] = time.perf_counter() - start
         limits = estimates["sampled"], estimates.pop("again")
         per = rig.plant.axes * len(exposures)
         table.append(
             Scene(name, {
-                each: _found(exposures, estimates[each], limits, one_mode, effort.limit_skip, seconds[each] * 1e3 / per)
+                each: _found(exposures, estimates[each], limits, single, effort.limit_skip, seconds[each] * 1e3 / per)
                 for each in NAMES
             })
         )  # fmt: skip
@@ -144,7 +144,7 @@ def against_o1_section(table: Sequence[tuple[str, dict[str, Measured]]], effort:
 
 def _found(
     exposures: Sequence[Exposure], estimates: Sequence[Estimate], limits: tuple[list[Estimate], list[Estimate]],
-    one_mode: Sequence[NDArray[np.bool_]], skip: int, time_ms: float,
+    single: Sequence[NDArray[np.bool_]], skip: int, time_ms: float,
 ) -> Found:  # fmt: skip
     path, end, nees, inside, product, variance = [], [], [], [], [], []
     for exposure, e, one, two in list(zip(exposures, estimates, *limits, strict=True))[skip:]:
@@ -162,12 +162,12 @@ def _found(
     axes, states = estimates[0].end_state.shape
     samples = axes * len(nees)
     low, high = (2 * float(special.gammaincinv(samples * states / 2, p)) / (samples * states) for p in (0.025, 0.975))
-    alone = np.array(one_mode[skip:])
+    alone = np.array(single[skip:])
     return Found(
         path=math.sqrt(np.mean(path)), end=math.sqrt(np.mean(end)), nees=float(np.mean(nees)) / states, nees_low=low,
         nees_high=high, inside=float(np.mean(inside)),
         distance=_root(np.array(product), np.array(variance)), time_ms=time_ms,
-        one_mode=(
+        single=(
             float(alone.mean()), _root(np.array(product)[alone], np.array(variance)[alone]),
             float(np.array(nees)[alone].mean()) / states if alone.any() else math.nan,
         ),
@@ -206,11 +206,14 @@ def limit_section(table: Sequence[Scene], effort: Effort, picture: Picture) -> l
             " sampler with other random numbers take its noise out. 0.32 costs 5 % in RMSE, 0.46 10 %."
         ),
         Table(["scene", *below], rows("distance", below)),
-        Text("Exposures in which profile saw one mode: their share, its distance and its NEES there:"),
+        Text(
+            "Exposures in which profile saw one reading of the blur, that is one mode, and a path that is known better"
+            " than the kernel is wide: their share, its distance and its NEES there:"
+        ),
         Table(
             ["scene", "share", "distance", "NEES"],
             [
-                [scene.name, *(format(x, ".2f") if math.isfinite(x) else "-" for x in scene.found["profile"].one_mode)]
+                [scene.name, *(format(x, ".2f") if math.isfinite(x) else "-" for x in scene.found["profile"].single)]
                 for scene in table
             ],
         ),
