@@ -48,7 +48,7 @@ def annealed(view: PixelView, prior: Hypotheses, count: int, key: tuple[int, ...
         power, before = _next_power(log_light, power), power
         chosen = _resampled(np.exp((power - before) * (log_light - log_light.max())), rng)
         t, log_prior, log_light = t[chosen], log_prior[chosen], log_light[chosen]
-        root = cholesky(np.cov(t, rowvar=False))
+        root = cholesky(np.cov(t, rowvar=False).reshape(n, n))
         size = 1.0
         for move in range(_MOVES):
             if move % 2:

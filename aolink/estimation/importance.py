@@ -38,8 +38,10 @@ _COMPONENTS = 6
 # is too sure. And steps of the search for the power.
 _LEAST_EFFECTIVE = 128.0
 _HALVINGS = 6
-# Points of a round for each pair of coefficients; as many as the next power of two.
+# Points of a round for each pair of coefficients; as many as the next power of two. Of one or two coefficients that
+# would be fewer than are to count.
 _POINTS = 14
+_FEWEST_POINTS = 128
 _MOST_POINTS = 2048
 # Share of the points that come from the wide Gaussians.
 _WIDE = 0.3
@@ -90,7 +92,7 @@ def importance_corrected(
 ) -> tuple[Hypotheses, FloatArray]:
     """The mixture that fits weighted points, and how many of them count, (axes,)."""
     enough, n = share * _ENOUGH, view.reduced.size
-    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * _POINTS * n**2)))
+    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
     if (line := view.line) is not None:
         numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]
         fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))

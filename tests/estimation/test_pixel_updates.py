@@ -36,7 +36,7 @@ def seen(rig=RIG, *, width=1.0, seed=3):
     reduced = pixels.reduction(model, rig.sensor)
     view = pixels.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
     P = rig.plant.initial_covariance * width**2
-    offset = np.linalg.cholesky(P) @ np.random.default_rng(seed).standard_normal(2)
+    offset = np.linalg.cholesky(P) @ np.random.default_rng(seed).standard_normal(len(P))
     return view, Belief(exposure.truth.start_state + offset, P[None])
 
 
@@ -294,3 +294,30 @@ def test_where_few_points_count_others_are_annealed(updates, monkeypatch):
     np.testing.assert_allclose(np.sqrt(np.diag(done.coefficients.covariance[0])) / sd, 1.0, atol=0.2)
     end = view.reduced.end(Belief(mean[None], covariance[None]))
     np.testing.assert_allclose(done.end.belief.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+@pytest.mark.parametrize("anneal", [False, True])
+def test_a_single_coefficient(updates, anneal, monkeypatch):
+    """Of one state without process noise the posterior is an integral over a line."""
+    noise = 0.0 * RIG.plant.process_noise
+    one = np.ones((1, 1))
+    plant = dataclasses.replace(
+        RIG.plant, A=0.999 * one, B=one, B_w=one, C=one, process_noise=noise, initial_mean=np.zeros(1),
+        initial_covariance=0.25 * one,
+    )  # fmt: skip
+    view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
+    assert view.reduced.size == 1
+    if anneal:
+        monkeypatch.setattr("aolink.estimation.importance._ENOUGH", np.inf)
+    else:
+        monkeypatch.delattr("aolink.estimation.importance.annealed")
+    t = np.linspace(-3, 3, 60_001)
+    log = view.log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
+    w = np.exp(log - log.max())
+    w /= w.sum()
+    mean = w @ t
+    sd = np.sqrt(w @ (t - mean) ** 2)
+    update = updates.update(view, single(state), state, 0)
+    assert abs(update.coefficients.mean[0, 0] - mean) < 0.2 * sd
+    assert np.sqrt(update.coefficients.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
