@@ -42,7 +42,7 @@ class Picture:
 
 @plain_data
 class Exposure:
-    """One camera integration."""
+    """One camera integration. Its arrays are not to be written to: those of a recording cannot be."""
 
     frame_id: int
     """The camera's own count of its frames; a gap is a lost frame."""

@@ -38,7 +38,8 @@ class Estimate:
 
     The three are jointly Gaussian. The path is kept as coefficients of the exposure basis
     (`aolink.estimation.ExposureModel.basis`): path = basis @ coefficients + response to the inputs. It is unfolded
-    where somebody reads it: of 1800 axes it takes longer than all that was estimated.
+    where somebody reads it: of 1800 axes it takes longer than all that was estimated. Nothing of it is to be written
+    to.
     """
 
     estimator: str

@@ -137,7 +137,9 @@ def log_sum(values: FloatArray, axis: int) -> FloatArray:
     top = np.maximum.reduce(values, axis=axis, keepdims=True)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.add.reduce(np.exp(values - top), axis=axis)) + np.squeeze(top, axis=axis))
+        # One after the other, so that what is not there does not change a bit.
+        total = np.take(np.add.accumulate(np.exp(values - top), axis=axis), -1, axis=axis)
+        return np.asarray(np.log(total) + np.squeeze(top, axis=axis))
 
 
 def cholesky(covariance: FloatArray) -> FloatArray:

@@ -32,6 +32,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _PATIENCE = 3
+# Times the plant's own uncertainty.
+_WIDEST = 1e6
 # Chunks of axes: what NumPy computes for them together fits into the cache; compiled code has fewer calls to pay for.
 _AT_ONCE = 32
 _AT_ONCE_COMPILED = 450
@@ -120,7 +122,17 @@ class HypothesisFilter:
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
             self.belief = _moved(self.belief, transition, noise, kick)
-            self._unseen = predicted(self._unseen, transition, noise, kick)
+            self._unseen = self._unwatched(transition, noise, kick)
+
+    def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
+        """The next of `_unseen`; that of an unstable plant stays where it is so wide that it says nothing."""
+        now, later = self._unseen, predicted(self._unseen, transition, noise, kick)
+        widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
+        grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)
+        return Belief(
+            np.where(grows[:, None], later.mean, now.mean),
+            np.where(grows[:, None, None], later.covariance, now.covariance),
+        )
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
         """One exposure, with its pixels or without."""
@@ -142,7 +154,8 @@ class HypothesisFilter:
                 lambda p: self._updates.update(view.part(p), prior.part(p), _part(self._unseen, p), self._number), parts
             )
             new = _spread([each.innovation for each in done], seen, axes)
-            trusted = new.believed[seen] | (not self._gate)
+            finite = np.concatenate([np.isfinite(each.coefficients.mean).all(axis=1) for each in done])
+            trusted = (new.believed[seen] | (not self._gate)) & finite
             took = seen[trusted]
             if len(took):
                 most = max(each.end.mean.shape[1] for each in done)
@@ -154,7 +167,7 @@ class HypothesisFilter:
             status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
             status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
         self.belief = end
-        self._unseen = predicted(self._unseen, model.transition, model.process_noise, response.end)
+        self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
         self._number += 1
         return Posterior(
             coefficients=reduced.coefficients(coefficients), end=end.belief, status=status, innovation=new.value,

@@ -27,6 +27,7 @@ from aolink.estimation.observation import Belief
 from aolink.estimation.pixels import PixelView
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 # Rounds at most, where fewer points than these count.
 _ROUNDS = 4
@@ -70,13 +71,15 @@ def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, w
     return joined(narrow, Hypotheses(wide_weight + math.log(_WIDE), wide.mean, wide.covariance)).ordered()
 
 
-def posterior(view: PixelView, prior: Hypotheses, proposal: Hypotheses, number: int, share: float = 1.0) -> Hypotheses:
+def posterior(
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, number: int, believed: BoolArray, share: float = 1.0
+) -> Hypotheses:
     """The posterior of t in the exposure of this number as the mixture that fits it.
 
-    Of the usual number of points each round has this ``share``.
+    Of the usual number of points each round has this ``share``. Axes that are not ``believed`` are not worth annealing.
     """
     fit, effective = importance_corrected(view, prior, proposal, share)
-    few = np.flatnonzero(effective < share * _ENOUGH)
+    few = np.flatnonzero(believed & ~(effective >= share * _ENOUGH))
     if not len(few):
         return fit
     rows = view.reduced.end_rows
@@ -95,7 +98,9 @@ def importance_corrected(
     points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
     if (line := view.line) is not None:
         numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]
-        fit = Hypotheses(*(np.array(each) for each in (proposal.log_weight, proposal.mean, proposal.covariance)))
+        fit = Hypotheses(
+            *(np.array(each, order="C") for each in (proposal.log_weight, proposal.mean, proposal.covariance))
+        )
         effective = np.empty(len(prior.mean))
         compiled_mixtures.importance_corrected(
             line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),

@@ -78,12 +78,10 @@ class PixelUpdates:
         wide = Hypotheses(
             np.full((len(unseen.mean), 1), math.log(_DOUBT)), unseen.mean[:, None], unseen.covariance[:, None]
         )
-        after = posterior(view, joined(rest, wide), proposal, number, self.share)
+        after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share)
         end = reduced.end(Belief(after.mean, after.covariance))
         carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(self.carried, _FREE)
-        several = several_readings(view, modes, after.belief)
-        several[doubted] = True
-        return Update(after.belief, carried, new, several)
+        return Update(after.belief, carried, new, several_readings(view, modes, after.belief))
 
 
 PROFILE = PixelUpdates(carried=1, share=0.25)

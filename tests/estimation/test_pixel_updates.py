@@ -321,3 +321,20 @@ def test_a_single_coefficient(updates, anneal, monkeypatch):
     update = updates.update(view, single(state), state, 0)
     assert abs(update.coefficients.mean[0, 0] - mean) < 0.2 * sd
     assert np.sqrt(update.coefficients.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_an_unstable_plant_does_not_end_in_infinity(name):
+    """What it would be without a camera grows without end; what the camera says of it does not."""
+    plant = dataclasses.replace(
+        RIG.plant, A=np.array([[1.02, 0.001], [0.0, 0.99]]), process_noise=np.array([[0.1]]),
+        initial_covariance=np.diag([1e-4, 1e-2]),
+    )  # fmt: skip
+    rig = dataclasses.replace(RIG, plant=plant)
+    model = exposure_model(plant, 200)
+    density = exposure_density(rig.sensor.kernel, rig.sensor.edges, np.zeros((1, 200)))
+    centred = Profile(density=density, mask=np.ones_like(density, dtype=bool))
+    filter_ = HypothesisFilter(plant, rig.sensor, UPDATES[name])
+    for _ in range(150):
+        filter_.step(model, model.response(np.zeros((200, 1))), centred)
+    assert np.isfinite(filter_.belief.mean).all()

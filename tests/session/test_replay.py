@@ -61,7 +61,7 @@ def test_as_fast_as_it_goes_nobody_sleeps(recorded: Session) -> None:
 def test_a_part_only(recorded: Session) -> None:
     frames = [each.frame_id for each, _ in replay(Recording(recorded.path), ["o1"], start_s=0.4, end_s=1.0)]
     assert frames == [3, 4, 5]
-    with pytest.raises(RecordingError, match="no exposure between 90 s and inf s"):
+    with pytest.raises(RecordingError, match="no exposure between 90 s and the end"):
         list(replay(Recording(recorded.path), ["o1"], start_s=90.0))
 
 

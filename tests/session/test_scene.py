@@ -261,7 +261,8 @@ def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sha
         np.isclose(a.info.scene_noise_sd, b.info.scene_noise_sd, rtol=1e-9) for a, b in zip(one, two, strict=True)
     )
     for a, b in zip(one, two, strict=True):
-        np.testing.assert_allclose(a.scene, b.scene, atol=1e-5)
+        # Two threads add up in another order than one, and the solver stops at 1e-4 of what it began with.
+        np.testing.assert_allclose(a.scene, b.scene, atol=1e-4)
     assert Recording(again).counts[wanted[0]] == EXPOSURES
     write_reestimated(Recording(sharp), ["o3"], tmp_path / "new.mcap")  # restored with what is no longer in it
     assert not set(wanted) & set(Recording(tmp_path / "new.mcap").counts)
