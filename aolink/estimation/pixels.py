@@ -251,10 +251,10 @@ class PixelView:
         edges, variance = self._optics.profile.edges, float(self._kernel[0, 0])
         return Line(
             y=np.ascontiguousarray(self.y), usable=np.ascontiguousarray(self.mask),
-            inputs=np.ascontiguousarray(self._inputs[:, 0]), basis=np.ascontiguousarray(self._basis[0]),
+            inputs=np.ascontiguousarray(self._inputs[:, 0]), basis=np.ascontiguousarray(self._basis[0].T),
             weights=self._weights, table=_light_table(variance, self._optics.pixel_size), low=float(edges[0]),
-            high=float(edges[-1]), pixel=self._optics.pixel_size, read_noise=self.read_noise, gain=self.gain,
-            kernel_variance=self.sensor.kernel.variance,
+            high=float(edges[-1]), pixel=self._optics.pixel_size, per_unit=1 / self._optics.pixel_size,
+            read_noise=self.read_noise, gain=self.gain, kernel_variance=self.sensor.kernel.variance,
         )  # fmt: skip
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -333,12 +333,15 @@ def _windowed(sensor: BaseSensor, line: bool, outputs: int) -> Windowed[Any]:
 
 @lru_cache(maxsize=16)
 def _light_table(variance: float, pixel: float) -> FloatArray:
-    """Taylor coefficients of the densities of pixels about a spot, by its place in its own, (points, 4, pixels)."""
+    """Taylor coefficients of the densities of pixels about a spot, by its place in its own, (points, 4, pixels).
+
+    By powers of its distance in pixels.
+    """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1
     places = (np.arange(points) + 0.5) * pixel / points
     masses = _masses(variance, pixel * np.arange(-half, half + 1.0), places, 3)
-    return np.stack([mass / (math.factorial(k) * pixel) for k, mass in enumerate(masses)], axis=1)
+    return np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
 
 
 def _masses(variance: float, edges: FloatArray, positions: FloatArray, highest: int) -> list[FloatArray]:

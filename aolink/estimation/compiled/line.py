@@ -28,16 +28,18 @@ class Line(NamedTuple):
     inputs: FloatArray
     """What inputs add to the path at its nodes, (rows, nodes)."""
     basis: FloatArray
-    """(nodes, n)"""
+    """(n, nodes): that of the exposure, transposed, for the loops' inner steps are the nodes."""
     weights: FloatArray
     """(nodes,)"""
     table: FloatArray
-    """Taylor coefficients of the light about points of a pixel, (points, 4, reach)."""
+    """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach)."""
     low: float
     """Where the first pixel begins."""
     high: float
     pixel: float
     """Width."""
+    per_unit: float
+    """Pixels: what is divided by often is kept as what is multiplied with."""
     read_noise: float
     """Variance of a pixel's density."""
     gain: float
@@ -47,25 +49,27 @@ class Line(NamedTuple):
 
 
 @compiled
-def _place(line: Line, theta: float) -> tuple[int, int, float]:
-    """First pixel that a spot gives light to, in padded rows; point of the table; distance from it. -1: no light."""
-    points, _, reach = line.table.shape
-    v = (theta - line.low) / line.pixel
-    if not (v > -0.5 * reach and v < line.y.shape[1] + 0.5 * reach):
+def _place(theta: float, low: float, per_unit: float, pixels: int, points: int, reach: int) -> tuple[int, int, float]:
+    """First pixel that a spot gives light to, in padded rows; point of the table; pixels from it. -1: no light.
+
+    Numbers come in, not the line: to count references to its arrays would take longer than all the rest.
+    """
+    v = (theta - low) * per_unit
+    if not (v > -0.5 * reach and v < pixels + 0.5 * reach):
         return -1, 0, 0.0
     cell = math.floor(v)
     u = v - cell
     point = min(int(u * points), points - 1)
-    return int(cell) + reach // 2, point, (u - (point + 0.5) / points) * line.pixel
+    return int(cell) + reach // 2, point, u - (point + 0.5) / points
 
 
 @compiled
 def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
     """Densities without noise, padded on both sides by the table's reach."""
     f[:] = 0.0
-    reach = line.table.shape[2]
+    points, _, reach = line.table.shape
     for k in range(len(path)):
-        first, point, d = _place(line, path[k])
+        first, point, d = _place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
         if first < 0:
             continue
         w = line.weights[k]
@@ -76,13 +80,13 @@ def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
 
 @compiled
 def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatArray, J: FloatArray) -> None:
-    """The same and its slope by the columns of a basis (nodes, n): J is (n, padded pixels)."""
+    """The same and its slope by the rows of a basis (n, nodes): J is (n, padded pixels)."""
     f[:] = 0.0
     J[:] = 0.0
-    reach = line.table.shape[2]
+    points, _, reach = line.table.shape
     slope = np.empty(reach)
     for k in range(len(path)):
-        first, point, d = _place(line, path[k])
+        first, point, d = _place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
         if first < 0:
             continue
         w = line.weights[k]
@@ -90,12 +94,13 @@ def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatAr
         # The loop of `expected_light`: in a function of its own it would make both a seventh slower.
         for p in range(reach):
             f[first + p] += w * (row[0, p] + d * (row[1, p] + d * (row[2, p] + d * row[3, p])))
+        w *= line.per_unit
         for p in range(reach):
             slope[p] = w * (row[1, p] + d * (2.0 * row[2, p] + 3.0 * d * row[3, p]))
-        for i in range(basis.shape[1]):
-            b, rates = basis[k, i], J[i, first : first + reach]
+        for i in range(len(basis)):
+            b = basis[i, k]
             for p in range(reach):
-                rates[p] += b * slope[p]
+                J[i, first + p] += b * slope[p]
 
 
 @compiled
@@ -114,24 +119,31 @@ def log_likelihood_of(line: Line, row: int, f: FloatArray) -> float:
 
 
 @compiled
-def path_of(line: Line, row: int, basis: FloatArray, t: FloatArray, path: FloatArray) -> None:
-    for k in range(len(path)):
-        total = line.inputs[row, k]
-        for i in range(len(t)):
-            total += basis[k, i] * t[i]
-        path[k] = total
+def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArray) -> None:
+    """Of coefficients t (n,) of a basis (n, nodes), (nodes,)."""
+    path[:] = offset
+    for i in range(len(t)):
+        x = t[i]
+        for k in range(len(path)):
+            path[k] += x * basis[i, k]
 
 
 @compiled
 def log_likelihoods(line: Line, t: FloatArray, out: FloatArray) -> None:
     """Of points (rows, points, n), (rows, points)."""
+    for row in range(len(t)):
+        log_likelihoods_of_row(line, row, t[row], out[row])
+
+
+@compiled
+def log_likelihoods_of_row(line: Line, row: int, t: FloatArray, out: FloatArray) -> None:
+    """Of points (points, n), (points,)."""
     path = np.empty(len(line.weights))
     f = np.empty(line.y.shape[1] + 2 * line.table.shape[2])
-    for row in range(t.shape[0]):
-        for j in range(t.shape[1]):
-            path_of(line, row, line.basis, t[row, j], path)
-            expected_light(line, path, f)
-            out[row, j] = log_likelihood_of(line, row, f)
+    for j in range(len(t)):
+        path_of(line.inputs[row], line.basis, t[j], path)
+        expected_light(line, path, f)
+        out[j] = log_likelihood_of(line, row, f)
 
 
 @compiled

@@ -7,12 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.compiled.line import Line, expected_light, log_likelihood_of, path_of
+from aolink.estimation.compiled.line import Line, log_likelihoods_of_row
 from aolink.estimation.compiled.small import cholesky, compiled, log_sum, lower_inverse
 
 FloatArray = NDArray[np.float64]
 
 _LOG_2PI = math.log(2 * math.pi)
+# Logarithm of what adds nothing to one.
+_NOTHING = -38.0
 
 
 @compiled
@@ -107,22 +109,31 @@ def _roots(
 
 
 @compiled
-def _densities(
-    log_weight: FloatArray, mean: FloatArray, inverse: FloatArray, constant: FloatArray, t: FloatArray, out: FloatArray
-) -> None:
-    """Log-densities of the components at a point."""
-    n = mean.shape[1]
+def _log_densities(
+    log_weight: FloatArray, mean: FloatArray, inverse: FloatArray, constant: FloatArray, t: FloatArray,
+    logs: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Of components at points (points, n), (components, points), and of the whole mixture, (points,)."""
+    points, n = t.shape
+    out[:] = -math.inf
     for c in range(len(log_weight)):
-        out[c] = -math.inf
         if log_weight[c] == -math.inf:
             continue
-        distance = 0.0
-        for i in range(n):
-            white = 0.0
-            for k in range(i + 1):
-                white += inverse[c, i, k] * (t[k] - mean[c, k])
-            distance += white * white
-        out[c] = constant[c] - 0.5 * distance
+        for k in range(points):
+            distance = 0.0
+            for i in range(n):
+                white = 0.0
+                for j in range(i + 1):
+                    white += inverse[c, i, j] * (t[k, j] - mean[c, j])
+                distance += white * white
+            logs[c, k] = constant[c] - 0.5 * distance
+            out[k] = max(out[k], logs[c, k])
+    for k in range(points):
+        total = 0.0
+        for c in range(len(log_weight)):
+            if log_weight[c] > -math.inf and logs[c, k] - out[k] > _NOTHING:
+                total += math.exp(logs[c, k] - out[k])
+        out[k] += math.log(total)
 
 
 @compiled
@@ -142,12 +153,11 @@ def importance_corrected(
     rounds, points = uniform.shape
     many = rounds * points
     prior_root, prior_inverse = np.empty(prior_covariance.shape[1:]), np.empty(prior_covariance.shape[1:])
-    prior_constant, prior_logs = np.empty(prior_mean.shape[1]), np.empty(prior_mean.shape[1])
+    prior_constant, prior_logs = np.empty(prior_mean.shape[1]), np.empty((prior_mean.shape[1], points))
     root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
-    t, target, drawn = np.empty((many, n)), np.empty(many), np.empty((rounds, many))
-    logs, total = np.empty((many, count)), np.empty(rounds)
+    t, target, prior_density = np.empty((many, n)), np.empty(many), np.empty(points)
+    logs, drawn = np.empty((count, many)), np.empty((rounds, many))
     weight, tempered = np.empty(many), np.empty(many)
-    f, path = np.empty(line.y.shape[1] + 2 * line.table.shape[2]), np.empty(len(line.weights))
     old_mean, old_inverse = np.empty((rounds, count, n)), np.empty((rounds, count, n, n))
     old_weight, old_constant = np.empty((rounds, count)), np.empty((rounds, count))
     for axis in range(axes):
@@ -157,35 +167,30 @@ def importance_corrected(
             _roots(w, P, root, inverse, constant)
             old_weight[r], old_mean[r], old_inverse[r], old_constant[r] = w, x, inverse, constant
             begin, end = r * points, (r + 1) * points
-            _draw(w, x, root, uniform[r], normal[r], t[begin:end])
-            for k in range(begin, end):
-                _densities(prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, t[k], prior_logs)
-                target[k] = log_sum(prior_logs) - 0.5 * (n - states) * _LOG_2PI
+            new = t[begin:end]
+            _draw(w, x, root, uniform[r], normal[r], new)
+            log_likelihoods_of_row(line, axis, new, target[begin:end])
+            _log_densities(
+                prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, new[:, :states], prior_logs,
+                prior_density,
+            )  # fmt: skip
+            for k in range(points):
+                square = (n - states) * _LOG_2PI
                 for i in range(states, n):
-                    target[k] -= 0.5 * t[k, i] * t[k, i]
-                path_of(line, axis, line.basis, t[k], path)
-                expected_light(line, path, f)
-                target[k] += log_likelihood_of(line, axis, f)
-                for q in range(r):
-                    _densities(old_weight[q], old_mean[q], old_inverse[q], old_constant[q], t[k], logs[k])
-                    drawn[q, k] = log_sum(logs[k])
-            for k in range(end):
-                _densities(w, x, inverse, constant, t[k], logs[k])
-                drawn[r, k] = log_sum(logs[k])
-                for q in range(r + 1):
-                    total[q] = drawn[q, k]
-                weight[k] = target[k] - log_sum(total[: r + 1])
-            weight[:end] -= log_sum(weight[:end])
-            square = 0.0
-            for k in range(end):
-                square += math.exp(2 * weight[k])
-            effective[axis] = 1.0 / square
-            _temper(weight[:end], least_effective, halvings, tempered[:end])
+                    square += new[k, i] * new[k, i]
+                target[begin + k] += prior_density[k] - 0.5 * square
+            for q in range(r):
+                _log_densities(
+                    old_weight[q], old_mean[q], old_inverse[q], old_constant[q], new, logs, drawn[q, begin:end]
+                )
+            _log_densities(w, x, inverse, constant, t[:end], logs, drawn[r, :end])
+            effective[axis] = _weigh(target[:end], drawn[: r + 1], weight[:end])
+            _temper(weight[:end], effective[axis], least_effective, halvings, tempered[:end])
             last = r + 1 == rounds or effective[axis] >= enough
             if last and r > 0:
                 P *= loosened
             beside = last_prior_points if last else prior_points
-            _refit(w, x, P, t[:end], tempered[:end], logs[:end], drawn[r, :end], beside, negligible)
+            _refit(w, x, P, t[:end], tempered[:end], logs, drawn[r], beside, negligible)
             if last:
                 break
 
@@ -214,27 +219,49 @@ def _draw(
 
 
 @compiled
-def _temper(log_weight: FloatArray, least: float, halvings: int, out: FloatArray) -> None:
+def _weigh(target: FloatArray, drawn: FloatArray, log_weight: FloatArray) -> float:
+    """Normalised weights of points over all the densities, (rounds, points), that they are from; how many count."""
+    top = -math.inf
+    for k in range(len(target)):
+        most = drawn[0, k]
+        for q in range(1, len(drawn)):
+            most = max(most, drawn[q, k])
+        log_weight[k] = target[k] - most
+        if len(drawn) > 1:
+            total = 0.0
+            for q in range(len(drawn)):
+                total += math.exp(drawn[q, k] - most)
+            log_weight[k] -= math.log(total)
+        top = max(top, log_weight[k])
+    one = two = 0.0
+    for k in range(len(target)):
+        each = math.exp(log_weight[k] - top)
+        one += each
+        two += each * each
+    log_weight -= top + math.log(one)
+    return one * one / two
+
+
+@compiled
+def _temper(log_weight: FloatArray, effective: float, least: float, halvings: int, out: FloatArray) -> None:
     """Weights raised to the largest power up to one at which so many points, or half of all, count."""
-    enough = math.log(min(least, len(log_weight) / 2))
-    low, high, power = 0.0, 1.0, 1.0
-    for _ in range(halvings):
-        top, one, two = -math.inf, 0.0, 0.0
+    enough = min(least, len(log_weight) / 2)
+    out[:] = log_weight
+    if effective >= enough:
+        return
+    low, high = 0.0, 1.0
+    for _ in range(1, halvings):
+        power = (low + high) / 2
+        one = two = 0.0
         for x in log_weight:
-            top = max(top, x)
-        for x in log_weight:
-            each = math.exp(power * (x - top))
+            each = math.exp(power * x)
             one += each
             two += each * each
-        if 2 * math.log(one) - math.log(two) >= enough:
+        if one * one >= enough * two:
             low = power
-            if power == 1.0:
-                break
         else:
             high = power
-        power = (low + high) / 2
-    for k in range(len(log_weight)):
-        out[k] = low * log_weight[k]
+    out *= low
     out -= log_sum(out)
 
 
@@ -245,7 +272,7 @@ def _refit(
 ) -> None:  # fmt: skip
     """One step of expectation and maximisation with weighted points, in place.
 
-    ``logs`` (points, components) are the components' log-densities at the points, ``density`` (points,) their sum's.
+    ``logs`` (components, points) are the components' log-densities at the points, ``density`` (points,) their sum's.
     """
     count, n = mean.shape
     away, whole = np.empty(n), 0.0
@@ -256,25 +283,25 @@ def _refit(
             continue
         mass = square = 0.0
         for k in range(len(t)):
-            share[k] = math.exp(logs[k, c] - density[k] + weight[k])
+            share[k] = math.exp(logs[c, k] - density[k] + weight[k])
             mass += share[k]
             square += share[k] * share[k]
         new[c] = mass
         whole += mass
-        safe = max(mass, 1e-300)
+        per_mass = 1.0 / max(mass, 1e-300)
         if mass > 1e-9:
             mean[c] = 0.0
             for k in range(len(t)):
                 for i in range(n):
-                    mean[c, i] += share[k] / safe * t[k, i]
+                    mean[c, i] += share[k] * per_mass * t[k, i]
         spread[:] = 0.0
         for k in range(len(t)):
-            if share[k] < 1e-12 * safe:
+            if share[k] * per_mass < 1e-12:
                 continue
             for i in range(n):
                 away[i] = t[k, i] - mean[c, i]
             for i in range(n):
-                x = share[k] / safe * away[i]
+                x = share[k] * per_mass * away[i]
                 for j in range(i + 1):
                     spread[i, j] += x * away[j]
         effective = mass * mass / max(square, 1e-300)

@@ -21,17 +21,14 @@ def linear_fits(
     line: Line, mean: FloatArray, roots: FloatArray, s: FloatArray, H: FloatArray, pull: FloatArray, square: FloatArray
 ) -> None:
     """In coordinates t = mean + root s, at s (rows, n): J' I J, J' score, and the sum of score^2 / I."""
-    nodes, n = line.basis.shape
+    n, nodes = line.basis.shape
     width = line.y.shape[1] + 2 * line.table.shape[2]
-    path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((nodes, n))
+    path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((n, nodes))
     f, J = np.empty(width), np.empty((n, width))
     for row in range(len(s)):
-        times(line.basis, roots[row], B)
-        path_of(line, row, line.basis, mean[row], rest)
-        for k in range(nodes):
-            path[k] = rest[k]
-            for i in range(n):
-                path[k] += B[k, i] * s[row, i]
+        times(roots[row].T, line.basis, B)
+        path_of(line.inputs[row], line.basis, mean[row], rest)
+        path_of(rest, B, s[row], path)
         linearised_light(line, path, B, f, J)
         _, square[row] = fisher_information(line, row, f, J, H[row], pull[row])
         for i in range(n):
@@ -49,17 +46,17 @@ def find_modes(
 
     As `aolink.estimation.modes.find_modes`; ``mean`` and ``roots`` are the prior's, (rows, n) and (rows, n, n).
     """
-    nodes, n = line.basis.shape
+    n, nodes = line.basis.shape
     width = line.y.shape[1] + 2 * line.table.shape[2]
-    path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((nodes, n))
+    path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((n, nodes))
     f, J = np.empty(width), np.empty((n, width))
     s, there, step = np.empty(n), np.empty(n), np.empty(n)
     H, pull, other, its_pull = np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n)
     damped, root, inverse = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     ends, their_H = np.empty(starts.shape[1:]), np.empty((starts.shape[1], n, n))
     for row in range(starts.shape[0]):
-        times(line.basis, roots[row], B)
-        path_of(line, row, line.basis, mean[row], rest)
+        times(roots[row].T, line.basis, B)
+        path_of(line.inputs[row], line.basis, mean[row], rest)
         for start in range(starts.shape[1]):
             s[:] = starts[row, start]
             now = _at(line, row, rest, B, s, path, f, J, H, pull)
@@ -153,10 +150,7 @@ def _at(
 ) -> float:  # fmt: skip
     """Information, downward pull and objective at whitened coordinates s."""
     n = len(s)
-    for k in range(len(path)):
-        path[k] = rest[k]
-        for i in range(n):
-            path[k] += B[k, i] * s[i]
+    path_of(rest, B, s, path)
     linearised_light(line, path, B, f, J)
     log_likelihood, _ = fisher_information(line, row, f, J, H, pull)
     square = 0.0

@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 
 def compiled(function: Callable[..., Any]) -> Any:
     """Decorator of a function that runs as machine code, which is kept for the next process if there is a place."""
-    options: Any = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
+    options: Any = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp"}}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # neither the source's folder nor the user's cache can be written
