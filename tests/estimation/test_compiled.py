@@ -170,7 +170,7 @@ def test_innovation(pair):
 
 def test_importance_sampling_with_the_same_points(pair):
     view, in_numpy, state = pair
-    some = slice(1, None)  # not the one beyond the sensor, where no point counts
+    some = slice(1, 7)  # not the one beyond the sensor, where no point counts
     prior = single(Belief(state.mean[some], state.covariance[some]))
     _, proposal = explored(view.part(some), prior)
     (ours, points), (theirs, their_points) = (

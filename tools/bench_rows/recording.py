@@ -207,7 +207,7 @@ def reestimation_rate() -> Row:
                 elif raw.topic == topics.IMAGE:
                     convert.frame_from_messages(info, cast(Any, recording.decoded(raw)))
 
-        estimating, reading = median_s(lambda: reestimate(recording, ["o3"]), 5, read)
+        estimating, reading = median_s(lambda: reestimate(recording, ["o3"]), 15, read)
         skipping = median_s(lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)), 5)[0]
     return Row(
         "re-estimation with o3",
