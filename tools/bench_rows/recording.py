@@ -7,11 +7,13 @@ import signal
 import statistics
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message
 from mcap.reader import make_reader
 
 from aolink.recording import schemas_pb2, topics
@@ -30,21 +32,26 @@ _LOOP_S = 20.0
 
 def _session(path: Path, seconds: float, options: WriteOptions | None = None) -> list[float]:
     """A 1 kHz loop that records a command, a report and, 50 times a second, a frame; times of its calls, s."""
+    with RecordingWriter(path, load_rig("section-vi"), {}, time.time_ns(), options=options) as writer:
+        return _loop(seconds, writer.write)
+
+
+def _loop(seconds: float, write: Callable[[str, Message, int], object]) -> list[float]:
+    """Times of the calls of a 1 kHz loop, s."""
     image = np.random.default_rng(1).integers(100, 200, (64, 64), dtype=np.uint16)
     spent = []
-    with RecordingWriter(path, load_rig("section-vi"), {}, time.time_ns(), options=options) as writer:
-        begin, k = time.monotonic(), 0
-        while time.monotonic() - begin < seconds:
-            now, start = time.time_ns(), time.perf_counter()
-            writer.write(topics.COMMAND, wire.CommandBlock(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
-            writer.write(topics.APPLIED, wire.Applied(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
-            if k % 20 == 0:
-                writer.write(topics.EXPOSURE, schemas_pb2.ExposureInfo(frame_id=k // 20 + 1), now)
-                frame = RawImage(width=64, height=64, encoding="mono16", step=128, data=image.tobytes())
-                writer.write(topics.IMAGE, frame, now)
-            spent.append(time.perf_counter() - start)
-            k += 1
-            time.sleep(max(0.0, begin + k * 1e-3 - time.monotonic()))
+    begin, k = time.monotonic(), 0
+    while time.monotonic() - begin < seconds:
+        now, start = time.time_ns(), time.perf_counter()
+        write(topics.COMMAND, wire.CommandBlock(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
+        write(topics.APPLIED, wire.Applied(block_id=k + 1, first_step=k, n_steps=1, u=[0.1]), now)
+        if k % 20 == 0:
+            write(topics.EXPOSURE, schemas_pb2.ExposureInfo(frame_id=k // 20 + 1), now)
+            frame = RawImage(width=64, height=64, encoding="mono16", step=128, data=image.tobytes())
+            write(topics.IMAGE, frame, now)
+        spent.append(time.perf_counter() - start)
+        k += 1
+        time.sleep(max(0.0, begin + k * 1e-3 - time.monotonic()))
     return spent
 
 
@@ -129,13 +136,15 @@ def flipped_bits() -> Row:
 
 
 def loop_stall() -> Row:
-    """The longest time that a 1 kHz loop waits for the recorder, in 20 s."""
+    """The longest time that a 1 kHz loop waits for the recorder, in 20 s; and what the machine takes from it anyway."""
     with tempfile.TemporaryDirectory() as folder:
         spent = np.array(_session(Path(folder) / "a.mcap", _LOOP_S)) * 1e3
-    p999, worst = np.percentile(spent, 99.9), spent.max()
+    alone = np.array(_loop(_LOOP_S, lambda topic, message, now: message.SerializeToString())) * 1e3
+    (p999, worst), (alone_999, alone_worst) = (np.percentile(each, [99.9, 100]) for each in (spent, alone))
     return Row(
-        "loop's wait for the recorder, 1 kHz", f"worst {worst:.2f} ms, 99.9 % {p999:.2f}", "limit 5 ms", 5 / worst, 1.0
-    )
+        "loop's wait for the recorder, 1 kHz", f"worst {worst:.2f} ms, 99.9 % {p999:.2f}",
+        f"limit 5 ms; encoded, not recorded: {alone_worst:.2f}, {alone_999:.2f}", 5 / worst, 1.0,
+    )  # fmt: skip
 
 
 def recording_rate() -> Row:
