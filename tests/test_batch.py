@@ -229,6 +229,9 @@ def test_the_command_on_two_processes(aolink: Run, recorded: Session, tmp_path: 
         *[("a.mcap", "o3")] * 2, *[("b.mcap", "o3")] * 2, *[("bad.mcap", "")] * 2,
     ]  # fmt: skip
     assert all("is not a recording" in row["error"] for row in rows[4:])
+    file = aolink(*arguments, "-o", "one.mcap")
+    assert (file.returncode, (tmp_path / "one.mcap").exists()) == (2, False)
+    assert "need -o DIR" in file.stderr
     alone = json.loads(aolink(*arguments, "-o", "one", "--json").stdout)
     for one, two in zip(alone, rows, strict=True):
         assert str(one["path_rmse"] or "") == two["path_rmse"]

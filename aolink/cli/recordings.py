@@ -103,7 +103,7 @@ def estimate(
     from aolink import batch, tables
     from aolink.rig import load_rig
 
-    if output is None:
+    if output is None or (output.suffix == ".mcap" and not is_folder):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
     models = batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
     todo = batch.jobs(files, models, estimator or [], output, engine.value, overwrite=overwrite)
