@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum
+from aolink.estimation.hypotheses import Hypotheses, cholesky, log_sum, with_noise
 from aolink.estimation.pixels import PixelView
 
 FloatArray = NDArray[np.float64]
@@ -127,8 +127,7 @@ def _drawn(prior: Hypotheses, rng: np.random.Generator, count: int, n: int) -> F
 
 
 def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
-    states = prior.mean.shape[2]
-    return np.asarray(prior.log_density(t[None, :, :states])[0] - 0.5 * (t[:, states:] ** 2).sum(axis=1))
+    return np.asarray(with_noise(prior, t[None])[0])
 
 
 def _log_likelihood(view: PixelView, t: FloatArray) -> FloatArray:

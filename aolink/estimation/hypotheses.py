@@ -132,6 +132,14 @@ def stacked_axes(mixtures: Sequence[Hypotheses]) -> Hypotheses:
     )
 
 
+def with_noise(prior: Hypotheses, t: FloatArray) -> FloatArray:
+    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
+    states = prior.mean.shape[2]
+    rest = t[..., states:]
+    noise = -0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi)
+    return np.asarray(prior.log_density(t[..., :states]) + noise)
+
+
 def log_sum(values: FloatArray, axis: int) -> FloatArray:
     """log sum exp along an axis; minus infinity where all are."""
     top = np.maximum.reduce(values, axis=axis, keepdims=True)

@@ -22,7 +22,7 @@ from scipy import special
 from aolink.estimation import stacked
 from aolink.estimation.annealing import annealed, fitted
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.hypotheses import Hypotheses, cholesky, joined, log_sum, stacked_axes
+from aolink.estimation.hypotheses import Hypotheses, cholesky, joined, log_sum, stacked_axes, with_noise
 from aolink.estimation.observation import Belief
 from aolink.estimation.pixels import PixelView
 
@@ -116,7 +116,7 @@ def importance_corrected(
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
         t = np.concatenate([t, new], axis=1)
-        target = np.concatenate([target, _log_prior(prior, new) + view.log_likelihoods(new)], axis=1)
+        target = np.concatenate([target, with_noise(prior, new) + view.log_likelihoods(new)], axis=1)
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
@@ -173,14 +173,6 @@ def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArr
     points = qmc.Sobol(n + 1, scramble=False).random(count)
     points = (points + np.random.default_rng(number).random(n + 1)) % 1.0
     return points[:, 0], np.asarray(special.ndtri(np.clip(points[:, 1:], 1e-12, 1 - 1e-12)))
-
-
-def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
-    """Of t = (start state, noise coefficients), (axes, points)."""
-    states = prior.mean.shape[2]
-    rest = t[..., states:]
-    noise = -0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi)
-    return np.asarray(prior.log_density(t[..., :states]) + noise)
 
 
 def _refitted(

@@ -55,6 +55,13 @@ def by_importance(view, state, count=60_000, seed=1):
 # Modes
 
 
+def assert_near(ours, mean, covariance, means, sds):
+    """Means within so many standard deviations, and those within such a part of themselves."""
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(ours.mean[0] / sd, mean / sd, atol=means)
+    np.testing.assert_allclose(np.sqrt(np.diag(ours.covariance[0])) / sd, 1.0, atol=sds)
+
+
 def test_the_gradient_is_zero_at_a_mode():
     view, state = seen(quiet(RIG, 0.001), width=0.3)
     prior = view.reduced.prior(state)
@@ -86,9 +93,7 @@ def test_posterior_is_that_of_importance_sampling(photoelectrons):
     mean, covariance, effective = by_importance(view, state)
     assert effective > 300
     update = PROFILE.update(view, single(state), state, 0)
-    sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.25)
-    np.testing.assert_allclose(np.sqrt(np.diag(update.coefficients.covariance[0])) / sd, 1.0, atol=0.15)
+    assert_near(update.coefficients, mean, covariance, 0.25, 0.15)
 
 
 @pytest.mark.parametrize("seed", [3, 4])
@@ -99,9 +104,7 @@ def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
     _, proposal = explored(view, single(state))
     after, points = importance_corrected(view, single(state), proposal)
     assert points[0] > 40
-    sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(after.belief.mean[0] / sd, mean / sd, atol=0.3)
-    np.testing.assert_allclose(np.sqrt(np.diag(after.belief.covariance[0])) / sd, 1.0, atol=0.25)
+    assert_near(after.belief, mean, covariance, 0.3, 0.25)
 
 
 @pytest.mark.parametrize("seed", [10, 11])
@@ -112,9 +115,7 @@ def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
     assert effective > 200
     update = PROFILE.update(view, single(state), state, 0)
     assert update.several[0]
-    sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(update.coefficients.mean[0] / sd, mean / sd, atol=0.45)
-    np.testing.assert_allclose(np.sqrt(np.diag(update.coefficients.covariance[0])) / sd, 1.0, atol=0.35)
+    assert_near(update.coefficients, mean, covariance, 0.45, 0.35)
 
 
 def test_evidence_of_a_mode_has_the_weight_of_its_prior():
@@ -289,9 +290,7 @@ def test_where_few_points_count_others_are_annealed(updates, monkeypatch):
     monkeypatch.setattr("aolink.estimation.importance._ENOUGH", np.inf)
     done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
     assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
-    sd = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(done.coefficients.mean[0] / sd, mean / sd, atol=0.25)
-    np.testing.assert_allclose(np.sqrt(np.diag(done.coefficients.covariance[0])) / sd, 1.0, atol=0.2)
+    assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
     end = view.reduced.end(Belief(mean[None], covariance[None]))
     np.testing.assert_allclose(done.end.belief.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
 
