@@ -154,8 +154,7 @@ class HypothesisFilter:
                 lambda p: self._updates.update(view.part(p), prior.part(p), _part(self._unseen, p), self._number), parts
             )
             new = _spread([each.innovation for each in done], seen, axes)
-            finite = np.concatenate([np.isfinite(each.coefficients.mean).all(axis=1) for each in done])
-            trusted = (new.believed[seen] | (not self._gate)) & finite
+            trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
             if len(took):
                 most = max(each.end.mean.shape[1] for each in done)

@@ -84,3 +84,11 @@ def test_an_axis_does_not_depend_on_those_beside_it(axes):
     some = points[3:4] if axes == 1 else points
     assert alone.log_density(some)[at].tobytes() == m.log_density(points)[3].tobytes()
     assert alone.reduced(2).mean[at].tobytes() == m.reduced(2).mean[3].tobytes()
+
+
+def test_what_is_not_there_does_not_change_a_bit_of_a_sum():
+    rng = np.random.default_rng(4)
+    values = rng.standard_normal((200, 6))
+    for more in (1, 3, 10):
+        padded = np.concatenate([values, np.full((200, more), -np.inf)], axis=1)
+        assert log_sum(padded, axis=1).tobytes() == log_sum(values, axis=1).tobytes()

@@ -337,3 +337,29 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
     for _ in range(150):
         filter_.step(model, model.response(np.zeros((200, 1))), centred)
     assert np.isfinite(filter_.belief.mean).all()
+    # A posterior mean is trusted however unstable the plant is, and what would be without a camera is a number.
+    assert (filter_.step(model, model.response(np.zeros((200, 1))), centred).status == Status.OK).all()
+    assert np.isfinite(filter_._unseen.covariance).all()
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+def test_a_path_that_is_not_known_has_several_readings(updates):
+    """Light that says next to nothing has one mode, and leaves the path wider than the kernel."""
+    for rig, several in ((RIG, True), (load_rig("section-vi"), False)):
+        view, state = seen(quiet(rig, 1e-3), width=1.0 if several else 0.05, seed=5)
+        view.read_noise *= 1e8 if several else 100.0
+        modes, _ = explored(view, single(state))
+        assert np.isfinite(modes.log_evidence).sum() == 1
+        assert updates.update(view, single(state), state, 0).several[0] == several
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+def test_a_frame_that_cannot_be_believed_is_not_annealed(updates, monkeypatch):
+    view, state = seen(quiet(RIG, 0.001), width=0.3)
+    lie = view.part(slice(None))
+    lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
+    monkeypatch.setattr("aolink.estimation.importance._ENOUGH", np.inf)
+    monkeypatch.delattr("aolink.estimation.importance.annealed")
+    assert not updates.update(lie, single(state), state, 0).innovation.believed[0]
+    with pytest.raises(NameError):
+        updates.update(view, single(state), state, 0)
