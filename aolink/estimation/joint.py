@@ -21,8 +21,8 @@ from aolink import tiles
 from aolink.estimation import large
 from aolink.estimation.exposure_model import InputResponse
 from aolink.estimation.factored_model import FactoredModel
-from aolink.estimation.pixels import _FEWEST_NODES, _SPACING
-from aolink.estimation.windowed import Nodes
+from aolink.estimation.nodes import Nodes, resolution
+from aolink.plant import psd_root
 from aolink.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -30,10 +30,12 @@ FloatArray = NDArray[np.float64]
 # Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
 # out, for many spots tell a displacement of all of them more finely.
 _LEFT_OUT = 0.05
+# Of all coefficients, to find the number of nodes.
+_DRAWS = 4
 
 
 class JointPaths:
-    """Paths of all spots at nodes, blocks of fast steps, of the first ``size`` coefficients.
+    """Paths of all spots at nodes, of the first ``size`` coefficients.
 
     Parameters
     ----------
@@ -66,13 +68,10 @@ class JointPaths:
         self._starts = np.cumsum([0] + [len(own) for own in self.groups[:-1]])
         self.course_of = course_of
         functions = model.functions[:, :used]
-        count = _node_count(model, functions, self, variance + sensor.pixel_width**2 / 12)
-        length = -(-model.n_steps // count)
-        self._first = np.arange(0, model.n_steps, length)
-        self._sizes = np.diff(np.append(self._first, model.n_steps))
-        self.functions = np.add.reduceat(functions, self._first, axis=0) / self._sizes[:, None]
-        """The courses' means over each node, (nodes, m)."""
-        self.weights = self._sizes / model.n_steps
+        self._quadrature = resolution(self._unseen(functions), variance, sensor.profile).quadrature
+        self.functions = np.ascontiguousarray(self._quadrature.at(functions.T).T)
+        """The courses at the nodes, (nodes, m)."""
+        self.weights = self._quadrature.weights
         """Each node's share of the exposure, (nodes,)."""
         self._late = model.moved
         if model.moved:
@@ -80,12 +79,19 @@ class JointPaths:
             self.functions = np.vstack([self.functions, functions[0], model.after[:used]])
             self.weights = np.append(self.weights, [-model.moved, model.moved])
         self.inputs = np.zeros((model.plant.n_outputs, len(self.weights)))
-        """Means of the response to the inputs, (n_outputs, nodes)."""
+        """The response to the inputs, (n_outputs, nodes)."""
+
+    def _unseen(self, functions: FloatArray) -> FloatArray:
+        """Paths of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
+        z = np.random.default_rng(0).standard_normal((_DRAWS, self.size))
+        n = self.model.plant.n_states
+        z[:, :n] = z[:, :n] @ psd_root(self.model.plant.initial_covariance).T
+        return np.concatenate([self.shares(each) @ functions.T for each in z])
 
     def with_inputs(self, response: InputResponse, axis: int) -> JointPaths:
         """The same with what the inputs of an exposure do."""
         paths, path = copy(self), response.path[axis]
-        paths.inputs = np.add.reduceat(path, self._first, axis=1) / self._sizes
+        paths.inputs = self._quadrature.at(path)
         if self._late:
             late = [path[:, 0], self.model.last_response(response.end)[axis]]
             paths.inputs = np.concatenate([paths.inputs, np.stack(late, axis=1)], axis=1)
@@ -183,16 +189,3 @@ class JointPaths:
 def joint_paths(model: FactoredModel, sensor: SpotSensor) -> JointPaths:
     """`JointPaths`, made once."""
     return JointPaths(model, sensor)
-
-
-def _node_count(model: FactoredModel, functions: FloatArray, paths: JointPaths, blurred: float) -> int:
-    """As for few states: by how far a spot of twice the prior's rms speed moves."""
-    covariance = np.eye(paths.size)
-    n = model.plant.n_states
-    covariance[:n, :n] = model.plant.initial_covariance
-    moves = np.diff(functions, axis=0)
-    own = np.einsum("sdcde->sdce", paths.spread(covariance)).reshape(-1, *(functions.shape[1],) * 2)
-    square = np.einsum("kc,oce,ke->ok", moves, own, moves)
-    speed = float(np.sqrt(square.mean(axis=1).max())) if square.size else 0.0
-    wanted = np.ceil(2 * speed * model.n_steps / (_SPACING * np.sqrt(blurred)))
-    return int(min(model.n_steps, max(_FEWEST_NODES, wanted)))

@@ -40,10 +40,15 @@ _NO_NOISE = 1e-14
 _CONVERGED = 0.03
 # Modes that are nearer to each other than so many standard deviations are one.
 _APART = 0.7
+# Starts lie on both sides along the most uncertain direction of the path; where that is wider than so many variances of
+# the kernel, along so many.
+_WIDE_PATH = 0.5
+_DIRECTIONS = 3
+_START_REACH = 1.3
 # A reversed path is met to so many standard deviations of the kernel, if the prior allows.
 _REVERSED_TO = 0.2
 # Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
-_DIRECTIONS = 4
+_NEW_DIRECTIONS = 4
 _GATE_PROBABILITY = 1e-9
 # Information of a direction, as a share of the largest, that is rounding.
 _TELLS_NOTHING = 1e-13
@@ -82,7 +87,7 @@ def find_modes(
     """
     axes, count, n = starts.shape
     if (line := view.line) is not None:
-        return _found_compiled(line, prior, starts, passes, converged)
+        return _found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0, passes, converged)
     if prior.mean.ndim == 2:
         prior = Belief(
             np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
@@ -125,17 +130,40 @@ def find_modes(
     )  # fmt: skip
 
 
-def _found_compiled(line: Line, prior: Belief, starts: FloatArray, passes: int, converged: float) -> Modes:
+def _found_compiled(
+    line: Line, prior: Belief, starts: FloatArray, of_axis: NDArray[np.intp], whole: int, reversed_precision: float,
+    passes: int = _PASSES, converged: float = _CONVERGED,
+) -> Modes:  # fmt: skip
     axes, count, n = starts.shape
+    count += 3 if reversed_precision else 0
     found = Modes(
         np.empty((axes, count, n)), np.empty((axes, count, n, n)), *(np.empty((axes, count)) for _ in range(3))
     )
     compiled_modes.find_modes(
-        line, np.ascontiguousarray(prior.mean), cholesky(prior.covariance), np.ascontiguousarray(starts), passes,
-        _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged, found.mean, found.covariance, found.log_evidence,
-        found.distance, found.objective,
+        line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
+        of_axis, whole, reversed_precision, passes, _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged,
+        found.mean, found.covariance, found.log_evidence, found.distance, found.objective,
     )  # fmt: skip
     return found
+
+
+def modes_of(view: PixelView, prior: Belief, wide: Belief) -> Modes:
+    """The modes of a posterior, looked for from what windowed moments make of the prior.
+
+    Starts lie there and on both sides along the most uncertain direction of the path; where that is wider than so many
+    variances of the kernel, along so many. After them come those that the best mode's reversal and mirror images lead
+    to.
+    """
+    starts, squares = spread_starts(view, prior, wide)
+    many = squares[:, 0] > _WIDE_PATH * view.kernel_variance
+    if (line := view.line) is not None:
+        of_axis = np.where(many, starts.shape[1], 3)
+        return _found_compiled(line, prior, starts, of_axis, view.whole_nodes, _reversed_precision(view))
+    found = find_modes(view, prior, starts[:, :3])
+    if len(some := np.flatnonzero(many)):
+        of_some = Belief(prior.mean[some], prior.covariance[some])
+        found = with_more(found, some, find_modes(view.part(some), of_some, starts[some, 3:]))
+    return with_reversals(view, prior, found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,21 +209,34 @@ def broad(view: PixelView, prior: Belief) -> Belief:
     return about
 
 
-def spread_starts(view: PixelView, belief: Belief, directions: int, reach: float) -> tuple[FloatArray, FloatArray]:
-    """The mean of a belief and points on both sides of it along the path's most uncertain directions.
+def spread_starts(view: PixelView, prior: Belief, wide: Belief) -> tuple[FloatArray, FloatArray]:
+    """The mean of a wide belief and points on both sides of it along the path's most uncertain directions.
 
     Returns
     -------
-    The points, (axes, 1 + 2 directions, n): the mean, and a pair for each direction. And the mean square of the path
-    along each direction at one standard deviation, the largest first, (axes, n).
+    The points, (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
+    direction. And the mean square of the path along each direction at one standard deviation, the largest first,
+    (axes, n).
     """
-    L = cholesky(belief.covariance)
+    axes, n = wide.mean.shape
+    if view.compiled:
+        starts, squares = np.empty((axes, 1 + 2 * min(_DIRECTIONS, n), n)), np.empty((axes, n))
+        compiled_modes.spread_starts(
+            *(np.ascontiguousarray(each) for each in (prior.mean, prior.covariance, wide.mean, wide.covariance)),
+            view.gram, _START_REACH, starts, squares,
+        )  # fmt: skip
+        return starts, squares
+    L = cholesky(wide.covariance)
     values, V = np.linalg.eigh(stacked.symmetric(stacked.matmul(stacked.transpose(L), stacked.matmul(view.gram, L))))
     V = stacked.transpose(V[:, :, ::-1])
-    along = stacked.matmul(V[:, :directions], stacked.transpose(L)) * reach
-    mean = belief.mean[:, None]
-    pairs = np.stack([mean + along, mean - along], axis=2).reshape(len(mean), -1, mean.shape[2])
-    return np.concatenate([mean, pairs], axis=1), values[:, ::-1] / view.whole_nodes
+    along = stacked.matmul(V[:, :_DIRECTIONS], stacked.transpose(L)) * _START_REACH
+    mean = wide.mean[:, None]
+    pairs = np.stack([mean + along, mean - along], axis=2).reshape(axes, -1, n)
+    return whitened(prior, np.concatenate([mean, pairs], axis=1)), values[:, ::-1]
+
+
+def _reversed_precision(view: PixelView) -> float:
+    return 1 / (_REVERSED_TO**2 * view.kernel_variance)
 
 
 def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> FloatArray:
@@ -205,17 +246,19 @@ def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> Float
     symmetric, as that of a vibration is; and both.
     """
     L, m = cholesky(prior.covariance), prior.mean
-    count = view.outputs * view.whole_nodes
-    rows = view.rows.reshape(view.outputs, -1, view.reduced.size)[:, : view.whole_nodes].reshape(count, -1)
-    precision = 1 / (_REVERSED_TO**2 * view.kernel_variance * view.whole_nodes)
+    nodes, outputs = view.whole_nodes, view.outputs
+    rows = view.rows.reshape(outputs, -1, view.reduced.size)[:, :nodes].reshape(outputs * nodes, -1)
+    weights = view.weights[:nodes] / view.weights[:nodes].sum()
+    precision = np.tile(weights, outputs) * _reversed_precision(view)
     B = stacked.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
-    path = view.paths(points)[..., : view.whole_nodes]
-    mirrored = 2 * path.mean(axis=-1, keepdims=True) - path
+    path = view.paths(points)[..., :nodes]
+    mirrored = 2 * (path @ weights)[..., None] - path
     like = np.concatenate([path[..., ::-1], mirrored, mirrored[..., ::-1]], axis=1)
-    back = like.reshape(len(like), -1, count)
-    away = back - view.paths(m[:, None])[..., : view.whole_nodes].reshape(-1, 1, count)
-    H = precision * stacked.matmul(stacked.transpose(B), B) + np.eye(B.shape[-1])
-    right = precision * stacked.matmul(away, B)
+    back = like.reshape(len(like), -1, outputs * nodes)
+    away = back - view.paths(m[:, None])[..., :nodes].reshape(-1, 1, outputs * nodes)
+    weighted = B * precision[:, None]
+    H = stacked.matmul(stacked.transpose(weighted), B) + np.eye(B.shape[-1])
+    right = stacked.matmul(away, weighted)
     return np.asarray(np.linalg.solve(H, stacked.transpose(right)).swapaxes(-1, -2))
 
 
@@ -252,18 +295,16 @@ def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
     """
     rows = np.arange(len(modes.mean)), modes.best
     t, distance = modes.mean[rows], modes.distance[rows]
-    n, L = t.shape[1], cholesky(prior.covariance)
-    s = whitened(prior, t[:, None])[:, 0]
-    gram, pull, square = _linear_fit(view, prior, L, s)
-    values, V = np.linalg.eigh(gram)
-    k = min(_DIRECTIONS * view.outputs, n)
-    values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
-    S = np.sqrt(values)
-    # Nothing is new in a direction in which the pixels do not tell anything.
-    tells = values > _TELLS_NOTHING * values[:, :1]
-    along = np.where(tells, stacked.matvec(stacked.transpose(V), pull) / np.where(tells, S, 1.0), 0.0)
-    u = along + S * stacked.matvec(stacked.transpose(V), s)
-    nis = np.add.reduce(u * u / (1 + values), axis=1)
+    axes, n = t.shape
+    k = min(_NEW_DIRECTIONS * view.outputs, n)
+    if (line := view.line) is not None:
+        u, values, nis, square = np.empty((axes, k)), np.empty((axes, k)), np.empty(axes), np.empty(axes)
+        compiled_modes.innovations(
+            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t, _TELLS_NOTHING, u,
+            values, nis, square,
+        )  # fmt: skip
+    else:
+        u, values, nis, square = _innovations(view, prior, t, k)
     # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
     total = square + distance
     degrees = np.add.reduce(view.mask, axis=1) + n
@@ -272,18 +313,21 @@ def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
     return Innovation(u, covariance, nis, believed & np.isfinite(nis))
 
 
-def _linear_fit(
-    view: PixelView, prior: Belief, L: FloatArray, s: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A'A, A'e and e'e of each axis, A = R^(-1/2) J L and e = R^(-1/2) (y - f), at whitened coordinates s."""
-    axes, n = s.shape
-    if (line := view.line) is not None:
-        gram, pull, square = np.empty((axes, n, n)), np.empty((axes, n)), np.empty(axes)
-        compiled_modes.linear_fits(line, np.ascontiguousarray(prior.mean), L, s, gram, pull, square)
-        return gram, pull, square
-    f, J = view.linearised((prior.mean + stacked.matvec(L, s))[:, None])
+def _innovations(
+    view: PixelView, prior: Belief, t: FloatArray, k: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
+    L, s = cholesky(prior.covariance), whitened(prior, t[:, None])[:, 0]
+    f, J = view.linearised(t[:, None])
     score, information = (each[:, 0] for each in view.information(f))
     root = np.sqrt(information)
     A = stacked.matmul(J[:, 0] * root[..., None], L)
     e = score / np.where(root > 0, root, 1.0)
-    return stacked.matmul(stacked.transpose(A), A), stacked.matvec(stacked.transpose(A), e), stacked.dot(e, e)
+    values, V = np.linalg.eigh(stacked.matmul(stacked.transpose(A), A))
+    values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
+    S = np.sqrt(values)
+    # Nothing is new in a direction in which the pixels do not tell anything.
+    tells = values > _TELLS_NOTHING * values[:, :1]
+    pull = stacked.matvec(stacked.transpose(stacked.matmul(A, V)), e)
+    u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * stacked.matvec(stacked.transpose(V), s)
+    return u, values, np.add.reduce(u * u / (1 + values), axis=1), stacked.dot(e, e)

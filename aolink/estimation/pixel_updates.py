@@ -21,17 +21,7 @@ from aolink.estimation.exposure_model import ExposureModel
 from aolink.estimation.hypotheses import Hypotheses, joined, log_sum, single
 from aolink.estimation.hypothesis_filter import Update
 from aolink.estimation.importance import posterior, proposed
-from aolink.estimation.modes import (
-    Modes,
-    broad,
-    find_modes,
-    innovation,
-    spread_starts,
-    whitened,
-    with_more,
-    with_reversals,
-    without_repeats,
-)
+from aolink.estimation.modes import Modes, broad, innovation, modes_of, without_repeats
 from aolink.estimation.observation import Belief
 from aolink.estimation.pixels import PixelView, Reduction, reduction
 from aolink.sensor import BaseSensor
@@ -40,11 +30,6 @@ FloatArray = NDArray[np.float64]
 
 # Mergers that lose less than this, in nats, cost nothing that matters.
 _FREE = 1e-3
-# Starts lie on both sides along the most uncertain direction of the path; where that is wider than so many variances of
-# the kernel, along so many.
-_WIDE_PATH = 0.5
-_DIRECTIONS = 3
-_START_REACH = 1.3
 # Of the prior is what the plant would be without a camera; and how rarely chance makes it looked at.
 _DOUBT = 1e-3
 _DOUBTED = 1e-3
@@ -94,7 +79,7 @@ def several_readings(view: PixelView, modes: Modes, after: Belief) -> NDArray[np
     A second mode that matters, or a path that is known no better than the kernel is wide.
     """
     share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
-    square = np.einsum("ij,aij->a", view.gram, after.covariance) / (view.whole_nodes * view.outputs)
+    square = np.einsum("ij,aij->a", view.gram, after.covariance) / view.outputs
     return np.asarray(((share > _LEAST_SHARE).sum(axis=1) > 1) | (square > view.kernel_variance))
 
 
@@ -108,14 +93,7 @@ def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
     there = np.nonzero(np.isfinite(prior.log_weight))
     rows, each = view.part(there[0]), Belief(before.mean[there], before.covariance[there])
     wide = broad(rows, each)
-    starts, squares = spread_starts(rows, wide, _DIRECTIONS, _START_REACH)
-    starts = whitened(each, starts)
-    found = find_modes(rows, each, starts[:, :3])
-    many = np.flatnonzero(squares[:, 0] > _WIDE_PATH * rows.kernel_variance)
-    if len(many):
-        some = Belief(each.mean[many], each.covariance[many])
-        found = with_more(found, many, find_modes(rows.part(many), some, starts[many, 3:]))
-    found = with_reversals(rows, each, found)
+    found = modes_of(rows, each, wide)
     of_each = found.mean.shape[1]
     found = replace(found, log_evidence=found.log_evidence + prior.log_weight[there][:, None])
 

@@ -6,9 +6,7 @@ something that the kernel does not hide: of the singular vectors of the noise pa
 remainder is a tenth of the kernel's standard deviation, rms. What is left out keeps its prior and widens the kernel by
 its variance, which is right to second order. Start states are kept whole.
 
-The path is looked at in blocks of steps, so few that a spot of the prior's speed (twice its rms) moves by 1.5
-standard deviations of kernel and pixel in one of them: the sum over a Gaussian at such a spacing is its integral to
-exp(-2 pi^2 / 1.5^2), 2e-4.
+The path is looked at at few nodes (`aolink.estimation.nodes`).
 """
 
 from __future__ import annotations
@@ -25,10 +23,12 @@ from scipy.special import erf
 
 from aolink.estimation import stacked
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.nodes import Nodes, Resolution, blocks, nodes_of, resolution
 from aolink.estimation.observation import Belief
-from aolink.estimation.windowed import Nodes, Profile, Regression, Windowed, WindowedMoments, _nodes
+from aolink.estimation.windowed import Profile, Regression, Windowed, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.plant import psd_root
 from aolink.sensor import BaseSensor
 
 if TYPE_CHECKING:
@@ -39,10 +39,8 @@ BoolArray = NDArray[np.bool_]
 
 # Rms of the noise path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.1
-# Of a slow path: all 200 steps move the mean by 0.07 standard deviations at V = 1e-4, and 16 do so no less than 12.
-_FEWEST_NODES = 12
-# Standard deviations of kernel and pixel that a spot of twice the rms speed moves from node to node.
-_SPACING = 1.5
+# Paths by which the number of nodes is found.
+_PATHS = 64
 # Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
 _SERIES = 1e-6
 _MOST_TERMS = 30
@@ -65,7 +63,7 @@ class Reduction:
     """Covariance of the end state that t leaves out, (n_states, n_states)."""
     widening: float
     """Mean variance of the path that t leaves out, which the kernel is to be widened by."""
-    nodes: int
+    resolution: Resolution
 
     @property
     def size(self) -> int:
@@ -104,42 +102,42 @@ def reduction(
     all_steps:
         Whether all fast steps are nodes.
     """
-    variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
-    pixel = sensor.profile.pixel_width
-    left_out = _LEFT_OUT if left_out is None else left_out
-    return _reduction(model, left_out**2 * variance, 0.0 if all_steps else variance + pixel**2 / 12)
+    return _reduction(model, sensor, _LEFT_OUT if left_out is None else left_out, all_steps)
 
 
 @lru_cache(maxsize=16)
-def _reduction(model: ExposureModel, tolerance: float, blurred: float) -> Reduction:
+def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_steps: bool) -> Reduction:
     n = model.plant.n_states
+    variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
     noise = model.basis[..., n:]
     size = noise.shape[2]
     paths = noise.reshape(noise.shape[0] * noise.shape[1], size) / math.sqrt(model.n_steps)
     _, values, vectors = np.linalg.svd(paths, full_matrices=False) if size else (0, np.zeros(0), np.zeros((0, 0)))
     # Each output by itself: a remainder that is spread over many of them is as small on each.
     rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / model.plant.n_outputs
-    kept = int(np.argmax(rest <= tolerance))
+    kept = int(np.argmax(rest <= left_out**2 * variance))
     V = vectors[:kept].T
     expand = np.zeros((n + size, n + kept))
     expand[:n, :n], expand[n:, n:] = np.eye(n), V
-    left_out = np.zeros((n + size, n + size))
-    left_out[n:, n:] = np.eye(size) - V @ V.T
-    remainder = model.end_remainder + model.end_rows @ left_out @ model.end_rows.T
+    hidden = np.zeros((n + size, n + size))
+    hidden[n:, n:] = np.eye(size) - V @ V.T
+    remainder = model.end_remainder + model.end_rows @ hidden @ model.end_rows.T
+    if all_steps:
+        seen = Resolution(blocks(model.n_steps, model.n_steps), math.inf, math.inf)
+    else:
+        seen = resolution(_paths(model, expand), variance, sensor.profile)
     return Reduction(
-        expand=expand, left_out=left_out, end_rows=model.end_rows @ expand, end_remainder=remainder,
-        widening=float(rest[kept]), nodes=_node_count(model, blurred) if blurred else model.n_steps,
+        expand=expand, left_out=hidden, end_rows=model.end_rows @ expand, end_remainder=remainder,
+        widening=float(rest[kept]), resolution=seen,
     )  # fmt: skip
 
 
-def _node_count(model: ExposureModel, blurred: float) -> int:
-    moves = np.diff(model.basis, axis=1)
-    n, P = model.plant.n_states, model.plant.initial_covariance
-    square = np.einsum("oki,ij,okj->ok", moves[..., :n], P, moves[..., :n]) + (moves[..., n:] ** 2).sum(axis=2)
-    speed = math.sqrt(float(square.mean(axis=1).max())) if square.size else 0.0
-    return min(
-        model.n_steps, max(_FEWEST_NODES, math.ceil(2 * speed * model.n_steps / (_SPACING * math.sqrt(blurred))))
-    )
+def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
+    """Of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
+    t = np.random.default_rng(0).standard_normal((_PATHS, expand.shape[1]))
+    n = model.plant.n_states
+    t[:, :n] = t[:, :n] @ psd_root(model.plant.initial_covariance).T
+    return np.asarray(np.tensordot(t, model.basis @ expand, axes=(1, 2))).reshape(-1, model.n_steps)
 
 
 class PixelView:
@@ -155,7 +153,7 @@ class PixelView:
         self.sensor, self.reduced = sensor, reduced
         line = isinstance(measured, Profile)
         self._optics = sensor.profile if line else sensor
-        nodes = _nodes(model, response, reduced.nodes)
+        nodes = nodes_of(model, response, reduced.resolution.with_inputs(response.path))
         self._basis = nodes.basis @ reduced.expand
         self._weights = nodes.weights
         self._inputs = nodes.inputs
@@ -188,8 +186,13 @@ class PixelView:
 
     @property
     def whole_nodes(self) -> int:
-        """Nodes inside the exposure's fast steps; those that correct for where it starts and ends come after them."""
+        """Nodes inside the exposure's fast steps; two that correct for where it starts and ends come after them."""
         return len(self._weights) - (2 if self._weights.min() < 0 else 0)
+
+    @property
+    def weights(self) -> FloatArray:
+        """What each node counts, (nodes,)."""
+        return self._weights
 
     @property
     def kernel_variance(self) -> float:
@@ -203,8 +206,8 @@ class PixelView:
 
     @property
     def gram(self) -> FloatArray:
-        """Their squares summed over the path, (n, n)."""
-        return self.rows.T @ self.rows
+        """Their squares, the mean over the exposure and the sum over outputs, (n, n)."""
+        return np.asarray((self.rows * np.tile(self._weights, self.outputs)[:, None]).T @ self.rows)
 
     def moments(self, about: Belief) -> tuple[FloatArray, FloatArray, Regression]:
         """Windowed moments about a belief of t, their noise and regression, as `Windowed.look`; of all axes."""

@@ -33,6 +33,7 @@ from scipy.special import erf
 from aolink.estimation import stacked
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.moments import LEAST_FLUX, Flux
+from aolink.estimation.nodes import Nodes, blocks, nodes_of
 from aolink.estimation.observation import Belief, Correction, corrected
 from aolink.optics.camera import effective_noise_density
 from aolink.rig import Sensor
@@ -83,22 +84,6 @@ class Profile:
         return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Nodes:
-    """The path in blocks of steps: few enough to look at each two of them together."""
-
-    basis: FloatArray
-    """Means of the exposure basis over each block, (n_outputs, nodes, n_coefficients)."""
-    weights: FloatArray
-    """Each block's share of the exposure, (nodes,)."""
-    inputs: FloatArray
-    """Means of the response to the inputs, (axes, n_outputs, nodes)."""
-
-    def part(self, axes: slice) -> Nodes:
-        """Of these axes alone."""
-        return Nodes(basis=self.basis, weights=self.weights, inputs=self.inputs[axes])
-
-
 @dataclass(frozen=True, eq=False)
 class Regression:
     """Linear regression of measurements on the coefficients, z being where it was made."""
@@ -138,7 +123,7 @@ class Windowed(ABC, Generic[Light]):
 
     def correct(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = _nodes(model, response, self.most_nodes)
+        nodes = nodes_of(model, response, blocks(model.n_steps, self.most_nodes))
         parts = [
             self._correct(model, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
@@ -354,24 +339,6 @@ def expected_response(
         before, last = last, 2 * u / width * last - 2 * (n - 1) / width**2 * before
         derivatives.append(-last * bell)
     return [stacked.matmul(d, steps) for d in derivatives[: highest + 1]]
-
-
-def _nodes(model: ExposureModel, response: InputResponse, most: int = _MOST_NODES) -> Nodes:
-    """The path in no more than ``most`` blocks of steps."""
-    length = -(-model.n_steps // most)
-    first = np.arange(0, model.n_steps, length)
-    sizes = np.diff(np.append(first, model.n_steps))
-    basis = np.add.reduceat(model.basis, first, axis=1) / sizes[:, None]
-    weights = sizes / model.n_steps
-    inputs = np.add.reduceat(response.path, first, axis=2) / sizes
-    if model.moved:
-        # So much of the first step is not in the exposure, but in the step after its last.
-        ends = (model.basis[:, 0], model.plant.C @ model.end_rows)
-        late = (response.path[:, :, 0], model.last_response(response.end))
-        basis = np.concatenate([basis, np.stack(ends, axis=1)], axis=1)
-        weights = np.append(weights, [-model.moved, model.moved])
-        inputs = np.concatenate([inputs, np.stack(late, axis=2)], axis=2)
-    return Nodes(basis=basis, weights=weights, inputs=inputs)
 
 
 def _arrays(correction: Correction) -> tuple[FloatArray, ...]:

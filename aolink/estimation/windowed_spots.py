@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from aolink.estimation import stacked
 from aolink.estimation.moments import Flux
+from aolink.estimation.nodes import Nodes
 from aolink.estimation.observation import Belief
-from aolink.estimation.windowed import Basis, Nodes, Regression, Windowed, expected_response, weighted_sums
+from aolink.estimation.windowed import Basis, Regression, Windowed, expected_response, weighted_sums
 from aolink.rig import SpotSensor
 
 FloatArray = NDArray[np.float64]

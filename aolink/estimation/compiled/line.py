@@ -12,10 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.compiled.small import compiled
+from aolink.estimation.compiled.small import compiled, compiled_sums
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
+
+# A product of ratios is taken further up to this.
+_LARGE = 1e200
 
 
 class Line(NamedTuple):
@@ -106,16 +109,21 @@ def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatAr
 @compiled
 def log_likelihood_of(line: Line, row: int, f: FloatArray) -> float:
     pad = line.table.shape[2]
-    total, quiet = 0.0, 1.0 / line.read_noise
+    total, product, quiet = 0.0, 1.0, 1.0 / line.read_noise
     for p in range(line.y.shape[1]):
         if line.usable[row, p]:
             e = line.y[row, p] - f[pad + p]
             if line.gain and f[pad + p] > 0.0:
                 R = line.read_noise + line.gain * f[pad + p]
-                total += e * e / R + math.log(R * quiet)
+                total += e * e / R
+                # One logarithm of a product: one for each pixel would take longer than all else here.
+                product *= R * quiet
+                if product > _LARGE:
+                    total += math.log(product)
+                    product = 1.0
             else:
                 total += e * e * quiet
-    return -0.5 * total
+    return -0.5 * (total + math.log(product))
 
 
 @compiled
@@ -146,38 +154,46 @@ def log_likelihoods_of_row(line: Line, row: int, t: FloatArray, out: FloatArray)
         out[j] = log_likelihood_of(line, row, f)
 
 
-@compiled
+@compiled_sums
 def fisher_information(
-    line: Line, row: int, f: FloatArray, J: FloatArray, H: FloatArray, pull: FloatArray
+    line: Line, row: int, f: FloatArray, J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray
 ) -> tuple[float, float]:
-    """H = J' I J, its lower half, pull = J' score; returns the log-likelihood and the sum of score^2 / I."""
-    n, pad = len(J), line.table.shape[2]
-    H[:] = 0.0
-    pull[:] = 0.0
-    column = np.empty(n)
+    """H = J' I J, its lower half, pull = J' score; returns the log-likelihood and the sum of score^2 / I.
+
+    ``scores`` is room for (3, pixels).
+    """
+    n, pixels, pad = len(J), line.y.shape[1], line.table.shape[2]
     total = square = 0.0
-    quiet = 1.0 / line.read_noise
-    for p in range(line.y.shape[1]):
-        if not line.usable[row, p]:
-            continue
-        value = f[pad + p]
-        e = line.y[row, p] - value
-        score, information = e * quiet, quiet
+    product, quiet = 1.0, 1.0 / line.read_noise
+    y, usable, gain = line.y[row], line.usable[row], line.gain
+    for p in range(pixels):
+        light = max(f[pad + p], 0.0)
+        relative = 0.5 * gain if f[pad + p] > 0.0 else 0.0
+        information = 1.0 / (line.read_noise + gain * light)
+        seen = 1.0 if usable[p] else 0.0
+        e = seen * (y[p] - f[pad + p])
+        score = e * information
+        relative *= information
         total += e * score
-        if line.gain and value > 0.0:
-            R = line.read_noise + line.gain * value
-            score, information = e / R, 1.0 / R
-            total += e * score - e * e * quiet + math.log(R * quiet)
-            score += line.gain * (e * score - 1.0) / (2.0 * R)
-            information += line.gain * line.gain / (2.0 * R * R)
-            square += score * score / information
-        else:
-            square += e * score
-        for i in range(n):
-            column[i] = J[i, pad + p]
-        for i in range(n):
-            x = column[i] * information
-            pull[i] += column[i] * score
-            for j in range(i + 1):
-                H[i, j] += x * column[j]
-    return -0.5 * total, square
+        score += relative * (e * score - seen)
+        information = seen * (information + 2.0 * relative * relative)
+        square += score * score / (information if usable[p] else 1.0)
+        scores[0, p], scores[1, p], scores[2, p] = score, information, light
+    if gain:
+        for p in range(pixels):
+            product *= 1.0 + gain * quiet * (scores[2, p] if usable[p] else 0.0)
+            if product > _LARGE:
+                total += math.log(product)
+                product = 1.0
+    for i in range(n):
+        told = 0.0
+        for p in range(pixels):
+            told += J[i, pad + p] * scores[0, p]
+            scores[2, p] = J[i, pad + p] * scores[1, p]
+        pull[i] = told
+        for j in range(i + 1):
+            told = 0.0
+            for p in range(pixels):
+                told += J[j, pad + p] * scores[2, p]
+            H[i, j] = told
+    return -0.5 * (total + math.log(product)), square

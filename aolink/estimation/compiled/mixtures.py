@@ -7,14 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.compiled.line import Line, log_likelihoods_of_row
-from aolink.estimation.compiled.small import cholesky, compiled, log_sum, lower_inverse
+from aolink.estimation.compiled.line import Line, expected_light, log_likelihood_of
+from aolink.estimation.compiled.small import cholesky, compiled, compiled_sums, decay, lower_inverse
 
 FloatArray = NDArray[np.float64]
 
 _LOG_2PI = math.log(2 * math.pi)
-# Logarithm of what adds nothing to one.
-_NOTHING = -38.0
 
 
 @compiled
@@ -108,32 +106,44 @@ def _roots(
             constant[c] -= math.log(root[c, i, i])
 
 
-@compiled
+@compiled_sums
 def _log_densities(
-    log_weight: FloatArray, mean: FloatArray, inverse: FloatArray, constant: FloatArray, t: FloatArray,
-    logs: FloatArray, out: FloatArray,
+    log_weight: FloatArray, mean: FloatArray, inverse: FloatArray, constant: FloatArray, t: FloatArray, begin: int,
+    end: int, white: FloatArray, logs: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Of components at points (points, n), (components, points), and of the whole mixture, (points,)."""
-    points, n = t.shape
-    out[:] = -math.inf
+    """Of components at points ``begin`` to ``end`` of t (n, points), (components, points), and of the mixture."""
+    n = mean.shape[1]
+    for k in range(begin, end):
+        out[k] = -math.inf
+    there = 0
     for c in range(len(log_weight)):
         if log_weight[c] == -math.inf:
             continue
-        for k in range(points):
-            distance = 0.0
-            for i in range(n):
-                white = 0.0
-                for j in range(i + 1):
-                    white += inverse[c, i, j] * (t[k, j] - mean[c, j])
-                distance += white * white
-            logs[c, k] = constant[c] - 0.5 * distance
+        there += 1
+        for k in range(begin, end):
+            logs[c, k] = 0.0
+        for i in range(n):
+            for k in range(begin, end):
+                white[k] = inverse[c, i, i] * (t[i, k] - mean[c, i])
+            for j in range(i):
+                x, m = inverse[c, i, j], mean[c, j]
+                for k in range(begin, end):
+                    white[k] += x * (t[j, k] - m)
+            for k in range(begin, end):
+                logs[c, k] -= 0.5 * white[k] * white[k]
+        for k in range(begin, end):
+            logs[c, k] += constant[c]
             out[k] = max(out[k], logs[c, k])
-    for k in range(points):
-        total = 0.0
-        for c in range(len(log_weight)):
-            if log_weight[c] > -math.inf and logs[c, k] - out[k] > _NOTHING:
-                total += math.exp(logs[c, k] - out[k])
-        out[k] += math.log(total)
+    if there < 2:
+        return
+    for k in range(begin, end):
+        white[k] = 0.0
+    for c in range(len(log_weight)):
+        if log_weight[c] > -math.inf:
+            for k in range(begin, end):
+                white[k] += decay(logs[c, k] - out[k])
+    for k in range(begin, end):
+        out[k] += math.log(white[k])
 
 
 @compiled
@@ -146,20 +156,22 @@ def importance_corrected(
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
     As `aolink.estimation.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds,
-    points, n) are the points' random numbers.
+    points, n) are the points' random numbers. Points lie along the last dimension of every array here, for they are
+    what there are many of.
     """
     axes, count, n = mean.shape
     states = prior_mean.shape[2]
     rounds, points = uniform.shape
     many = rounds * points
     prior_root, prior_inverse = np.empty(prior_covariance.shape[1:]), np.empty(prior_covariance.shape[1:])
-    prior_constant, prior_logs = np.empty(prior_mean.shape[1]), np.empty((prior_mean.shape[1], points))
+    prior_constant, prior_logs = np.empty(prior_mean.shape[1]), np.empty((prior_mean.shape[1], many))
     root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
-    t, target, prior_density = np.empty((many, n)), np.empty(many), np.empty(points)
-    logs, drawn = np.empty((count, many)), np.empty((rounds, many))
-    weight, tempered = np.empty(many), np.empty(many)
+    t, target, prior_density = np.empty((n, many)), np.empty(many), np.empty(many)
+    logs, drawn, total = np.empty((count, many)), np.empty((rounds, many)), np.empty(count)
+    weight, tempered, some, more = np.empty(many), np.empty(many), np.empty(many), np.empty(many)
     old_mean, old_inverse = np.empty((rounds, count, n)), np.empty((rounds, count, n, n))
     old_weight, old_constant = np.empty((rounds, count)), np.empty((rounds, count))
+    path, f = np.empty(len(line.weights)), np.empty(line.y.shape[1] + 2 * line.table.shape[2])
     for axis in range(axes):
         w, x, P = log_weight[axis], mean[axis], covariance[axis]
         _roots(prior_weight[axis], prior_covariance[axis], prior_root, prior_inverse, prior_constant)
@@ -167,40 +179,46 @@ def importance_corrected(
             _roots(w, P, root, inverse, constant)
             old_weight[r], old_mean[r], old_inverse[r], old_constant[r] = w, x, inverse, constant
             begin, end = r * points, (r + 1) * points
-            new = t[begin:end]
-            _draw(w, x, root, uniform[r], normal[r], new)
-            log_likelihoods_of_row(line, axis, new, target[begin:end])
+            _draw(w, x, root, uniform[r], normal[r], total, t, begin)
+            for k in range(begin, end):
+                path[:] = line.inputs[axis]
+                for i in range(n):
+                    for node in range(len(path)):
+                        path[node] += t[i, k] * line.basis[i, node]
+                expected_light(line, path, f)
+                target[k] = log_likelihood_of(line, axis, f)
             _log_densities(
-                prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, new[:, :states], prior_logs,
+                prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, t, begin, end, some, prior_logs,
                 prior_density,
             )  # fmt: skip
-            for k in range(points):
+            for k in range(begin, end):
                 square = (n - states) * _LOG_2PI
                 for i in range(states, n):
-                    square += new[k, i] * new[k, i]
-                target[begin + k] += prior_density[k] - 0.5 * square
+                    square += t[i, k] * t[i, k]
+                target[k] += prior_density[k] - 0.5 * square
             for q in range(r):
                 _log_densities(
-                    old_weight[q], old_mean[q], old_inverse[q], old_constant[q], new, logs, drawn[q, begin:end]
+                    old_weight[q], old_mean[q], old_inverse[q], old_constant[q], t, begin, end, some, logs, drawn[q]
                 )
-            _log_densities(w, x, inverse, constant, t[:end], logs, drawn[r, :end])
-            effective[axis] = _weigh(target[:end], drawn[: r + 1], weight[:end])
-            _temper(weight[:end], effective[axis], least_effective, halvings, tempered[:end])
+            _log_densities(w, x, inverse, constant, t, 0, end, some, logs, drawn[r])
+            effective[axis] = _weigh(target, drawn, r + 1, end, some, weight)
+            _temper(weight, end, effective[axis], least_effective, halvings, tempered)
             last = r + 1 == rounds or effective[axis] >= enough
             if last and r > 0:
                 P *= loosened
             beside = last_prior_points if last else prior_points
-            _refit(w, x, P, t[:end], tempered[:end], logs, drawn[r], beside, negligible)
+            _refit(w, x, P, t, end, tempered, logs, drawn[r], beside, negligible, some, more)
             if last:
                 break
 
 
 @compiled
 def _draw(
-    log_weight: FloatArray, mean: FloatArray, root: FloatArray, uniform: FloatArray, normal: FloatArray, t: FloatArray
-) -> None:
+    log_weight: FloatArray, mean: FloatArray, root: FloatArray, uniform: FloatArray, normal: FloatArray,
+    total: FloatArray, t: FloatArray, begin: int,
+) -> None:  # fmt: skip
+    """Points of a mixture, t (n, points) from ``begin`` on."""
     count, n = mean.shape
-    total = np.empty(count)
     so_far = 0.0
     last = 0
     for c in range(count):
@@ -208,110 +226,121 @@ def _draw(
             so_far += math.exp(log_weight[c])
             last = c
         total[c] = so_far
-    for k in range(len(t)):
+    for k in range(len(uniform)):
         c = 0
         while c < last and total[c] < uniform[k] * so_far:
             c += 1
         for i in range(n):
-            t[k, i] = mean[c, i]
+            place = mean[c, i]
             for j in range(i + 1):
-                t[k, i] += root[c, i, j] * normal[k, j]
+                place += root[c, i, j] * normal[k, j]
+            t[i, begin + k] = place
 
 
-@compiled
-def _weigh(target: FloatArray, drawn: FloatArray, log_weight: FloatArray) -> float:
+@compiled_sums
+def _weigh(
+    target: FloatArray, drawn: FloatArray, rounds: int, end: int, most: FloatArray, log_weight: FloatArray
+) -> float:
     """Normalised weights of points over all the densities, (rounds, points), that they are from; how many count."""
-    top = -math.inf
-    for k in range(len(target)):
-        most = drawn[0, k]
-        for q in range(1, len(drawn)):
-            most = max(most, drawn[q, k])
-        log_weight[k] = target[k] - most
-        if len(drawn) > 1:
+    for k in range(end):
+        most[k] = drawn[0, k]
+    for q in range(1, rounds):
+        for k in range(end):
+            most[k] = max(most[k], drawn[q, k])
+    for k in range(end):
+        log_weight[k] = target[k] - most[k]
+    if rounds > 1:
+        for k in range(end):
             total = 0.0
-            for q in range(len(drawn)):
-                total += math.exp(drawn[q, k] - most)
+            for q in range(rounds):
+                total += decay(drawn[q, k] - most[k])
             log_weight[k] -= math.log(total)
+    top = -math.inf
+    for k in range(end):
         top = max(top, log_weight[k])
     one = two = 0.0
-    for k in range(len(target)):
-        each = math.exp(log_weight[k] - top)
+    for k in range(end):
+        each = decay(log_weight[k] - top)
         one += each
         two += each * each
-    log_weight -= top + math.log(one)
+    whole = top + math.log(one)
+    for k in range(end):
+        log_weight[k] -= whole
     return one * one / two
 
 
-@compiled
-def _temper(log_weight: FloatArray, effective: float, least: float, halvings: int, out: FloatArray) -> None:
+@compiled_sums
+def _temper(
+    log_weight: FloatArray, end: int, effective: float, least: float, halvings: int, out: FloatArray
+) -> None:
     """Weights raised to the largest power up to one at which so many points, or half of all, count."""
-    enough = min(least, len(log_weight) / 2)
-    out[:] = log_weight
+    enough = min(least, end / 2)
+    for k in range(end):
+        out[k] = log_weight[k]
     if effective >= enough:
         return
-    low, high = 0.0, 1.0
+    top = -math.inf
+    for k in range(end):
+        top = max(top, log_weight[k])
+    low, high, whole = 0.0, 1.0, float(end)
     for _ in range(1, halvings):
         power = (low + high) / 2
         one = two = 0.0
-        for x in log_weight:
-            each = math.exp(power * x)
+        for k in range(end):
+            each = decay(power * (log_weight[k] - top))
             one += each
             two += each * each
         if one * one >= enough * two:
-            low = power
+            low, whole = power, one
         else:
             high = power
-    out *= low
-    out -= log_sum(out)
+    whole = math.log(whole)
+    for k in range(end):
+        out[k] = low * (log_weight[k] - top) - whole
 
 
-@compiled
+@compiled_sums
 def _refit(
-    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, t: FloatArray, weight: FloatArray,
-    logs: FloatArray, density: FloatArray, prior_points: float, negligible: float,
+    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, t: FloatArray, end: int, weight: FloatArray,
+    logs: FloatArray, density: FloatArray, prior_points: float, negligible: float, share: FloatArray, away: FloatArray,
 ) -> None:  # fmt: skip
     """One step of expectation and maximisation with weighted points, in place.
 
     ``logs`` (components, points) are the components' log-densities at the points, ``density`` (points,) their sum's.
+    Of a component that is not there any more the weight is minus infinity.
     """
     count, n = mean.shape
-    away, whole = np.empty(n), 0.0
-    share, spread, new = np.empty(len(t)), np.empty((n, n)), np.empty(count)
+    whole = 0.0
     for c in range(count):
-        new[c] = 0.0
         if log_weight[c] == -math.inf:
             continue
         mass = square = 0.0
-        for k in range(len(t)):
-            share[k] = math.exp(logs[c, k] - density[k] + weight[k])
+        for k in range(end):
+            share[k] = decay(logs[c, k] - density[k] + weight[k])
             mass += share[k]
             square += share[k] * share[k]
-        new[c] = mass
+        log_weight[c] = mass
         whole += mass
         per_mass = 1.0 / max(mass, 1e-300)
         if mass > 1e-9:
-            mean[c] = 0.0
-            for k in range(len(t)):
-                for i in range(n):
-                    mean[c, i] += share[k] * per_mass * t[k, i]
-        spread[:] = 0.0
-        for k in range(len(t)):
-            if share[k] * per_mass < 1e-12:
-                continue
             for i in range(n):
-                away[i] = t[k, i] - mean[c, i]
-            for i in range(n):
-                x = share[k] * per_mass * away[i]
-                for j in range(i + 1):
-                    spread[i, j] += x * away[j]
+                total = 0.0
+                for k in range(end):
+                    total += share[k] * t[i, k]
+                mean[c, i] = total * per_mass
         effective = mass * mass / max(square, 1e-300)
         trust = effective / (effective + prior_points)
         for i in range(n):
+            for k in range(end):
+                away[k] = share[k] * (t[i, k] - mean[c, i])
             for j in range(i + 1):
-                fitted = trust * spread[i, j] + (1 - trust) * covariance[c, i, j]
+                total = 0.0
+                for k in range(end):
+                    total += away[k] * (t[j, k] - mean[c, j])
+                fitted = trust * total * per_mass + (1 - trust) * covariance[c, i, j]
                 covariance[c, i, j] = covariance[c, j, i] = fitted
     left = 0.0
     for c in range(count):
-        left += new[c] if new[c] > negligible * whole else 0.0
+        left += log_weight[c] if log_weight[c] > negligible * whole else 0.0
     for c in range(count):
-        log_weight[c] = math.log(new[c] / left) if new[c] > negligible * whole else -math.inf
+        log_weight[c] = math.log(log_weight[c] / left) if log_weight[c] > negligible * whole else -math.inf

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.compiled.line import Line, fisher_information, linearised_light, path_of
-from aolink.estimation.compiled.small import cholesky, compiled, lower_inverse, solve, times
+from aolink.estimation.compiled.small import cholesky, compiled, eigh, lower_inverse, lower_solve, solve, times
 
 FloatArray = NDArray[np.float64]
 
@@ -17,127 +17,225 @@ _NEXT_TO = 0.05
 
 
 @compiled
-def linear_fits(
-    line: Line, mean: FloatArray, roots: FloatArray, s: FloatArray, H: FloatArray, pull: FloatArray, square: FloatArray
-) -> None:
-    """In coordinates t = mean + root s, at s (rows, n): J' I J, J' score, and the sum of score^2 / I."""
+def spread_starts(
+    mean: FloatArray, covariance: FloatArray, broad_mean: FloatArray, broad_covariance: FloatArray, gram: FloatArray,
+    reach: float, starts: FloatArray, squares: FloatArray,
+) -> None:  # fmt: skip
+    """Starts about broad Gaussians, (rows, 1 + 2 directions, n), in coordinates in which the priors are N(0, I).
+
+    As `aolink.estimation.modes.spread_starts`; ``squares`` are (rows, n).
+    """
+    rows, count, n = starts.shape
+    root, wide, product, turned = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    vectors, along = np.empty((n, n)), np.empty(n)
+    for row in range(rows):
+        cholesky(covariance[row], root)
+        cholesky(broad_covariance[row], wide)
+        times(gram, wide, product)
+        times(wide.T, product, turned)
+        eigh(turned, squares[row], vectors)
+        for i in range(n):
+            along[i] = broad_mean[row, i] - mean[row, i]
+        lower_solve(root, along)
+        starts[row] = along
+        for d in range(count // 2):
+            for i in range(n):
+                along[i] = 0.0
+                for j in range(i + 1):
+                    along[i] += reach * wide[i, j] * vectors[d, j]
+            lower_solve(root, along)
+            for i in range(n):
+                starts[row, 1 + 2 * d, i] += along[i]
+                starts[row, 2 + 2 * d, i] -= along[i]
+
+
+@compiled
+def innovations(
+    line: Line, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float, value: FloatArray,
+    information: FloatArray, nis: FloatArray, square: FloatArray,
+) -> None:  # fmt: skip
+    """Of points t (rows, n), as `aolink.estimation.modes.innovation`, in so many directions as there is room for.
+
+    ``value`` and ``information`` are (rows, k); ``square`` is the sum of score^2 / I.
+    """
+    rows, k = value.shape
     n, nodes = line.basis.shape
     width = line.y.shape[1] + 2 * line.table.shape[2]
-    path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((n, nodes))
-    f, J = np.empty(width), np.empty((n, width))
-    for row in range(len(s)):
-        times(roots[row].T, line.basis, B)
-        path_of(line.inputs[row], line.basis, mean[row], rest)
-        path_of(rest, B, s[row], path)
+    path, B, root, s = np.empty(nodes), np.empty((n, nodes)), np.empty((n, n)), np.empty(n)
+    f, J, scores = np.empty(width), np.empty((n, width)), np.empty((3, line.y.shape[1]))
+    H, pull, values, vectors = np.empty((n, n)), np.empty(n), np.empty(n), np.empty((n, n))
+    for row in range(rows):
+        cholesky(covariance[row], root)
+        times(root.T, line.basis, B)
+        path_of(line.inputs[row], line.basis, t[row], path)
         linearised_light(line, path, B, f, J)
-        _, square[row] = fisher_information(line, row, f, J, H[row], pull[row])
+        _, square[row] = fisher_information(line, row, f, J, scores, H, pull)
         for i in range(n):
+            s[i] = t[row, i] - mean[row, i]
             for j in range(i):
-                H[row, j, i] = H[row, i, j]
+                H[j, i] = H[i, j]
+        lower_solve(root, s)
+        eigh(H, values, vectors)
+        nis[row] = 0.0
+        for d in range(k):
+            size = max(values[d], 0.0)
+            moved = told = 0.0
+            for i in range(n):
+                moved += vectors[d, i] * s[i]
+                told += vectors[d, i] * pull[i]
+            # Nothing is new in a direction in which the pixels do not tell anything.
+            along = told / math.sqrt(size) if size > tells_nothing * values[0] else 0.0
+            value[row, d] = along + math.sqrt(size) * moved
+            information[row, d] = size
+            nis[row] += value[row, d] * value[row, d] / (1.0 + size)
 
 
 @compiled
 def find_modes(
-    line: Line, mean: FloatArray, roots: FloatArray, starts: FloatArray, passes: int, first_damping: float,
-    largest_damping: float, free_damping: float, converged: float, out_mean: FloatArray, out_covariance: FloatArray,
-    out_evidence: FloatArray, out_distance: FloatArray, out_objective: FloatArray,
+    line: Line, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: NDArray[np.intp], whole: int,
+    reversed_precision: float, passes: int, first_damping: float, largest_damping: float, free_damping: float,
+    converged: float, out_mean: FloatArray, out_covariance: FloatArray, out_evidence: FloatArray,
+    out_distance: FloatArray, out_objective: FloatArray,
 ) -> None:  # fmt: skip
-    """Where starts (rows, starts, n), whitened, lead by Levenberg and Marquardt's method.
+    """Where the first ``of_row`` (rows,) of starts (rows, starts, n), whitened, lead, and after them reversals.
 
-    As `aolink.estimation.modes.find_modes`; ``mean`` and ``roots`` are the prior's, (rows, n) and (rows, n, n).
+    As `aolink.estimation.modes.modes_of`; ``mean`` and ``covariance`` are the prior's. Results have room for three more
+    than there are starts if ``reversed_precision`` is not zero; what is not there has evidence minus infinity.
     """
-    n, nodes = line.basis.shape
+    rows, n = mean.shape
+    nodes, room = line.basis.shape[1], out_mean.shape[1]
     width = line.y.shape[1] + 2 * line.table.shape[2]
     path, rest, B = np.empty(nodes), np.empty(nodes), np.empty((n, nodes))
-    f, J = np.empty(width), np.empty((n, width))
+    f, J, scores = np.empty(width), np.empty((n, width)), np.empty((3, line.y.shape[1]))
     s, there, step = np.empty(n), np.empty(n), np.empty(n)
     H, pull, other, its_pull = np.empty((n, n)), np.empty(n), np.empty((n, n)), np.empty(n)
-    damped, root, inverse = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    ends, their_H = np.empty(starts.shape[1:]), np.empty((starts.shape[1], n, n))
-    for row in range(starts.shape[0]):
-        times(roots[row].T, line.basis, B)
+    root, damped, lower, inverse = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    begins, ends, their_H = np.empty((room, n)), np.empty((room, n)), np.empty((room, n, n))
+    for row in range(rows):
+        cholesky(covariance[row], root)
+        times(root.T, line.basis, B)
         path_of(line.inputs[row], line.basis, mean[row], rest)
-        for start in range(starts.shape[1]):
-            s[:] = starts[row, start]
-            now = _at(line, row, rest, B, s, path, f, J, H, pull)
-            damping, twin = first_damping, -1
-            for _ in range(passes):
-                for i in range(n):
-                    for j in range(i + 1):
-                        damped[i, j] = H[i, j]
-                    damped[i, i] += damping * H[i, i]
-                    step[i] = pull[i]
-                cholesky(damped, root)
-                solve(root, step)
-                decrement = 0.0
-                for i in range(n):
-                    there[i] = s[i] + step[i]
-                    decrement += step[i] * pull[i]
-                objective = _at(line, row, rest, B, there, path, f, J, other, its_pull)
-                gain, before = now - objective, damping
-                better = gain > 0
-                if better:
-                    now = objective
-                    s[:] = there
-                    H[:] = other
-                    pull[:] = its_pull
-                    damping = damping / 8
-                    twin = _near(s, ends[:start], their_H[:start])
-                    if twin >= 0:
+        count = of_row[row]
+        begins[:count] = starts[row, :count]
+        best = done = 0
+        while done < count:
+            twin = _near(begins[done], ends, their_H, done)
+            if twin < 0:
+                s[:] = begins[done]
+                now = _at(line, row, rest, B, s, path, f, J, scores, H, pull)
+                damping = first_damping
+                for _ in range(passes):
+                    for i in range(n):
+                        for j in range(i + 1):
+                            damped[i, j] = H[i, j]
+                        damped[i, i] += damping * H[i, i]
+                        step[i] = pull[i]
+                    cholesky(damped, lower)
+                    solve(lower, step)
+                    decrement = 0.0
+                    for i in range(n):
+                        there[i] = s[i] + step[i]
+                        decrement += step[i] * pull[i]
+                    objective = _at(line, row, rest, B, there, path, f, J, scores, other, its_pull)
+                    gain, before = now - objective, damping
+                    better = gain > 0
+                    if better:
+                        now = objective
+                        s, there = there, s
+                        H, other = other, H
+                        pull, its_pull = its_pull, pull
+                        damping = damping / 8
+                        twin = _near(s, ends, their_H, done)
+                        if twin >= 0:
+                            break
+                    else:
+                        damping = max(damping, 1e-3) * 8
+                    if before <= free_damping and ((better and gain < converged) or decrement < converged):
                         break
-                else:
-                    damping = max(damping, 1e-3) * 8
-                if before <= free_damping and ((better and gain < converged) or decrement < converged):
-                    break
-                if damping > largest_damping:
-                    break
-            ends[start] = s
-            their_H[start] = H
+                    if damping > largest_damping:
+                        break
             if twin >= 0:
-                ends[start], their_H[start] = ends[twin], their_H[twin]
-                out_mean[row, start], out_covariance[row, start] = out_mean[row, twin], out_covariance[row, twin]
-                out_evidence[row, start], out_distance[row, start] = out_evidence[row, twin], out_distance[row, twin]
-                out_objective[row, start] = out_objective[row, twin]
-                continue
-            cholesky(H, root)
-            log_H = 0.0
-            for i in range(n):
-                log_H += 2 * math.log(root[i, i])
-            lower_inverse(root, inverse)
-            # Covariance L H^-1 L' = W W' with W = L R^-T.
-            distance = 0.0
-            for i in range(n):
-                distance += s[i] * s[i]
-                out_mean[row, start, i] = mean[row, i]
-                for j in range(n):
-                    total = 0.0
-                    for k in range(n):
-                        total += roots[row, i, k] * inverse[j, k]
-                    damped[i, j] = total
-                    out_mean[row, start, i] += roots[row, i, j] * s[j]
-            for i in range(n):
-                for j in range(i + 1):
-                    total = 0.0
-                    for k in range(n):
-                        total += damped[i, k] * damped[j, k]
-                    out_covariance[row, start, i, j] = out_covariance[row, start, j, i] = total
-            out_evidence[row, start] = -now - 0.5 * log_H
-            out_distance[row, start] = distance
-            out_objective[row, start] = now
+                ends[done], their_H[done] = ends[twin], their_H[twin]
+                out_mean[row, done], out_covariance[row, done] = out_mean[row, twin], out_covariance[row, twin]
+                out_evidence[row, done], out_distance[row, done] = -math.inf, out_distance[row, twin]
+                out_objective[row, done] = out_objective[row, twin]
+            else:
+                ends[done], their_H[done] = s, H
+                cholesky(H, lower)
+                log_H = distance = 0.0
+                for i in range(n):
+                    log_H += 2 * math.log(lower[i, i])
+                    distance += s[i] * s[i]
+                lower_inverse(lower, inverse)
+                # Covariance L H^-1 L' = W W' with W = L R^-T.
+                for i in range(n):
+                    out_mean[row, done, i] = mean[row, i]
+                    for j in range(n):
+                        total = 0.0
+                        for k in range(i + 1):
+                            total += root[i, k] * inverse[j, k]
+                        damped[i, j] = total
+                    for j in range(i + 1):
+                        out_mean[row, done, i] += root[i, j] * s[j]
+                        total = 0.0
+                        for k in range(n):
+                            total += damped[i, k] * damped[j, k]
+                        out_covariance[row, done, i, j] = out_covariance[row, done, j, i] = total
+                out_evidence[row, done] = -now - 0.5 * log_H
+                out_distance[row, done] = distance
+                out_objective[row, done] = now
+                if now < out_objective[row, best]:
+                    best = done
+            done += 1
+            if done == of_row[row] and reversed_precision > 0.0:
+                path_of(rest, B, ends[best], path)
+                _reversals(line.weights, rest, B, path, whole, reversed_precision, damped, lower, begins[done:])
+                count = done + 3
+        for k in range(count, room):
+            out_mean[row, k], out_covariance[row, k] = out_mean[row, 0], out_covariance[row, 0]
+            out_evidence[row, k], out_objective[row, k], out_distance[row, k] = -math.inf, math.inf, 0.0
 
 
 @compiled
-def _near(s: FloatArray, ends: FloatArray, H: FloatArray) -> int:
-    """A mode that s is on its way to, next to it already, or -1; their informations' lower halves, (modes, n, n)."""
+def _reversals(
+    weights: FloatArray, rest: FloatArray, B: FloatArray, path: FloatArray, whole: int, precision: float, H: FloatArray,
+    root: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
+    """Whitened coordinates (3, n) of paths like a path's reversal, its mirror image and both, as `reversed_starts`."""
+    n, total, mean = len(B), 0.0, 0.0
+    for k in range(whole):
+        total += weights[k]
+        mean += weights[k] * path[k]
+    mean /= total
+    for i in range(n):
+        for j in range(i + 1):
+            H[i, j] = 1.0 if i == j else 0.0
+            for k in range(whole):
+                H[i, j] += precision * weights[k] / total * B[i, k] * B[j, k]
+    cholesky(H, root)
+    for d in range(3):
+        for i in range(n):
+            out[d, i] = 0.0
+        for k in range(whole):
+            to = path[k] if d == 1 else path[whole - 1 - k]
+            to = to if d == 0 else 2.0 * mean - to
+            x = precision * weights[k] / total * (to - rest[k])
+            for i in range(n):
+                out[d, i] += B[i, k] * x
+        solve(root, out[d])
+
+
+@compiled
+def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
+    """Which of so many modes s is next to already, or -1; their informations' lower halves are (modes, n, n)."""
     n = len(s)
-    away = np.empty(n)
-    for m in range(len(ends)):
+    for m in range(count):
         distance = 0.0
         for i in range(n):
-            away[i] = s[i] - ends[m, i]
+            away = s[i] - ends[m, i]
             for j in range(i):
-                distance += 2.0 * away[i] * H[m, i, j] * away[j]
-            distance += away[i] * H[m, i, i] * away[i]
+                distance += 2.0 * away * H[m, i, j] * (s[j] - ends[m, j])
+            distance += away * away * H[m, i, i]
         if distance < _NEXT_TO:
             return m
     return -1
@@ -146,13 +244,13 @@ def _near(s: FloatArray, ends: FloatArray, H: FloatArray) -> int:
 @compiled
 def _at(
     line: Line, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, f: FloatArray,
-    J: FloatArray, H: FloatArray, pull: FloatArray,
+    J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray,
 ) -> float:  # fmt: skip
     """Information, downward pull and objective at whitened coordinates s."""
     n = len(s)
     path_of(rest, B, s, path)
     linearised_light(line, path, B, f, J)
-    log_likelihood, _ = fisher_information(line, row, f, J, H, pull)
+    log_likelihood, _ = fisher_information(line, row, f, J, scores, H, pull)
     square = 0.0
     for i in range(n):
         H[i, i] += 1.0

@@ -15,7 +15,16 @@ FloatArray = NDArray[np.float64]
 
 def compiled(function: Callable[..., Any]) -> Any:
     """Decorator of a function that runs as machine code, which is kept for the next process if there is a place."""
-    options: Any = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "arcp"}}
+    return _compiled(function, {"contract", "arcp"})
+
+
+def compiled_sums(function: Callable[..., Any]) -> Any:
+    """The same of a function with long sums, which may be taken in any order: several terms at a time."""
+    return _compiled(function, {"contract", "arcp", "reassoc", "nsz"})
+
+
+def _compiled(function: Callable[..., Any], freedom: set[str]) -> Any:
+    options: Any = {"nogil": True, "error_model": "numpy", "fastmath": freedom}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # neither the source's folder nor the user's cache can be written
@@ -23,6 +32,9 @@ def compiled(function: Callable[..., Any]) -> Any:
 
 
 _JITTER = 1e-10
+# Of Jacobi's method at most; and squares beside the diagonal, as a share of those on it, that are rounding.
+_SWEEPS = 30
+_ROUNDING = 1e-28
 
 
 @compiled
@@ -94,15 +106,77 @@ def times(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 
 @compiled
-def log_sum(values: FloatArray) -> float:
-    """log sum exp of (n,); minus infinity where all are."""
-    top = -math.inf
-    for x in values:
-        top = max(top, x)
-    if top == -math.inf or top != top:
-        return top
-    total = 0.0
-    for x in values:
-        if x > -math.inf:
-            total += math.exp(x - top)
-    return top + math.log(total)
+def decay(x: float) -> float:
+    """exp x of no more than zero, to 3e-9 of it, and 4e-18 of less than -40.
+
+    Unlike the library's it is nothing but products, so that several are taken at a time.
+    """
+    y = (-40.0 if x < -40.0 else x) * (1.0 / 256.0)
+    p = 1.0 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y * (1 / 120 + y * (1 / 720 + y * (1 / 5040)))))))
+    p *= p
+    p *= p
+    p *= p
+    p *= p
+    p *= p
+    p *= p
+    p *= p
+    return p * p
+
+
+@compiled
+def lower_solve(root: FloatArray, x: FloatArray) -> None:
+    """R^-1 x in the place of x, (n,)."""
+    for i in range(len(root)):
+        total = x[i]
+        for k in range(i):
+            total -= root[i, k] * x[k]
+        x[i] = total / root[i, i]
+
+
+@compiled
+def eigh(a: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
+    """Eigenvalues of a symmetric matrix (n, n), the largest first, and its eigenvectors as rows, by Jacobi's method.
+
+    The matrix is made diagonal in its place.
+    """
+    n = len(a)
+    for i in range(n):
+        for j in range(n):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(_SWEEPS):
+        beside = whole = 0.0
+        for i in range(n):
+            for j in range(i):
+                beside += a[i, j] * a[i, j]
+            whole += a[i, i] * a[i, i]
+        if not beside > _ROUNDING * whole:
+            break
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if a[p, q] == 0.0:
+                    continue
+                theta = (a[q, q] - a[p, p]) / (2.0 * a[p, q])
+                t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                t = t if theta >= 0.0 else -t
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(n):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
+                for k in range(n):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
+                for k in range(n):
+                    x, y = vectors[p, k], vectors[q, k]
+                    vectors[p, k], vectors[q, k] = c * x - s * y, s * x + c * y
+    for i in range(n):
+        values[i] = a[i, i]
+    for i in range(n - 1):
+        largest = i
+        for j in range(i + 1, n):
+            if values[j] > values[largest]:
+                largest = j
+        if largest != i:
+            values[i], values[largest] = values[largest], values[i]
+            for k in range(n):
+                vectors[i, k], vectors[largest, k] = vectors[largest, k], vectors[i, k]
