@@ -149,6 +149,8 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
         printed predictor has the inputs in reverse order and one step early.)
     """
     axes, k, n_u = u.shape
+    if not u.any():
+        return np.zeros((axes, plant.n_outputs, k)), np.zeros((axes, plant.n_states))
     systems = alike_systems(plant)
     if systems is not None:
         own, ends = input_response(systems.one, u.transpose(0, 2, 1).reshape(axes * n_u, k, 1))

@@ -72,13 +72,15 @@ def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, w
 
 
 def posterior(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, number: int, believed: BoolArray, share: float = 1.0
-) -> Hypotheses:
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, number: int, believed: BoolArray, share: float,
+    several: BoolArray,
+) -> Hypotheses:  # fmt: skip
     """The posterior of t in the exposure of this number as the mixture that fits it.
 
-    Of the usual number of points each round has this ``share``. Axes that are not ``believed`` are not worth annealing.
+    Of the usual number of points each round has this ``share``, and so many are to count, but for axes with ``several``
+    modes. Axes that are not ``believed`` are not worth annealing.
     """
-    fit, effective = importance_corrected(view, prior, proposal, share)
+    fit, effective = importance_corrected(view, prior, proposal, share, np.where(several, _ENOUGH, share * _ENOUGH))
     few = np.flatnonzero(believed & ~(effective >= share * _ENOUGH))
     if not len(few):
         return fit
@@ -91,10 +93,10 @@ def posterior(
 
 
 def importance_corrected(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, share: float = 1.0
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, share: float, enough: FloatArray
 ) -> tuple[Hypotheses, FloatArray]:
-    """The mixture that fits weighted points, and how many of them count, (axes,)."""
-    enough, n = share * _ENOUGH, view.reduced.size
+    """The mixture that fits weighted points, and how many of them count, (axes,): ``enough``, if so many do."""
+    n = view.reduced.size
     points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
     if (line := view.line) is not None:
         numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]

@@ -137,8 +137,9 @@ def _found_compiled(
     axes, count, n = starts.shape
     count += 3 if reversed_precision else 0
     found = Modes(
-        np.empty((axes, count, n)), np.empty((axes, count, n, n)), *(np.empty((axes, count)) for _ in range(3))
-    )
+        np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), np.full((axes, count), -np.inf),
+        np.zeros((axes, count)), np.full((axes, count), np.inf),
+    )  # fmt: skip
     compiled_modes.find_modes(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
         of_axis, whole, reversed_precision, passes, _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged,

@@ -28,8 +28,6 @@ from aolink.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 
-# Mergers that lose less than this, in nats, cost nothing that matters.
-_FREE = 1e-3
 # Of the prior is what the plant would be without a camera; and how rarely chance makes it looked at.
 _DOUBT = 1e-3
 _DOUBTED = 1e-3
@@ -43,8 +41,10 @@ class PixelUpdates:
 
     carried: int
     """Gaussians from exposure to exposure, at most."""
+    free: float
+    """Fewer, where mergers lose less than this, in nats."""
     share: float
-    """Of the usual number of points."""
+    """Of the usual number of points; and of those that are to count, where there is one mode."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
@@ -63,24 +63,21 @@ class PixelUpdates:
         wide = Hypotheses(
             np.full((len(unseen.mean), 1), math.log(_DOUBT)), unseen.mean[:, None], unseen.covariance[:, None]
         )
-        after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share)
+        several = has_several(modes)
+        after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
         end = reduced.end(Belief(after.mean, after.covariance))
-        carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(self.carried, _FREE)
-        return Update(after.belief, carried, new, several_readings(view, modes, after.belief))
+        carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(self.carried, self.free)
+        return Update(after.belief, carried, new, several)
 
 
-PROFILE = PixelUpdates(carried=1, share=0.25)
-MIXTURE = PixelUpdates(carried=6, share=1.0)
+PROFILE = PixelUpdates(carried=3, free=0.1, share=0.25)
+MIXTURE = PixelUpdates(carried=6, free=1e-3, share=1.0)
 
 
-def several_readings(view: PixelView, modes: Modes, after: Belief) -> NDArray[np.bool_]:
-    """Whether the blur has more than one reading, (axes,).
-
-    A second mode that matters, or a path that is known no better than the kernel is wide.
-    """
+def has_several(modes: Modes) -> NDArray[np.bool_]:
+    """Whether there is a second mode that matters, (axes,)."""
     share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
-    square = np.einsum("ij,aij->a", view.gram, after.covariance) / view.outputs
-    return np.asarray(((share > _LEAST_SHARE).sum(axis=1) > 1) | (square > view.kernel_variance))
+    return np.asarray((share > _LEAST_SHARE).sum(axis=1) > 1)
 
 
 def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:

@@ -17,7 +17,7 @@ from aolink.estimation.hypotheses import Hypotheses, stacked_axes
 from aolink.estimation.hypothesis_filter import Update
 from aolink.estimation.modes import innovation
 from aolink.estimation.observation import Belief
-from aolink.estimation.pixel_updates import explored, several_readings
+from aolink.estimation.pixel_updates import explored, has_several
 from aolink.estimation.pixels import PixelView, Reduction, reduction
 from aolink.sensor import BaseSensor
 
@@ -51,7 +51,7 @@ class SampledUpdates:
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         end = reduced.end(Belief(fit.mean, fit.covariance))
         return Update(
-            after, Hypotheses(fit.log_weight, end.mean, end.covariance), new, several_readings(view, modes, after)
+            after, Hypotheses(fit.log_weight, end.mean, end.covariance), new, has_several(modes)
         )
 
     def sample(self, view: PixelView, prior: Hypotheses, number: int) -> FloatArray:

@@ -149,7 +149,7 @@ def _log_densities(
 @compiled
 def importance_corrected(
     line: Line, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray, log_weight: FloatArray,
-    mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, enough: float,
+    mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, enough: FloatArray,
     least_effective: float, halvings: int, prior_points: float, last_prior_points: float, loosened: float,
     negligible: float, effective: FloatArray,
 ) -> None:  # fmt: skip
@@ -203,7 +203,7 @@ def importance_corrected(
             _log_densities(w, x, inverse, constant, t, 0, end, some, logs, drawn[r])
             effective[axis] = _weigh(target, drawn, r + 1, end, some, weight)
             _temper(weight, end, effective[axis], least_effective, halvings, tempered)
-            last = r + 1 == rounds or effective[axis] >= enough
+            last = r + 1 == rounds or effective[axis] >= enough[axis]
             if last and r > 0:
                 P *= loosened
             beside = last_prior_points if last else prior_points

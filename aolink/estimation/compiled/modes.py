@@ -13,7 +13,7 @@ from aolink.estimation.compiled.small import cholesky, compiled, eigh, lower_inv
 FloatArray = NDArray[np.float64]
 
 # Squared distance from a mode, in its standard deviations, at which a search ends there.
-_NEXT_TO = 0.05
+_NEXT_TO = 0.25
 
 
 @compiled
@@ -100,7 +100,8 @@ def find_modes(
     """Where the first ``of_row`` (rows,) of starts (rows, starts, n), whitened, lead, and after them reversals.
 
     As `aolink.estimation.modes.modes_of`; ``mean`` and ``covariance`` are the prior's. Results have room for three more
-    than there are starts if ``reversed_precision`` is not zero; what is not there has evidence minus infinity.
+    than there are starts if ``reversed_precision`` is not zero. Of starts that are not there, or lead where an earlier
+    one did, they are left as they come.
     """
     rows, n = mean.shape
     nodes, room = line.basis.shape[1], out_mean.shape[1]
@@ -116,12 +117,15 @@ def find_modes(
         times(root.T, line.basis, B)
         path_of(line.inputs[row], line.basis, mean[row], rest)
         count = of_row[row]
-        begins[:count] = starts[row, :count]
-        best = done = 0
+        for k in range(count):
+            for i in range(n):
+                begins[k, i] = starts[row, k, i]
+        best = best_end = done = found = 0
         while done < count:
-            twin = _near(begins[done], ends, their_H, done)
+            twin = _near(begins[done], ends, their_H, found)
             if twin < 0:
-                s[:] = begins[done]
+                for i in range(n):
+                    s[i] = begins[done, i]
                 now = _at(line, row, rest, B, s, path, f, J, scores, H, pull)
                 damping = first_damping
                 for _ in range(passes):
@@ -145,7 +149,7 @@ def find_modes(
                         H, other = other, H
                         pull, its_pull = its_pull, pull
                         damping = damping / 8
-                        twin = _near(s, ends, their_H, done)
+                        twin = _near(s, ends, their_H, found)
                         if twin >= 0:
                             break
                     else:
@@ -154,13 +158,12 @@ def find_modes(
                         break
                     if damping > largest_damping:
                         break
-            if twin >= 0:
-                ends[done], their_H[done] = ends[twin], their_H[twin]
-                out_mean[row, done], out_covariance[row, done] = out_mean[row, twin], out_covariance[row, twin]
-                out_evidence[row, done], out_distance[row, done] = -math.inf, out_distance[row, twin]
-                out_objective[row, done] = out_objective[row, twin]
-            else:
-                ends[done], their_H[done] = s, H
+            if twin < 0:
+                for i in range(n):
+                    ends[found, i] = s[i]
+                    for j in range(i + 1):
+                        their_H[found, i, j] = H[i, j]
+                found += 1
                 cholesky(H, lower)
                 log_H = distance = 0.0
                 for i in range(n):
@@ -169,31 +172,29 @@ def find_modes(
                 lower_inverse(lower, inverse)
                 # Covariance L H^-1 L' = W W' with W = L R^-T.
                 for i in range(n):
-                    out_mean[row, done, i] = mean[row, i]
+                    place = mean[row, i]
                     for j in range(n):
                         total = 0.0
                         for k in range(i + 1):
                             total += root[i, k] * inverse[j, k]
                         damped[i, j] = total
                     for j in range(i + 1):
-                        out_mean[row, done, i] += root[i, j] * s[j]
+                        place += root[i, j] * s[j]
                         total = 0.0
                         for k in range(n):
                             total += damped[i, k] * damped[j, k]
                         out_covariance[row, done, i, j] = out_covariance[row, done, j, i] = total
+                    out_mean[row, done, i] = place
                 out_evidence[row, done] = -now - 0.5 * log_H
                 out_distance[row, done] = distance
                 out_objective[row, done] = now
-                if now < out_objective[row, best]:
-                    best = done
+                if done == 0 or now < out_objective[row, best]:
+                    best, best_end = done, found - 1
             done += 1
             if done == of_row[row] and reversed_precision > 0.0:
-                path_of(rest, B, ends[best], path)
+                path_of(rest, B, ends[best_end], path)
                 _reversals(line.weights, rest, B, path, whole, reversed_precision, damped, lower, begins[done:])
                 count = done + 3
-        for k in range(count, room):
-            out_mean[row, k], out_covariance[row, k] = out_mean[row, 0], out_covariance[row, 0]
-            out_evidence[row, k], out_objective[row, k], out_distance[row, k] = -math.inf, math.inf, 0.0
 
 
 @compiled
