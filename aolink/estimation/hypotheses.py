@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation import stacked
-from aolink.estimation.compiled.mixtures import merge
+from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.observation import Belief
 
 FloatArray = NDArray[np.float64]
@@ -38,11 +38,19 @@ class Hypotheses:
     @property
     def belief(self) -> Belief:
         """Mean and covariance of the mixture."""
-        w = np.exp(self.log_weight)
-        mean = np.add.reduce(w[..., None] * self.mean, axis=1)
-        away = self.mean - mean[:, None]
-        spread = self.covariance + away[..., :, None] * away[..., None, :]
-        return Belief(mean, stacked.symmetric(np.add.reduce(w[..., None, None] * spread, axis=1)))
+        axes, _, n = self.mean.shape
+        out = Belief(np.empty((axes, n)), np.empty((axes, n, n)))
+        compiled_mixtures.moments(*self.contiguous, out.mean, out.covariance)
+        return out
+
+    def mapped(self, rows: FloatArray, remainder: FloatArray) -> Hypotheses:
+        """Of M t + e instead of t, M being ``rows`` (m, n) and the independent e's covariance ``remainder`` (m, m)."""
+        (axes, count, _), m = self.mean.shape, len(rows)
+        out = Hypotheses(self.log_weight, np.zeros((axes, count, m)), np.zeros((axes, count, m, m)))
+        compiled_mixtures.mapped(
+            *self.contiguous, np.ascontiguousarray(rows), np.ascontiguousarray(remainder), out.mean, out.covariance
+        )
+        return out
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """At points (axes, points, n), (axes, points)."""
@@ -75,7 +83,7 @@ class Hypotheses:
         Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
         """
         merged = Hypotheses(self.log_weight.copy(), self.mean.copy(), self.covariance.copy())
-        merge(*merged.contiguous, most, free)
+        compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
     def with_components(self, count: int) -> Hypotheses:

@@ -68,7 +68,7 @@ def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, w
     weight = _EVIDENCE * (modes_weight - np.maximum.reduce(modes_weight, axis=1, keepdims=True))
     weight += math.log(1 - _WIDE) - log_sum(weight, axis=1)[:, None]
     narrow = Hypotheses(weight, modes.mean, modes.covariance * _INFLATION)
-    return joined(narrow, Hypotheses(wide_weight + math.log(_WIDE), wide.mean, wide.covariance)).ordered()
+    return joined(narrow, Hypotheses(wide_weight + math.log(_WIDE), wide.mean, wide.covariance))
 
 
 def posterior(
@@ -110,7 +110,7 @@ def importance_corrected(
             n * _LAST_PRIOR_POINTS, _LOOSENED, _NEGLIGIBLE, effective,
         )  # fmt: skip
         return fit, effective
-    proposals: list[Hypotheses] = []
+    proposal, proposals = proposal.ordered(), list[Hypotheses]()
     t = np.zeros((len(prior.mean), 0, n))
     target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
     fit, going_on = proposal, np.ones(len(t), dtype=bool)

@@ -65,8 +65,7 @@ class PixelUpdates:
         )
         several = has_several(modes)
         after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
-        end = reduced.end(Belief(after.mean, after.covariance))
-        carried = Hypotheses(after.log_weight, end.mean, end.covariance).reduced(self.carried, self.free)
+        carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
         return Update(after.belief, carried, new, several)
 
 

@@ -16,6 +16,64 @@ _LOG_2PI = math.log(2 * math.pi)
 
 
 @compiled
+def moments(
+    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, out_mean: FloatArray, out_covariance: FloatArray
+) -> None:
+    """Means (axes, n) and covariances of mixtures with components (axes, components, ...)."""
+    axes, count, n = mean.shape
+    for axis in range(axes):
+        for i in range(n):
+            out_mean[axis, i] = 0.0
+            for j in range(n):
+                out_covariance[axis, i, j] = 0.0
+        for c in range(count):
+            if log_weight[axis, c] > -math.inf:
+                w = math.exp(log_weight[axis, c])
+                for i in range(n):
+                    out_mean[axis, i] += w * mean[axis, c, i]
+        for c in range(count):
+            if log_weight[axis, c] > -math.inf:
+                w = math.exp(log_weight[axis, c])
+                for i in range(n):
+                    away = mean[axis, c, i] - out_mean[axis, i]
+                    for j in range(i + 1):
+                        beside = away * (mean[axis, c, j] - out_mean[axis, j])
+                        out_covariance[axis, i, j] += w * (covariance[axis, c, i, j] + beside)
+        for i in range(n):
+            for j in range(i):
+                out_covariance[axis, j, i] = out_covariance[axis, i, j]
+
+
+@compiled
+def mapped(
+    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, rows: FloatArray, remainder: FloatArray,
+    out_mean: FloatArray, out_covariance: FloatArray,
+) -> None:  # fmt: skip
+    """Components of M t + e, e of covariance ``remainder``; what is not there is left as it comes."""
+    axes, count, n = mean.shape
+    m = len(rows)
+    half = np.empty((m, n))
+    for axis in range(axes):
+        for c in range(count):
+            if log_weight[axis, c] == -math.inf:
+                continue
+            for a in range(m):
+                place = 0.0
+                for j in range(n):
+                    place += rows[a, j] * mean[axis, c, j]
+                    total = 0.0
+                    for i in range(n):
+                        total += rows[a, i] * covariance[axis, c, i, j]
+                    half[a, j] = total
+                out_mean[axis, c, a] = place
+                for b in range(a + 1):
+                    total = remainder[a, b]
+                    for j in range(n):
+                        total += half[a, j] * rows[b, j]
+                    out_covariance[axis, c, a, b] = out_covariance[axis, c, b, a] = total
+
+
+@compiled
 def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most: int, free: float) -> None:
     """Components (axes, components, ...) merged by Runnalls' bound, in place; those that are gone weigh nothing.
 
@@ -26,18 +84,23 @@ def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most
     root, merged = np.empty((n, n)), np.empty((n, n))
     for axis in range(axes):
         w, x, P = log_weight[axis], mean[axis], covariance[axis]
-        there = 0
+        # Those that are there come first.
+        begun = 0
         for j in range(count):
             if w[j] > -math.inf:
-                there += 1
-                logs[j] = _log_determinant(P[j], root)
-        for i in range(count):
-            for j in range(i + 1, count):
+                if begun < j:
+                    x[begun], P[begun] = x[j], P[j]
+                    w[begun], w[j] = w[j], -math.inf
+                logs[begun] = _log_determinant(P[begun], root)
+                begun += 1
+        for i in range(begun):
+            for j in range(i + 1, begun):
                 cost[i, j] = _cost(w, x, P, logs, i, j, merged, root)
+        there = begun
         while there > 1:
             first, second, least = -1, -1, math.inf
-            for i in range(count):
-                for j in range(i + 1, count):
+            for i in range(begun):
+                for j in range(i + 1, begun):
                     if w[i] > -math.inf and w[j] > -math.inf and cost[i, j] < least:
                         first, second, least = i, j, cost[i, j]
             if first < 0 or (there <= most and least > free):
@@ -50,7 +113,7 @@ def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most
             w[first], w[second] = total, -math.inf
             there -= 1
             logs[first] = _log_determinant(P[first], root)
-            for j in range(count):
+            for j in range(begun):
                 i, k = min(first, j), max(first, j)
                 if i < k:
                     cost[i, k] = _cost(w, x, P, logs, i, k, merged, root)
