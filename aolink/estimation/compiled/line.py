@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.compiled.small import compiled, compiled_sums
+from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -66,7 +66,7 @@ def _place(theta: float, low: float, per_unit: float, pixels: int, points: int, 
     return int(cell) + reach // 2, point, u - (point + 0.5) / points
 
 
-@compiled
+@inlined
 def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
     """Densities without noise, padded on both sides by the table's reach."""
     f[:] = 0.0
@@ -81,7 +81,7 @@ def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
             f[first + p] += w * (row[0, p] + d * (row[1, p] + d * (row[2, p] + d * row[3, p])))
 
 
-@compiled
+@inlined
 def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatArray, J: FloatArray) -> None:
     """The same and its slope by the rows of a basis (n, nodes): J is (n, padded pixels)."""
     f[:] = 0.0
@@ -106,7 +106,7 @@ def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatAr
                 J[i, first + p] += b * slope[p]
 
 
-@compiled
+@inlined
 def log_likelihood_of(line: Line, row: int, f: FloatArray) -> float:
     pad = line.table.shape[2]
     total, product, quiet = 0.0, 1.0, 1.0 / line.read_noise
@@ -126,7 +126,7 @@ def log_likelihood_of(line: Line, row: int, f: FloatArray) -> float:
     return -0.5 * (total + math.log(product))
 
 
-@compiled
+@inlined
 def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArray) -> None:
     """Of coefficients t (n,) of a basis (n, nodes), (nodes,)."""
     path[:] = offset
@@ -154,7 +154,7 @@ def log_likelihoods_of_row(line: Line, row: int, t: FloatArray, out: FloatArray)
         out[j] = log_likelihood_of(line, row, f)
 
 
-@compiled_sums
+@inlined
 def fisher_information(
     line: Line, row: int, f: FloatArray, J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray
 ) -> tuple[float, float]:

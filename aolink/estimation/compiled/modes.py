@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.compiled.line import Line, fisher_information, linearised_light, path_of
-from aolink.estimation.compiled.small import cholesky, compiled, eigh, lower_inverse, lower_solve, solve, times
+from aolink.estimation.compiled.small import cholesky, compiled, inlined, eigh, lower_inverse, lower_solve, solve, times
 
 FloatArray = NDArray[np.float64]
 
@@ -226,7 +226,7 @@ def _reversals(
         solve(root, out[d])
 
 
-@compiled
+@inlined
 def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
     """Which of so many modes s is next to already, or -1; their informations' lower halves are (modes, n, n)."""
     n = len(s)
@@ -242,7 +242,7 @@ def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
     return -1
 
 
-@compiled
+@inlined
 def _at(
     line: Line, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, f: FloatArray,
     J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray,

@@ -18,6 +18,10 @@ def compiled(function: Callable[..., Any]) -> Any:
     return _compiled(function, {"contract", "arcp"})
 
 
+def inlined(function: Callable[..., Any]) -> Any:
+    return numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "arcp"}, inline="always")(function)
+
+
 def compiled_sums(function: Callable[..., Any]) -> Any:
     """The same of a function with long sums, which may be taken in any order: several terms at a time."""
     return _compiled(function, {"contract", "arcp", "reassoc", "nsz"})
