@@ -173,6 +173,10 @@ class ExposureModel:
         Each is to the same bits as alone, for a fraction of the calls.
         """
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
+        if not path.any():
+            none = np.zeros(path.shape[:2])
+            slope = np.zeros((*path.shape[:2], self.plant.n_states))
+            return InputResponse(path=path, end=end, mean=none, slope=slope, square=none)
         mean, square = stacked.mean_over_path(path), stacked.mean_over_path(path * path)
         if self._few is self.plant:
             # Column by column, so that the products lie in memory as they are summed.

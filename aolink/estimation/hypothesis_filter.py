@@ -58,7 +58,7 @@ class Update:
     """What a frame made of a prior."""
 
     coefficients: Belief
-    """Of the reduced coefficients t."""
+    """Of the exposure's coefficients z."""
     end: Hypotheses
     """Of the state at the exposure's end, without what inputs do."""
     innovation: Innovation
@@ -141,10 +141,10 @@ class HypothesisFilter:
         lost = self._missed >= _PATIENCE
         prior = _chosen(lost, single(self._unseen), self.belief)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
-        coefficients = reduced.prior(prior.belief)
-        end = _moved(prior, model.transition, model.process_noise, response.end)
         new = Innovation(np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes), np.ones(axes, dtype=bool))
         several = np.zeros(axes, dtype=bool)
+        done: list[Update] = []
+        took = np.zeros(0, dtype=np.intp)
         if measured is not None:
             view = PixelView(self.sensor, model, response, measured, reduced)
             seen = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
@@ -156,20 +156,29 @@ class HypothesisFilter:
             new = _spread([each.innovation for each in done], seen, axes)
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
-            if len(took):
-                most = max(each.end.mean.shape[1] for each in done)
-                after = [np.concatenate(each)[trusted] for each in zip(*(_arrays(d, most) for d in done), strict=True)]
-                coefficients.mean[took], coefficients.covariance[took], several[took] = after[3], after[4], after[5]
-                kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
-                end = end.replaced(took, kicked)
             self._missed[seen] = np.where(trusted, 0, np.where(lost[seen], 1, self._missed[seen] + 1))
             status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
             status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
+        if len(took) < axes:
+            coefficients = reduced.coefficients(reduced.prior(prior.belief))
+            end = _moved(prior, model.transition, model.process_noise, response.end)
+        if len(took):
+            most = max(each.end.mean.shape[1] for each in done)
+            after = [np.concatenate(each) for each in zip(*(_arrays(d, most) for d in done), strict=True)]
+            if len(took) < len(trusted):
+                after = [each[trusted] for each in after]
+            kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
+            several[took] = after[5]
+            if len(took) == axes:
+                coefficients, end = Belief(after[3], after[4]), kicked
+            else:
+                coefficients.mean[took], coefficients.covariance[took] = after[3], after[4]
+                end = end.replaced(took, kicked)
         self.belief = end
         self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
         self._number += 1
         return Posterior(
-            coefficients=reduced.coefficients(coefficients), end=end.belief, status=status, innovation=new.value,
+            coefficients=coefficients, end=end.belief, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several,
         )  # fmt: skip
 

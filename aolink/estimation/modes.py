@@ -11,7 +11,7 @@ the kernel is wide: so mean and covariance are those of points drawn about the m
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,7 @@ class Modes:
     mean: FloatArray
     covariance: FloatArray
     log_evidence: FloatArray
-    """Laplace's, without the prior weight; minus infinity where a start led to a mode that was there already."""
+    """Laplace's, without the prior weight; minus infinity of a mode that is not there."""
     distance: FloatArray
     """|s|^2, squared distance from the prior, (axes, starts)."""
     objective: FloatArray
@@ -185,10 +185,11 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
 
 
 def without_repeats(modes: Modes) -> Modes:
-    """The same, log-evidence minus infinity for modes that a better start, or an earlier one, led to as well."""
-    evidence = modes.log_evidence.copy()
-    compiled_modes.mark_repeats(modes.mean, modes.covariance, _APART, evidence)
-    return replace(modes, log_evidence=evidence)
+    """The same without modes that an earlier start led to as well, those that are there first."""
+    kept = [getattr(modes, f.name).copy() for f in fields(Modes)]
+    mean, covariance, evidence, distance, objective = kept
+    most = compiled_modes.drop_repeats(mean, covariance, _APART, evidence, distance, objective)
+    return Modes(*(each[:, : max(most, 1)] for each in kept))
 
 
 def broad(view: PixelView, prior: Belief) -> Belief:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.compiled.small import compiled, compiled_sums, inlined
+from aolink.estimation.compiled.small import compiled, inlined
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -333,9 +333,7 @@ def _weigh(
 
 
 @compiled_sums
-def _temper(
-    log_weight: FloatArray, end: int, effective: float, least: float, halvings: int, out: FloatArray
-) -> None:
+def _temper(log_weight: FloatArray, end: int, effective: float, least: float, halvings: int, out: FloatArray) -> None:
     """Weights raised to the largest power up to one at which so many points, or half of all, count."""
     enough = min(least, end / 2)
     for k in range(end):

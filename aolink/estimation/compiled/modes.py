@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.compiled.line import Line, fisher_information, linearised_light, path_of
-from aolink.estimation.compiled.small import cholesky, compiled, inlined, eigh, lower_inverse, lower_solve, solve, times
+from aolink.estimation.compiled.small import cholesky, compiled, eigh, inlined, lower_inverse, lower_solve, solve, times
 
 FloatArray = NDArray[np.float64]
 
@@ -261,25 +261,41 @@ def _at(
 
 
 @compiled
-def mark_repeats(mean: FloatArray, covariance: FloatArray, apart: float, evidence: FloatArray) -> None:
-    """Log-evidence (rows, modes) becomes minus infinity for modes that an earlier one is, too."""
+def drop_repeats(
+    mean: FloatArray, covariance: FloatArray, apart: float, evidence: FloatArray, distance: FloatArray,
+    objective: FloatArray,
+) -> int:  # fmt: skip
+    """Modes (rows, modes, ...) that no earlier one is come first, the log-evidence of the rest is minus infinity.
+
+    Returns how many the row with the most has.
+    """
     rows, count, n = mean.shape
     root, inverse = np.empty((n, n)), np.empty((n, n))
+    most = 0
     for row in range(rows):
-        for j in range(1, count):
+        kept = 0
+        for j in range(count):
             if evidence[row, j] == -math.inf:
                 continue
             cholesky(covariance[row, j], root)
             lower_inverse(root, inverse)
-            for other in range(j):
-                if evidence[row, other] == -math.inf:
-                    continue
-                distance = 0.0
+            repeats = False
+            for other in range(kept):
+                square = 0.0
                 for i in range(n):
                     white = 0.0
                     for k in range(i + 1):
                         white += inverse[i, k] * (mean[row, other, k] - mean[row, j, k])
-                    distance += white * white
-                if distance < apart * apart:
-                    evidence[row, j] = -math.inf
-                    break
+                    square += white * white
+                repeats = repeats or square < apart * apart
+            if repeats:
+                evidence[row, j], objective[row, j] = -math.inf, math.inf
+                continue
+            if kept < j:
+                mean[row, kept], covariance[row, kept] = mean[row, j], covariance[row, j]
+                evidence[row, kept], evidence[row, j] = evidence[row, j], -math.inf
+                distance[row, kept] = distance[row, j]
+                objective[row, kept], objective[row, j] = objective[row, j], math.inf
+            kept += 1
+        most = max(most, kept)
+    return most
