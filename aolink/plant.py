@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink import tiles
+from aolink import blas
 from aolink.blocks import Indices, alike, blockwise, components, eigenvalues, null_space
 from aolink.rig import Plant, Rig
 
@@ -154,7 +154,7 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
     systems = alike_systems(plant)
     if systems is not None:
         own, ends = input_response(systems.one, u.transpose(0, 2, 1).reshape(axes * n_u, k, 1))
-        paths = [tiles.matmul(systems.gains, each) for each in own.reshape(axes, n_u, k)]
+        paths = [blas.matmul(systems.gains, each) for each in own.reshape(axes, n_u, k)]
         end = np.empty((axes, plant.n_states))
         end[:, systems.order] = ends.reshape(axes, n_u, -1)
         return np.stack(paths), end

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink import tiles
+from aolink import blas
 from aolink.estimation import stacked
 from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
 from aolink.plant import AlikeSystems, input_response, lift, output_rows
@@ -92,7 +92,7 @@ def noise_factors(systems: AlikeSystems, n_steps: int) -> NoiseFactors:
     noise = ((systems.gains * sd) ** 2).sum(axis=1) * energy / n_steps
     return NoiseFactors(
         patterns=patterns, course_of=time, courses=courses[:, :distinct] * values[:distinct],
-        after=pushed[:distinct] @ one.C[0], ends=rows, end_remainder=tiles.gram(np.ascontiguousarray(root.T)),
+        after=pushed[:distinct] @ one.C[0], ends=rows, end_remainder=blas.gram(np.ascontiguousarray(root.T)),
         left_out=np.maximum(noise - patterns**2 @ values[time] ** 2 / n_steps, 0.0),
     )  # fmt: skip
 
@@ -208,7 +208,7 @@ class FactoredModel(ExposureModel):
 
     def _mean_slopes(self, path: FloatArray) -> FloatArray:
         """Mean of each output times the rows of its states over the fast steps, (axes, n_outputs, n_states)."""
-        return np.stack([self._of_states(tiles.matmul(each, self.state_courses) / self.n_steps) for each in path])
+        return np.stack([self._of_states(blas.matmul(each, self.state_courses) / self.n_steps) for each in path])
 
     def times_quadratic(self, state: FloatArray) -> FloatArray:
         """M x for each output, (axes, n_outputs, n_states)."""
@@ -224,7 +224,7 @@ class FactoredModel(ExposureModel):
         """basis @ coefficients + c, as of `ExposureModel`."""
         count = coefficients.shape[1]
         patterns, courses = self.patterns[:, :count], self.courses[:, :count]
-        return input_path + np.stack([tiles.matmul(patterns * z, courses.T) for z in coefficients])
+        return input_path + np.stack([blas.matmul(patterns * z, courses.T) for z in coefficients])
 
     def path_sd(self, covariance: FloatArray) -> FloatArray:
         """Standard deviation of the path, as of `ExposureModel`; with process noise in it, also what is left out."""
@@ -241,6 +241,6 @@ class FactoredModel(ExposureModel):
             columns = self.columns(count)
             for c, own in enumerate(columns):
                 for d, other in enumerate(columns[: c + 1]):
-                    block = tiles.matmul(self.patterns[:, own], P[np.ix_(own, other)])
+                    block = blas.matmul(self.patterns[:, own], P[np.ix_(own, other)])
                     out[axis, :, c, d] = out[axis, :, d, c] = (block * self.patterns[:, other]).sum(axis=1)
         return out

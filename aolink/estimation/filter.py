@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink import tiles
+from aolink import blas
 from aolink.estimation import entries, stacked, two_states
 from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis
@@ -215,7 +215,7 @@ def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: F
     """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
     mean = _predicted_mean(belief.mean, transition, kick)
     if max(transition.shape) > entries.MOST_ROWS:
-        spread = tiles.congruences if max(transition.shape) > MANY_STATES else stacked.congruence
+        spread = blas.congruences if max(transition.shape) > MANY_STATES else stacked.congruence
         return Belief(mean, stacked.symmetric(spread(transition, belief.covariance) + noise))
     P, Q = entries.unpack(belief.covariance), entries.unpack(noise)
     covariance = entries.congruence_by_numbers(transition.tolist(), P, Q)

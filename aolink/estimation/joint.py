@@ -13,12 +13,14 @@ from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink import tiles
+from aolink import blas
 from aolink.estimation import large
+from aolink.estimation.compiled import joint as compiled_joint
 from aolink.estimation.exposure_model import InputResponse
 from aolink.estimation.factored_model import FactoredModel
 from aolink.estimation.nodes import Nodes, resolution
@@ -62,10 +64,11 @@ class JointPaths:
         """Coefficients of each course."""
         self.patterns = np.ascontiguousarray(model.patterns[:, : self.size])
         """(n_outputs, size)"""
-        self._by_course = [np.ascontiguousarray(self.patterns[:, own]) for own in self.groups]
-        self._transposed = [np.ascontiguousarray(own.T) for own in self._by_course]
-        self._gram = tiles.gram(self.patterns)
-        self._starts = np.cumsum([0] + [len(own) for own in self.groups[:-1]])
+        self._gram = blas.gram(self.patterns)
+        # In the order of courses.
+        self._patterns, self._course_of = np.ascontiguousarray(self.patterns[:, self.order]), course_of[self.order]
+        self._starts = np.cumsum([0] + [len(own) for own in self.groups])
+        self._slices = [slice(start, end) for start, end in pairwise(self._starts.tolist())]
         self.course_of = course_of
         functions = model.functions[:, :used]
         self._quadrature = resolution(self._unseen(functions), variance, sensor.profile).quadrature
@@ -103,11 +106,11 @@ class JointPaths:
 
     def shares(self, t: FloatArray) -> FloatArray:
         """The courses' shares of each output's path, (n_outputs, m)."""
-        return np.asarray(np.add.reduceat((self.patterns * t)[:, self.order], self._starts, axis=1))
+        return np.asarray(np.add.reduceat(self._patterns * t[self.order], self._starts[:-1], axis=1))
 
     def positions(self, t: FloatArray) -> FloatArray:
         """Where the spots are at the nodes, (spots, 2, nodes)."""
-        path = tiles.matmul(self.shares(t), np.ascontiguousarray(self.functions.T)) + self.inputs
+        path = blas.matmul(self.shares(t), np.ascontiguousarray(self.functions.T)) + self.inputs
         return path.reshape(self.spots, 2, -1)
 
     def score(self, of_shares: FloatArray) -> FloatArray:
@@ -116,33 +119,23 @@ class JointPaths:
 
     def information(self, of_shares: FloatArray) -> FloatArray:
         """Information on the coefficients from that on each spot's shares, (spots, 2, m, 2, m) -> (size, size)."""
-        m = len(self.groups)
-        by_course = np.empty((self.size, self.size))  # in the order of courses
-        flat = of_shares.reshape(self.spots, 2 * m, 2, m)
-        right = [flat[..., d] @ self._by_course[d].reshape(self.spots, 2, -1) for d in range(m)]
-        rows = np.concatenate(right, axis=2).reshape(self.spots, 2, m, -1)
-        for c, start in enumerate(self._starts):
-            end = start + len(self.groups[c])
-            mine = np.ascontiguousarray(rows[:, :, c, :end]).reshape(2 * self.spots, -1)
-            by_course[start:end, :end] = tiles.matmul(self._transposed[c], mine)
-        lower = np.tril(by_course)
-        out = np.empty_like(lower)
-        out[np.ix_(self.order, self.order)] = lower + np.tril(lower, -1).T
+        lower, out = np.empty((self.size, self.size)), np.empty((self.size, self.size))
+        of_shares = np.ascontiguousarray(of_shares)
+        for c, own in enumerate(self._slices):
+            told = np.empty((len(self.patterns), own.stop))
+            compiled_joint.informed(of_shares, self._patterns, self._course_of, c, told)
+            lower[own, : own.stop] = blas.matmul(self._patterns[:, own].T, told)
+        compiled_joint.spread_out(lower, self.order, out)
         return out
 
     def spread(self, covariance: FloatArray) -> FloatArray:
         """Covariance of the shares of each spot, from that of the coefficients, (spots, 2, m, 2, m)."""
         m = len(self.groups)
         out = np.empty((self.spots, 2, m, 2, m))
-        turned = [own.reshape(self.spots, 2, -1).swapaxes(1, 2) for own in self._by_course]
-        sorted_ = covariance[np.ix_(self.order, self.order)]
-        for c, start in enumerate(self._starts):
-            end = start + len(self.groups[c])
-            left = tiles.matmul(self._by_course[c], sorted_[start:end, :end]).reshape(self.spots, 2, -1)
-            for d, first in enumerate(self._starts[: c + 1]):
-                block = left[:, :, first : first + len(self.groups[d])] @ turned[d]
-                out[:, :, c, :, d] = block
-                out[:, :, d, :, c] = block.swapaxes(1, 2)
+        by_course = covariance[self.order][:, self.order]
+        for c, own in enumerate(self._slices):
+            left = blas.matmul(self._patterns[:, own], by_course[own, : own.stop])
+            compiled_joint.spread_of(left, self._patterns, self._starts, c, out)
         return out
 
     def of_one_spot(self) -> Nodes:
@@ -165,8 +158,9 @@ class JointPaths:
 
     def rms_spread(self, state_covariance: FloatArray) -> float:
         """Standard deviation of the paths before the exposure, rms over outputs and nodes."""
-        summed = (self._gram * self.prior_covariance(state_covariance))[np.ix_(self.order, self.order)]
-        own = np.add.reduceat(np.add.reduceat(summed, self._starts, axis=0), self._starts, axis=1)
+        summed = (self._gram * self.prior_covariance(state_covariance))[self.order][:, self.order]
+        first = self._starts[:-1]
+        own = np.add.reduceat(np.add.reduceat(summed, first, axis=0), first, axis=1)
         variance = (self.weights * ((self.functions @ own) * self.functions).sum(axis=1)).sum()
         return float(np.sqrt(max(variance, 0.0) / len(self.patterns)))
 

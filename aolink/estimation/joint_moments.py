@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink import tiles
+from aolink import blas
 from aolink.estimation import large, stacked
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.factored_model import FactoredModel
@@ -92,16 +92,15 @@ class JointMoments:
                 y, noise, fit = self._spot._ratios(y, noise, fit)
             new = y - fit.expected - stacked.matvec(fit.slope, paths.shares_of_spots(prior.mean - t))
             H, score = _told(paths, fit, noise + memory * fit.remainder, new)
-            P = tiles.gram(large.inverse_root(precision + H))
-            t = prior.mean + tiles.matvec(P, score)
+            P = large.covariance(precision + H)
+            t = prior.mean + blas.matvec(P, score)
             if to_come:
                 spread = paths.spread_of_spots(P)
         # The spread to expect of this one innovation is without the memory.
         own = noise + fit.remainder
         H, score = _told(paths, fit, own, new)
-        white = tiles.matvec(large.inverse_root(precision + H), score)
         weighted = np.linalg.solve(own, new[..., None])[..., 0]
-        nis = np.asarray((new * weighted).sum() - white @ white)
+        nis = np.asarray((new * weighted).sum() - score @ large.solve(precision + H, score))
         if light is not None and light < LEAST_FLUX:
             nis = np.asarray(_NOT_BELIEVED)
         S = np.einsum("skk->sk", stacked.congruence(fit.slope, first) + own)

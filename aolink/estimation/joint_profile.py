@@ -24,8 +24,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink import tiles
+from aolink import blas
 from aolink.estimation import large
+from aolink.estimation.compiled.joint import looked_at
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.factored_model import FactoredModel
 from aolink.estimation.joint import JointPaths, joint_paths
@@ -64,10 +65,13 @@ class JointPixels:
         light: FloatArray | None,
     ) -> None:  # fmt: skip
         self.paths, self._edges, self._area = paths, sensor.profile.edges, sensor.pixel_size
-        self.y, self.mask = density.reshape(len(density), -1), mask.reshape(len(mask), -1)
-        share = 1.0 if light is None else light[:, None]
-        self._read = np.broadcast_to(effective_noise_density(sensor) / self._area / share**2, self.y.shape)
-        self._gain = np.broadcast_to(shot_gain(sensor) / share, self.y.shape)
+        self.y, self.mask = (np.ascontiguousarray(each.reshape(len(each), -1)) for each in (density, mask))
+        share = 1.0 if light is None else light
+        spots = np.ones(len(density))
+        self._read, self._gain = (
+            effective_noise_density(sensor) / self._area / share**2 * spots,
+            shot_gain(sensor) / share * spots,
+        )
         self._kernel = sensor.kernel.covariance + paths.widening * np.eye(2)
         self._terms = mehler_series(self._kernel)
 
@@ -76,63 +80,27 @@ class JointPixels:
         """Of the narrowest direction, slope units squared."""
         return float(np.linalg.eigvalsh(self._kernel)[0])
 
-    def predicted(self, t: FloatArray) -> FloatArray:
-        """Densities of the pixels without noise, (spots, pixels)."""
-        path, w, terms = self.paths.positions(t), self.paths.weights, self._terms
-        X, Y = (_masses(self._kernel[d, d], self._edges, path[:, d], len(terms) - 1) for d in (0, 1))
-        light = sum(c * (Y[j].swapaxes(1, 2) @ (X[j] * w[:, None])) for j, c in enumerate(terms))
-        return np.asarray(light).reshape(len(path), -1) / self._area
-
-    def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The same, their Jacobian by the courses' shares, and by the displacement of each spot.
-
-        (spots, pixels), (spots, pixels, 2, m) and (spots, pixels, 2)
-        """
-        path, w, terms = self.paths.positions(t), self.paths.weights[:, None], self._terms
-        X, Y = (_masses(self._kernel[d, d], self._edges, path[:, d], len(terms)) for d in (0, 1))
-        # A displacement is one more course.
-        courses = np.column_stack([self.paths.functions, np.ones(len(w))])
-        spots, m = len(path), courses.shape[1]
-        side = X[0].shape[-1]
-        f = np.zeros((spots, side, side))
-        J = np.zeros((spots, side, side, 2, m))
-        for j, c in enumerate(terms):
-            left, below = Y[j].swapaxes(1, 2), X[j].swapaxes(1, 2)
-            f += c * (left @ (X[j] * w))
-            by_x = left @ ((X[j + 1] * w)[..., None] * courses[:, None]).reshape(spots, len(w), -1)
-            by_y = below @ ((Y[j + 1] * w)[..., None] * courses[:, None]).reshape(spots, len(w), -1)
-            J[..., 0, :] += c * by_x.reshape(spots, side, side, m)
-            J[..., 1, :] += c * by_y.reshape(spots, side, side, m).swapaxes(1, 2)
-        f, J = f.reshape(spots, -1) / self._area, J.reshape(spots, -1, 2, m) / self._area
-        return f, J[..., :-1], J[..., -1]
-
-    def log_likelihood(self, f: FloatArray) -> float:
-        """Of the usable pixels where these are expected, up to a constant."""
-        R, e = self._read + self._gain * np.maximum(f, 0.0), self.y - f
-        return float(-0.5 * np.where(self.mask, e * e / R + np.log(R / self._read), 0.0).sum())
-
-    def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Score and Fisher information of each pixel by what is expected of it, (spots, pixels) both."""
-        R, e = self._read + self._gain * np.maximum(f, 0.0), self.y - f
-        grows = np.where(f > 0, self._gain, 0.0)
-        score = e / R + grows * (e * e / R - 1) / (2 * R)
-        return np.where(self.mask, score, 0.0), np.where(self.mask, 1 / R + grows**2 / (2 * R * R), 0.0)
-
     def at(self, t: FloatArray) -> Linearised:
         """All that is known of the neighbourhood of a point."""
-        f, J, displaced = self.linearised(t)
-        score, information = self.information(f)
-        spots, pixels = f.shape
-        flat = J.reshape(spots, pixels, -1)
-        weighted = (flat * information[..., None]).swapaxes(1, 2)
-        shape = J.shape[2:]
+        path, highest = self.paths.positions(t), len(self._terms)
+        X, Y = (np.stack(_masses(self._kernel[d, d], self._edges, path[:, d], highest)) for d in (0, 1))
+        # A displacement is one more course.
+        courses = np.column_stack([self.paths.functions, np.ones(len(self.paths.weights))])
+        spots, m = len(path), courses.shape[1]
+        log_likelihood, score = np.empty(spots), np.empty((spots, 2 * m))
+        told = np.empty((spots, 2 * m, 2 * m))
+        looked_at(
+            X, Y, np.array(self._terms), self.paths.weights, courses, self._area, self.y, self.mask, self._read,
+            self._gain, log_likelihood, score, told,
+        )  # fmt: skip
+        score, told = score.reshape(spots, 2, m), told.reshape(spots, 2, m, 2, m)
         return Linearised(
-            log_likelihood=self.log_likelihood(f),
-            score=(score[:, None] @ flat).reshape(spots, *shape),
-            information=(weighted @ flat).reshape(spots, *shape, *shape),
-            displaced=np.asarray(weighted @ displaced).reshape(spots, *shape, 2),
-            of_displacement=(displaced * information[..., None]).swapaxes(1, 2) @ displaced,
-            displacement_score=(score[:, None] @ displaced)[:, 0],
+            log_likelihood=float(log_likelihood.sum()),
+            score=score[..., :-1],
+            information=np.ascontiguousarray(told[:, :, :-1, :, :-1]),
+            displaced=told[:, :, :-1, :, -1],
+            of_displacement=told[:, :, -1, :, -1],
+            displacement_score=score[..., -1],
         )
 
 
@@ -176,7 +144,7 @@ def find_mode(
 
     def pulled(t: FloatArray, log_likelihood: float) -> tuple[FloatArray, float]:
         """By the prior, and the objective."""
-        pull = tiles.matvec(precision, t - mean)
+        pull = blas.matvec(precision, t - mean)
         return pull, 0.5 * float((t - mean) @ pull) - log_likelihood
 
     t, at, used = start, view.at(start), 1
@@ -235,7 +203,7 @@ class JointProfile:
             before, P = prior.mean[axis, : paths.size], prior.covariance[axis, :n, :n]
             if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
                 mode = find_mode(view, before, paths.prior_information(P), before)
-                t, after, at = mode.t, tiles.gram(large.inverse_root(mode.precision)), mode.at
+                t, after, at = mode.t, large.covariance(mode.precision), mode.at
             else:
                 t, after, *_ = self._moments.corrected(model, view.paths, Belief(before, P), by_spot(measured, axis))
                 at = view.at(t)
@@ -262,12 +230,13 @@ def innovation(
     # How much each share displaces its spot, (spots, 2, 2, m), and so each coefficient.
     by_share = noise @ at.displaced.transpose(0, 3, 1, 2).reshape(spots, 2, -1)
     by_share = by_share.reshape(spots, 2, 2, -1)
-    H = np.einsum("sdej,sej->sdj", by_share[..., paths.course_of], paths.patterns.reshape(spots, 2, -1))
+    patterns = paths.patterns.reshape(spots, 1, 2, -1)
+    H = by_share[:, :, 0, paths.course_of] * patterns[:, :, 0] + by_share[:, :, 1, paths.course_of] * patterns[:, :, 1]
     H = H.reshape(2 * spots, -1)
-    new = (noise @ at.displacement_score[..., None]).ravel() + tiles.matvec(H, t - mean)
-    S = tiles.matmul(tiles.matmul(H[:, :n], state_covariance), np.ascontiguousarray(H[:, :n].T))
-    S += tiles.gram(np.ascontiguousarray(H[:, n:].T))
+    new = (noise @ at.displacement_score[..., None]).ravel() + blas.matvec(H, t - mean)
+    S = blas.matmul(blas.matmul(H[:, :n], state_covariance), H[:, :n].T)
+    S += blas.gram(H[:, n:].T)
     for s in range(spots):
         S[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += noise[s]
-    white = tiles.matvec(large.inverse_root((S + S.T) / 2), new)
-    return new, np.diagonal(S).copy(), np.asarray(white @ white)
+    S = (S + S.T) / 2
+    return new, np.diagonal(S).copy(), np.asarray(new @ large.solve(S, new))

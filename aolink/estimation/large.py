@@ -1,7 +1,7 @@
 """Corrections of a plant with hundreds of states, in information form: posterior = (P^-1 + H' R^-1 H)^-1.
 
 The information that frames add is a sum over spots, of which each knows its own noise; nothing is as large as
-measurements times measurements. All products are those of `aolink.tiles`.
+measurements times measurements. All products are those of `aolink.blas`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink import tiles
+from aolink import blas
 
 FloatArray = NDArray[np.float64]
 
@@ -26,19 +26,25 @@ def information(covariance: FloatArray) -> FloatArray:
     sd = np.where(sd > 0, sd, 1.0)
     scaled = covariance / sd / sd[:, None]
     np.fill_diagonal(scaled, np.diagonal(scaled) + _JITTER)
-    return np.asarray(tiles.inverse(scaled) / sd / sd[:, None])
+    return np.asarray(blas.inverse(scaled) / sd / sd[:, None])
 
 
 def inverse_root(precision: FloatArray) -> FloatArray:
     """W with W' W the covariance of an information matrix, (n, n); it is scaled to a diagonal of one before."""
     scale = 1 / np.sqrt(np.diagonal(precision))
-    return np.asarray(tiles.inverse_root(precision * scale * scale[:, None]) * scale)
+    return np.asarray(blas.inverse_root(precision * scale * scale[:, None]) * scale)
+
+
+def covariance(precision: FloatArray) -> FloatArray:
+    """Inverse of an information matrix, scaled as in `inverse_root`."""
+    scale = 1 / np.sqrt(np.diagonal(precision))
+    return np.asarray(blas.inverse(precision * scale * scale[:, None]) * scale * scale[:, None])
 
 
 def solve(precision: FloatArray, score: FloatArray) -> FloatArray:
     """precision^-1 score, scaled as in `inverse_root`."""
     scale = 1 / np.sqrt(np.diagonal(precision))
-    return tiles.solve(precision * scale * scale[:, None], score * scale) * scale
+    return blas.solve(precision * scale * scale[:, None], score * scale) * scale
 
 
 def corrected(
@@ -60,17 +66,17 @@ def corrected(
     white = np.linalg.inv(np.linalg.cholesky(R))
     H_white = (white @ H.reshape(blocks, size, n)).reshape(m, n)
     y_white = (white @ y.reshape(blocks, size, 1)).ravel()
-    W = inverse_root(information(P) + tiles.gram(H_white))
-    score = tiles.matvec(H_white.T, y_white)
-    covariance = tiles.gram(W)
-    moved = tiles.matvec(covariance, score)
+    W = inverse_root(information(P) + blas.gram(H_white))
+    score = blas.matvec(H_white.T, y_white)
+    covariance = blas.gram(W)
+    moved = blas.matvec(covariance, score)
     nis = np.asarray(y_white @ y_white - score @ moved)
-    S = (tiles.matmul(H, P) * H).sum(axis=1) + np.einsum("bss->bs", R).ravel()
+    S = (blas.matmul(H, P) * H).sum(axis=1) + np.einsum("bss->bs", R).ravel()
     if gain is not None:
-        moved = tiles.matvec(gain, y)
-        keep = np.eye(n) - tiles.matmul(gain, H)
+        moved = blas.matvec(gain, y)
+        keep = np.eye(n) - blas.matmul(gain, H)
         told = (gain.reshape(n, blocks, size).swapaxes(0, 1) @ R).swapaxes(0, 1).reshape(n, m)
-        covariance = tiles.congruence(keep, P) + tiles.matmul(told, np.ascontiguousarray(gain.T))
+        covariance = blas.congruence(keep, P) + blas.matmul(told, np.ascontiguousarray(gain.T))
         covariance = (covariance + covariance.T) / 2
     return mean + moved, covariance, S, nis
 
@@ -88,12 +94,12 @@ def steady_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> F
     """
     blocks, size, _ = R.shape
     weighted = np.asarray(np.linalg.solve(R, H.reshape(blocks, size, -1)), dtype=np.float64).reshape(len(H), -1)
-    told = tiles.matmul(np.ascontiguousarray(H.T), weighted)
+    told = blas.matmul(np.ascontiguousarray(H.T), weighted)
     told, P = (told + told.T) / 2, Q
     for _ in range(_MOST_EXPOSURES):
-        before, after = P, tiles.inverse(information(P) + told)
-        P = tiles.congruence(A, after) + Q
+        before, after = P, blas.inverse(information(P) + told)
+        P = blas.congruence(A, after) + Q
         P = (P + P.T) / 2
         if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
-            return tiles.matmul(after, np.ascontiguousarray(weighted.T))
+            return blas.matmul(after, np.ascontiguousarray(weighted.T))
     return None

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aolink import tiles
+from aolink import blas
 
 sizes = st.integers(0, 130)
 
@@ -18,12 +18,12 @@ def random(*shape: int) -> np.ndarray:
 @given(sizes, sizes, sizes)
 def test_products_are_those_of_whole_matrices(n: int, k: int, m: int) -> None:
     a, b = random(n, k), random(k, m)
-    np.testing.assert_allclose(tiles.matmul(a, b), a @ b, atol=1e-12)
-    np.testing.assert_allclose(tiles.matmul(b.T, a.T), b.T @ a.T, atol=1e-12)
+    np.testing.assert_allclose(blas.matmul(a, b), a @ b, atol=1e-12)
+    np.testing.assert_allclose(blas.matmul(b.T, a.T), b.T @ a.T, atol=1e-12)
     np.testing.assert_allclose(
-        tiles.matvec(a, b[:, 0] if m else np.zeros(k)), a @ (b[:, 0] if m else np.zeros(k)), atol=1e-12
+        blas.matvec(a, b[:, 0] if m else np.zeros(k)), a @ (b[:, 0] if m else np.zeros(k)), atol=1e-12
     )
-    gram = tiles.gram(a)
+    gram = blas.gram(a)
     np.testing.assert_allclose(gram, a.T @ a, atol=1e-12)
     np.testing.assert_array_equal(gram, gram.T)
 
@@ -32,24 +32,24 @@ def test_products_are_those_of_whole_matrices(n: int, k: int, m: int) -> None:
 def test_the_inverse_of_a_root_gives_the_inverse(n: int) -> None:
     a = random(n, n + 5)
     a = a @ a.T
-    W = tiles.inverse_root(a)
+    W = blas.inverse_root(a)
     np.testing.assert_array_equal(W, np.tril(W))
     np.testing.assert_allclose(W @ np.linalg.cholesky(a), np.eye(n), atol=1e-8)
-    np.testing.assert_allclose(tiles.inverse(a) @ a, np.eye(n), atol=1e-7)
+    np.testing.assert_allclose(blas.inverse(a) @ a, np.eye(n), atol=1e-7)
     x = random(n)
-    np.testing.assert_allclose(tiles.solve(a, a @ x), x, atol=1e-7)
+    np.testing.assert_allclose(blas.solve(a, a @ x), x, atol=1e-7)
 
 
 def test_a_matrix_without_a_root_is_refused() -> None:
     a = np.eye(100)
     a[70, 70] = -1
     with pytest.raises(np.linalg.LinAlgError):
-        tiles.inverse_root(a)
+        blas.inverse_root(a)
 
 
 @pytest.mark.parametrize("share", [0.01, 1.0])
 def test_congruence_by_entries_and_by_pieces(share: float) -> None:
     a, p = random(90, 150) * (np.random.default_rng(1).random((90, 150)) < share), random(150, 150)
     p = p + p.T
-    np.testing.assert_allclose(tiles.congruence(a, p), a @ p @ a.T, atol=1e-11)
-    np.testing.assert_array_equal(tiles.congruences(a, p[None])[0], tiles.congruence(a, p))
+    np.testing.assert_allclose(blas.congruence(a, p), a @ p @ a.T, atol=1e-11)
+    np.testing.assert_array_equal(blas.congruences(a, p[None])[0], blas.congruence(a, p))
