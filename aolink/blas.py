@@ -75,12 +75,22 @@ def congruences(a: FloatArray, p: FloatArray) -> FloatArray:
     return np.stack([congruence(a, each) for each in p])
 
 
+@by_one_thread
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
-    """a p a' of a symmetric p, by the entries of ``a`` where they are few."""
+    """a p a' of a symmetric p, by the entries of ``a`` where they are few.
+
+    Rows of ``p`` at its end that are those of the identity cost next to nothing.
+    """
     if np.count_nonzero(a) <= _SPARSE * a.size:
         entries = csr_array(a)
         return np.asarray(entries @ np.ascontiguousarray((entries @ p).T))
-    return matmul(a, matmul(p, a.T))
+    touched = np.flatnonzero((p != np.eye(len(p))).any(axis=1))
+    k = int(touched[-1]) + 1 if len(touched) else 0
+    own, rest = a[:, :k], a[:, k:]
+    few = np.count_nonzero(own, axis=0) <= _SPARSE * len(own)
+    entries, full = csr_array(own[:, few]), own[:, ~few]
+    half = entries @ p[:k, :k][few] + full @ p[:k, :k][~few]
+    return np.asarray((entries @ half[:, few].T).T + half[:, ~few] @ full.T + rest @ rest.T)
 
 
 @by_one_thread
@@ -100,7 +110,9 @@ def inverse_root(a: FloatArray) -> FloatArray:
 def inverse(a: FloatArray) -> FloatArray:
     """Inverse of a symmetric positive definite matrix, symmetric to the last bit; raises as `inverse_root`."""
     lower, _ = lapack.dpotri(_root(a), lower=1, overwrite_c=1)
-    return np.asarray(lower + np.tril(lower, -1).T)
+    whole = lower + lower.T
+    np.fill_diagonal(whole, np.diagonal(lower))
+    return np.asarray(whole)
 
 
 @by_one_thread

@@ -132,10 +132,16 @@ class JointPaths:
         """Covariance of the shares of each spot, from that of the coefficients, (spots, 2, m, 2, m)."""
         m = len(self.groups)
         out = np.empty((self.spots, 2, m, 2, m))
-        by_course = covariance[self.order][:, self.order]
+        by_course = self._sorted(covariance)
         for c, own in enumerate(self._slices):
             left = blas.matmul(self._patterns[:, own], by_course[own, : own.stop])
             compiled_joint.spread_of(left, self._patterns, self._starts, c, out)
+        return out
+
+    def _sorted(self, matrix: FloatArray) -> FloatArray:
+        """Rows and columns (size, size) in the order of courses."""
+        out = np.empty((self.size, self.size))
+        compiled_joint.taken(np.ascontiguousarray(matrix), self.order, out)
         return out
 
     def of_one_spot(self) -> Nodes:
@@ -158,7 +164,7 @@ class JointPaths:
 
     def rms_spread(self, state_covariance: FloatArray) -> float:
         """Standard deviation of the paths before the exposure, rms over outputs and nodes."""
-        summed = (self._gram * self.prior_covariance(state_covariance))[self.order][:, self.order]
+        summed = self._sorted(self._gram * self.prior_covariance(state_covariance))
         first = self._starts[:-1]
         own = np.add.reduceat(np.add.reduceat(summed, first, axis=0), first, axis=1)
         variance = (self.weights * ((self.functions @ own) * self.functions).sum(axis=1)).sum()

@@ -50,6 +50,7 @@ class JointMoments:
         self._spot = WindowedSpots(sensor, 1, orders, basis=basis, flux=flux)
         self.n_measurements = self._spot.n_measurements * (n_outputs // 2)
 
+    @blas.by_one_thread
     def correct(
         self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
     ) -> Correction:

@@ -187,6 +187,7 @@ class JointProfile:
         self.sensor, self.n_measurements = sensor, n_outputs
         self._moments = JointMoments(sensor, n_outputs)
 
+    @blas.by_one_thread
     def correct(
         self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
     ) -> Correction:

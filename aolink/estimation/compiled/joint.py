@@ -53,6 +53,14 @@ def spread_of(left: FloatArray, patterns: FloatArray, starts: Indices, course: i
 
 
 @compiled
+def taken(matrix: FloatArray, places: Indices, out: FloatArray) -> None:
+    """The rows and columns at these places."""
+    for i in range(len(places)):
+        for j in range(len(places)):
+            out[i, j] = matrix[places[i], places[j]]
+
+
+@compiled
 def spread_out(lower: FloatArray, places: Indices, out: FloatArray) -> None:
     """A symmetric matrix by its lower half, rows and columns in their places."""
     for i in range(len(lower)):
