@@ -8,7 +8,7 @@ without a camera.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -58,7 +58,7 @@ class Update:
     """What a frame made of a prior."""
 
     coefficients: Belief
-    """Of the exposure's coefficients z."""
+    """Of the reduced coefficients t."""
     end: Hypotheses
     """Of the state at the exposure's end, without what inputs do."""
     innovation: Innovation
@@ -150,9 +150,12 @@ class HypothesisFilter:
             seen = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
             at_once = min(_AT_ONCE_COMPILED if view.compiled else _AT_ONCE, -(-len(seen) // thread_count()) or 1)
             parts = [seen[k : k + at_once] for k in range(0, len(seen), at_once)]
-            done = in_threads(
-                lambda p: self._updates.update(view.part(p), prior.part(p), _part(self._unseen, p), self._number), parts
-            )
+
+            def updated(p: NDArray[np.intp]) -> Update:
+                u = self._updates.update(view.part(p), prior.part(p), _part(self._unseen, p), self._number)
+                return replace(u, coefficients=reduced.coefficients(u.coefficients))
+
+            done = in_threads(updated, parts)
             new = _spread([each.innovation for each in done], seen, axes)
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]

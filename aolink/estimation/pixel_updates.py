@@ -66,7 +66,7 @@ class PixelUpdates:
         several = has_several(modes)
         after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
-        return Update(reduced.coefficients(after.belief), carried, new, several)
+        return Update(after.belief, carried, new, several)
 
 
 PROFILE = PixelUpdates(carried=3, free=0.1, share=0.25)

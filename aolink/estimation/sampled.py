@@ -50,9 +50,7 @@ class SampledUpdates:
         new = innovation(view, before, modes)
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         end = reduced.end(Belief(fit.mean, fit.covariance))
-        return Update(
-            reduced.coefficients(after), Hypotheses(fit.log_weight, end.mean, end.covariance), new, has_several(modes)
-        )
+        return Update(after, Hypotheses(fit.log_weight, end.mean, end.covariance), new, has_several(modes))
 
     def sample(self, view: PixelView, prior: Hypotheses, number: int) -> FloatArray:
         """Equally likely particles of the posterior, (axes, particles, n).

@@ -10,11 +10,19 @@ import pytest
 
 from aolink.estimation import exposure_model, make_estimator, pixels
 from aolink.estimation.compiled import forget_stale, small
-from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.hypotheses import Hypotheses, log_determinant, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
 from aolink.estimation.importance import importance_corrected
-from aolink.estimation.modes import broad, find_modes, innovation, spread_starts, whitened
+from aolink.estimation.modes import (
+    Modes,
+    broad,
+    find_modes,
+    innovation,
+    modes_of,
+    spread_starts,
+    whitened,
+    without_repeats,
+)
 from aolink.estimation.observation import Belief
 from aolink.estimation.pixel_updates import MIXTURE, PROFILE, explored
 from aolink.estimation.windowed import Profile
@@ -104,19 +112,51 @@ def test_windowed_moments(pair):
     np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-5 * sd.max() ** 2)
 
 
+def test_starts(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    wide = broad(in_numpy, prior)
+    (ours, squares), (theirs, their_squares) = (spread_starts(each, prior, wide) for each in (view, in_numpy))
+    np.testing.assert_allclose(squares, their_squares, atol=1e-9 * their_squares.max())
+    np.testing.assert_allclose(ours[:, 0], theirs[:, 0], atol=1e-6)
+    # A direction is one whichever way it points.
+    both = np.sort(ours[:, 1:3], axis=1), np.sort(theirs[:, 1:3], axis=1)
+    assert np.quantile(np.abs(both[0] - both[1]), 0.9) < 1e-4
+
+
 def test_every_start_leads_to_the_same_mode(pair):
     view, in_numpy, state = pair
     prior = view.reduced.prior(state)
-    starts, _ = spread_starts(in_numpy, broad(in_numpy, prior), 2, 1.3)
-    white = whitened(prior, starts)
-    ours, theirs = (find_modes(each, prior, white, 40, 1e-4) for each in (view, in_numpy))
-    # A long search may end in another mode, as one that begins 1e-6 away may.
-    settled = np.abs(ours.objective - theirs.objective) < 0.02
-    assert settled.mean() > 0.85
-    sd = np.sqrt(np.einsum("asii->asi", theirs.covariance))
-    apart = np.abs(ours.mean - theirs.mean) / sd
-    assert np.quantile(apart[settled], 0.95) < 0.15
-    assert np.quantile(np.abs(ours.log_evidence - theirs.log_evidence)[settled], 0.95) < 0.15
+    starts, _ = spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    for k in range(starts.shape[1]):
+        ours, theirs = (find_modes(each, prior, starts[:, k : k + 1], 40, 1e-4) for each in (view, in_numpy))
+        # A long search may end in another mode, as one that begins 1e-6 away may.
+        settled = np.abs(ours.objective - theirs.objective) < 0.02
+        assert settled.mean() > 0.6
+        sd = np.sqrt(np.einsum("asii->asi", theirs.covariance))
+        apart = np.abs(ours.mean - theirs.mean) / sd
+        assert np.quantile(apart[settled], 0.95) < 0.15
+        assert np.quantile(np.abs(ours.log_evidence - theirs.log_evidence)[settled], 0.95) < 0.15
+
+
+def test_all_modes_together(pair):
+    """With reversals, and searches that end next to a mode that is known: the same modes that matter."""
+    view, in_numpy, state = pair
+    prior, some = view.reduced.prior(state), slice(1, None)  # not the one beyond the sensor
+    prior = Belief(prior.mean[some], prior.covariance[some])
+    wide = broad(in_numpy.part(some), prior)
+    ours, theirs = (without_repeats(modes_of(each.part(some), prior, wide)) for each in (view, in_numpy))
+    found = 0
+    for axis in range(AXES - 1):
+        most = theirs.log_evidence[axis].max()
+        for k in np.flatnonzero(theirs.log_evidence[axis] > most - 3):
+            white = np.linalg.solve(
+                np.linalg.cholesky(theirs.covariance[axis, k]), (ours.mean - theirs.mean[:, [k]])[axis].T
+            )
+            near = np.isfinite(ours.log_evidence[axis]) & ((white**2).sum(axis=0) < 1)
+            found += near.any()
+            assert near.any() or k != np.argmax(theirs.log_evidence[axis]) or ours.log_evidence[axis].max() > most - 0.5
+    assert found > 0.8 * np.sum(theirs.log_evidence > theirs.log_evidence.max(axis=1)[:, None] - 3)
 
 
 def test_a_mode_is_where_the_gradient_is_zero(pair):
@@ -141,18 +181,24 @@ def test_a_mode_is_where_the_gradient_is_zero(pair):
 def test_repeats():
     rng = np.random.default_rng(3)
     mean, root = rng.standard_normal((20, 7, 3)) * 0.4, np.linalg.cholesky(0.3 * np.eye(3) + 0.1)
-    covariance = np.tile(root @ root.T, (20, 7, 1, 1))
-    evidence = rng.standard_normal((20, 7))
+    evidence, distance, objective = rng.standard_normal((3, 20, 7))
     evidence[0, 2] = -np.inf
-    ours = evidence.copy()
-    compiled_modes.mark_repeats(mean, covariance, 0.7, ours)
+    modes = Modes(mean, np.tile(root @ root.T, (20, 7, 1, 1)), evidence, distance, objective)
+    ours, kept = without_repeats(modes), []
     for axis in range(20):
-        for j in range(1, 7):
-            white = np.linalg.solve(root, (mean[axis, :j] - mean[axis, j]).T)
-            if np.any((np.sum(white**2, axis=0) < 0.49) & np.isfinite(evidence[axis, :j])):
-                evidence[axis, j] = -np.inf
-    np.testing.assert_array_equal(ours, evidence)
-    assert 20 < np.isinf(ours).sum() < 120
+        own: list[int] = []
+        for j in range(7):
+            white = np.linalg.solve(root, (mean[axis, own] - mean[axis, j]).T)
+            if np.isfinite(evidence[axis, j]) and not np.any(np.sum(white**2, axis=0) < 0.49):
+                own.append(j)
+        kept.append(own)
+        there = slice(0, len(own))
+        for field in ("mean", "covariance", "log_evidence", "distance", "objective"):
+            np.testing.assert_array_equal(getattr(ours, field)[axis, there], getattr(modes, field)[axis, own])
+        assert np.all(ours.log_evidence[axis, len(own) :] == -np.inf)
+        assert ours.best[axis] == np.argmin(objective[axis, own])
+    assert ours.mean.shape[1] == max(map(len, kept))
+    assert 20 < 140 - sum(map(len, kept)) < 120
 
 
 def test_innovation(pair):
@@ -173,11 +219,13 @@ def test_importance_sampling_with_the_same_points(pair):
     some = slice(1, 7)  # not the one beyond the sensor, where no point counts
     prior = single(Belief(state.mean[some], state.covariance[some]))
     _, proposal = explored(view.part(some), prior)
+    proposal = proposal.ordered()
     (ours, points), (theirs, their_points) = (
-        importance_corrected(each.part(some), prior, proposal) for each in (view, in_numpy)
+        importance_corrected(each.part(some), prior, proposal, 1.0, np.full(6, 100.0)) for each in (view, in_numpy)
     )
     np.testing.assert_allclose(points, their_points, rtol=0.02)
-    np.testing.assert_allclose(np.exp(ours.log_weight), np.exp(theirs.log_weight), atol=2e-3)
+    weights = (np.exp(each.ordered().log_weight) for each in (ours, theirs))
+    np.testing.assert_allclose(*weights, atol=2e-3)
     sd = np.sqrt(np.einsum("aii->ai", theirs.belief.covariance))
     np.testing.assert_allclose(ours.belief.mean / sd, theirs.belief.mean / sd, atol=5e-3)
     np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.belief.covariance)) / sd, 1.0, atol=5e-3)
@@ -249,8 +297,18 @@ def test_small_matrices_are_those_of_numpy():
         solved = x.copy()
         small.solve(root, solved)
         np.testing.assert_allclose(a @ solved, x, rtol=1e-6, atol=1e-8)
-    assert small.log_sum(np.full(3, -np.inf)) == -np.inf
-    assert small.log_sum(np.array([0.0, -np.inf, 0.0])) == pytest.approx(np.log(2))
+        solved = x.copy()
+        small.lower_solve(root, solved)
+        np.testing.assert_allclose(root @ solved, x, rtol=1e-6, atol=1e-8)
+        values, vectors, worked = np.empty(n), np.empty((n, n)), a.copy()
+        small.eigh(worked, values, vectors)
+        np.testing.assert_allclose(values, np.linalg.eigvalsh(a)[::-1], rtol=1e-9)
+        np.testing.assert_allclose(vectors @ a @ vectors.T, np.diag(values), atol=1e-9 * values[0])
+        np.testing.assert_allclose(vectors @ vectors.T, np.eye(n), atol=1e-12)
+    x = np.append(-np.geomspace(1e-9, 39, 200), 0.0)
+    np.testing.assert_allclose([small.decay(each) for each in x], np.exp(x), rtol=3e-9)
+    assert small.decay(-np.inf) == small.decay(-41.0) < 5e-18
+    assert np.isnan(small.decay(np.nan))
 
 
 FIRST_SESSION = """
