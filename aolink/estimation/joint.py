@@ -23,7 +23,7 @@ from aolink.estimation import large
 from aolink.estimation.compiled import joint as compiled_joint
 from aolink.estimation.exposure_model import InputResponse
 from aolink.estimation.factored_model import FactoredModel
-from aolink.estimation.nodes import Nodes, resolution
+from aolink.estimation.nodes import Nodes, Quadrature, resolution
 from aolink.plant import psd_root
 from aolink.sensor import SpotSensor
 
@@ -70,32 +70,37 @@ class JointPaths:
         self._starts = np.cumsum([0] + [len(own) for own in self.groups])
         self._slices = [slice(start, end) for start, end in pairwise(self._starts.tolist())]
         self.course_of = course_of
-        functions = model.functions[:, :used]
-        self._quadrature = resolution(self._unseen(functions), variance, sensor.profile).quadrature
-        self.functions = np.ascontiguousarray(self._quadrature.at(functions.T).T)
-        """The courses at the nodes, (nodes, m)."""
-        self.weights = self._quadrature.weights
-        """Each node's share of the exposure, (nodes,)."""
-        self._late = model.moved
-        if model.moved:
-            # So much of the first step is not in the exposure, but in the step after its last.
-            self.functions = np.vstack([self.functions, functions[0], model.after[:used]])
-            self.weights = np.append(self.weights, [-model.moved, model.moved])
+        self._functions = model.functions[:, :used]
+        self.resolution = resolution(self._unseen(), variance, sensor.profile)
+        self.functions, self.weights = self._at(self.resolution.quadrature)
+        """The courses at the nodes, (nodes, m), and each node's share of the exposure, (nodes,)."""
         self.inputs = np.zeros((model.plant.n_outputs, len(self.weights)))
         """The response to the inputs, (n_outputs, nodes)."""
 
-    def _unseen(self, functions: FloatArray) -> FloatArray:
+    def _unseen(self) -> FloatArray:
         """Paths of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
         z = np.random.default_rng(0).standard_normal((_DRAWS, self.size))
         n = self.model.plant.n_states
         z[:, :n] = z[:, :n] @ psd_root(self.model.plant.initial_covariance).T
-        return np.concatenate([self.shares(each) @ functions.T for each in z])
+        return np.concatenate([self.shares(each) @ self._functions.T for each in z])
+
+    def _at(self, q: Quadrature) -> tuple[FloatArray, FloatArray]:
+        """Courses and weights of nodes."""
+        functions, weights, moved = np.ascontiguousarray(q.at(self._functions.T).T), q.weights, self.model.moved
+        if not moved:
+            return functions, weights
+        # So much of the first step is not in the exposure, but in the step after its last.
+        after = self.model.after[: functions.shape[1]]
+        return np.vstack([functions, self._functions[0], after]), np.append(weights, [-moved, moved])
 
     def with_inputs(self, response: InputResponse, axis: int) -> JointPaths:
         """The same with what the inputs of an exposure do."""
         paths, path = copy(self), response.path[axis]
-        paths.inputs = self._quadrature.at(path)
-        if self._late:
+        q = self.resolution.with_inputs(path[None])
+        if q is not self.resolution.quadrature:
+            paths.functions, paths.weights = self._at(q)
+        paths.inputs = q.at(path)
+        if self.model.moved:
             late = [path[:, 0], self.model.last_response(response.end)[axis]]
             paths.inputs = np.concatenate([paths.inputs, np.stack(late, axis=1)], axis=1)
         return paths

@@ -40,7 +40,7 @@ class Quadrature:
 
     def at(self, steps: FloatArray) -> FloatArray:
         """At the nodes, what is known at all steps, along the last axis."""
-        return stacked.long_matmul(steps, self.rows.T)
+        return stacked.long_matmul(steps.reshape(-1, 1, steps.shape[-1]), self.rows.T).reshape(*steps.shape[:-1], -1)
 
 
 @lru_cache(maxsize=64)

@@ -86,7 +86,7 @@ def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
     model, size = frame.model, paths.size
     reduced = Reduction(
         expand=np.eye(model.n_coefficients)[:, :size], left_out=np.zeros((0, 0)), end_rows=model.end_rows[:, :size],
-        end_remainder=model.end_remainder, widening=paths.widening, nodes=len(paths._sizes),
+        end_remainder=model.end_remainder, widening=paths.widening, resolution=paths.resolution,
     )  # fmt: skip
     return PixelView(rig.sensor, model, frame.response, frame.windows, reduced)
 
@@ -112,7 +112,6 @@ def test_pixels_and_what_they_tell_are_those_of_a_dense_view(rig, frame):
     t = np.random.default_rng(0).multivariate_normal(
         whole_prior(frame, paths.size).mean[0], whole_prior(frame, paths.size).covariance[0]
     )
-    np.testing.assert_allclose(ours.predicted(t).ravel(), theirs.predicted(t[None, None])[0, 0], atol=1e-12)
     f, J = theirs.linearised(t[None, None])
     weigh, information = theirs.information(f)
     at = ours.at(t)
@@ -123,26 +122,29 @@ def test_pixels_and_what_they_tell_are_those_of_a_dense_view(rig, frame):
     assert at.log_likelihood == pytest.approx(theirs.log_likelihood(f)[0, 0], rel=1e-12)
 
 
-def test_jacobian_is_that_of_finite_differences(rig, frame):
+def test_slopes_are_those_of_finite_differences(rig, frame):
     paths = JointPaths(frame.model, rig.sensor)
     view = joint_view(rig, frame, paths)
     t, rng = whole_prior(frame, paths.size).mean[0], np.random.default_rng(1)
-    _, J, displaced = view.linearised(t)
+    at = view.at(t)
+    slope = paths.score(at.score)
     for _ in range(3):
-        step = rng.standard_normal(paths.size) * 1e-5
-        shares = paths.shares(step).reshape(paths.spots, 2, -1)
-        difference = (view.predicted(t + step) - view.predicted(t - step)) / 2
-        np.testing.assert_allclose(np.einsum("spdm,sdm->sp", J, shares), difference, atol=1e-6 * abs(difference).max())
-    moved = JointPixels(rig.sensor, paths, *(getattr(frame.windows, name)[0] for name in ("density", "mask")), None)
+        step = rng.standard_normal(paths.size) * 1e-4
+        difference = (view.at(t + step).log_likelihood - view.at(t - step).log_likelihood) / 2
+        assert slope @ step == pytest.approx(difference, rel=1e-4, abs=1e-6)
     for d in (0, 1):
         sides = []
         for sign in (1, -1):
             inputs = view.paths.inputs.reshape(paths.spots, 2, -1).copy()
             inputs[:, d] += sign * 1e-5
+            moved = copy(view)
             moved.paths = copy(view.paths)
             moved.paths.inputs = inputs.reshape(view.paths.inputs.shape)
-            sides.append(moved.predicted(t))
-        np.testing.assert_allclose(displaced[..., d], (sides[0] - sides[1]) / 2e-5, atol=1e-6)
+            sides.append(moved.at(t))
+        total = at.displacement_score[:, d].sum()
+        assert total == pytest.approx((sides[0].log_likelihood - sides[1].log_likelihood) / 2e-5, rel=1e-4)
+    # The displacement is a course that is one: what tells of it is what tells of a constant.
+    assert at.displaced.shape == (paths.spots, 2, len(paths.groups), 2)
 
 
 def test_the_mode_and_its_covariance_are_those_of_the_dense_search(rig, frame, monkeypatch):
@@ -195,7 +197,7 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
     assert paths.size == frame.model.n_coefficients
     spots = rig.plant.n_outputs // 2
     theirs = WindowedSpots(rig.sensor, spots, flux=flux)
-    theirs.most_nodes = len(paths._sizes)
+    monkeypatch.setattr(windowed, "blocks", lambda *_: paths.resolution.quadrature)
     whole = WindowedSpots.regression
 
     def of_each_spot(*arguments):

@@ -9,8 +9,9 @@ from scipy import linalg
 from aolink.errors import EstimatorError
 from aolink.estimation import Status, exposure_model, make_estimator, run, score, windowed
 from aolink.estimation.filter import BlurFilter
+from aolink.estimation.nodes import blocks, nodes_of
 from aolink.estimation.observation import Belief
-from aolink.estimation.windowed import Profile, WindowedMoments, _nodes
+from aolink.estimation.windowed import Profile, WindowedMoments
 from aolink.optics.camera import pixel_noise_variance, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import load_rig
@@ -67,7 +68,7 @@ def spread_prior(axes=2):
 def test_regression_is_that_of_samples(basis):
     model, prior = spread_prior()
     observation = WindowedMoments(SENSOR, (0, 1, 2, 3), basis=basis)
-    nodes = _nodes(model, model.response(np.zeros((model.n_steps, model.plant.axes))))
+    nodes = nodes_of(model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100))
     rows, weights = nodes.basis[0], nodes.weights
     mean = prior.mean @ rows.T
     spread = rows @ prior.covariance @ rows.T
@@ -92,7 +93,7 @@ def test_regression_is_that_of_samples(basis):
 def test_slope_is_the_derivative_of_what_is_expected():
     model, prior = spread_prior(1)
     observation = WindowedMoments(SENSOR)
-    nodes = _nodes(model, model.response(np.zeros((model.n_steps, model.plant.axes))))
+    nodes = nodes_of(model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100))
     rows, weights = nodes.basis[0], nodes.weights
     spread = rows @ prior.covariance @ rows.T
     W = observation.window_weights(prior.mean @ rows.T, np.einsum("akk->ak", spread), np.ones((1, 40), bool))
@@ -140,7 +141,7 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
 
 def test_blocks_of_steps_keep_the_mean_of_the_path():
     model = exposure_model(RIG.plant, 1037)
-    nodes = _nodes(model, model.response(np.zeros((model.n_steps, model.plant.axes))))
+    nodes = nodes_of(model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100))
     rows, weights = nodes.basis[0], nodes.weights
     assert len(weights) <= 100
     np.testing.assert_allclose(weights @ rows, model.basis[0].mean(axis=0), atol=1e-14)

@@ -9,8 +9,8 @@ from scipy import linalg
 
 from aolink.estimation import Status, exposure_model, make_estimator, run, score, windowed
 from aolink.estimation.measuring import measure
+from aolink.estimation.nodes import blocks, nodes_of
 from aolink.estimation.observation import Belief
-from aolink.estimation.windowed import _nodes
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.optics.camera import pixel_noise_variance
 from aolink.optics.plane import exposure_density_2d, pixel_mass_2d
@@ -86,7 +86,7 @@ def spread_prior(rig, share=0.3):
 
 
 def at_prior(rig, observation, prior, model):
-    nodes = _nodes(model, model.response(np.zeros((200, 1))), observation.most_nodes)
+    nodes = nodes_of(model, model.response(np.zeros((200, 1))), blocks(200, observation.most_nodes))
     spots, (height, width) = observation.spots, rig.sensor.window
     whole = SpotWindows(
         density=np.zeros((1, spots, height, width)), mask=np.ones((1, spots, height, width), dtype=bool)
