@@ -400,8 +400,17 @@ def _refit(
                     total += away[k] * (t[j, k] - mean[c, j])
                 fitted = trust * total * per_mass + (1 - trust) * covariance[c, i, j]
                 covariance[c, i, j] = covariance[c, j, i] = fitted
+    _normalise(log_weight, negligible * whole)
+
+
+@compiled
+def _normalise(weight: FloatArray, least: float) -> None:
+    """Weights become logarithms, those of no more than the least minus infinity.
+
+    Summed one after the other, so that what is not there does not change a bit.
+    """
     left = 0.0
-    for c in range(count):
-        left += log_weight[c] if log_weight[c] > negligible * whole else 0.0
-    for c in range(count):
-        log_weight[c] = math.log(log_weight[c] / left) if log_weight[c] > negligible * whole else -math.inf
+    for each in weight:
+        left += each if each > least else 0.0
+    for c in range(len(weight)):
+        weight[c] = math.log(weight[c] / left) if weight[c] > least else -math.inf
