@@ -1,9 +1,12 @@
-"""Large products in pieces, against NumPy's in one."""
+"""Linear algebra by one thread, against NumPy's; and who else is given one."""
+
+from threading import Event, Thread
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from threadpoolctl import threadpool_info
 
 from aolink import blas
 
@@ -48,8 +51,43 @@ def test_a_matrix_without_a_root_is_refused() -> None:
 
 
 @pytest.mark.parametrize("share", [0.01, 1.0])
-def test_congruence_by_entries_and_by_pieces(share: float) -> None:
+def test_congruence_by_entries_and_whole(share: float) -> None:
     a, p = random(90, 150) * (np.random.default_rng(1).random((90, 150)) < share), random(150, 150)
     p = p + p.T
     np.testing.assert_allclose(blas.congruence(a, p), a @ p @ a.T, atol=1e-11)
     np.testing.assert_array_equal(blas.congruences(a, p[None])[0], blas.congruence(a, p))
+
+
+@pytest.mark.parametrize("touched", [0, 60, 149, 150])
+def test_congruence_of_what_is_independent_at_its_end(touched: int) -> None:
+    a, p = random(90, 150), np.eye(150)
+    a[:, :40] *= np.random.default_rng(2).random((90, 40)) < 0.02
+    own = random(touched, touched)
+    p[:touched, :touched] = own + own.T
+    np.testing.assert_allclose(blas.congruence(a, p), a @ p @ a.T, atol=1e-11)
+
+
+def blas_threads() -> set[int]:
+    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+
+def test_one_thread_as_long_as_anybody_is_inside() -> None:
+    before, inside, leave = blas_threads(), Event(), Event()
+
+    def other() -> None:
+        with blas.by_one_thread:
+            inside.set()
+            leave.wait(60)
+
+    thread = Thread(target=other)
+    with blas.by_one_thread:
+        thread.start()
+        assert inside.wait(60)
+        assert blas_threads() == {1}
+    assert blas_threads() == {1}
+    leave.set()
+    thread.join()
+    assert blas_threads() == before
+    with pytest.raises(np.linalg.LinAlgError):
+        blas.inverse(-np.eye(3))
+    assert blas_threads() == before

@@ -25,7 +25,7 @@ from aolink.estimation.observation import Observation, PathMoments, steady_gain
 from aolink.estimation.options import Engine, Options
 from aolink.estimation.two_states import Run
 from aolink.estimation.windowed import Basis, WindowedMoments
-from aolink.estimation.windowed_spots import WindowedSpots
+from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 from aolink.exposure import Exposure
 from aolink.plant import MANY_STATES, alike_systems
 from aolink.rig import Rig, SpotSensor
@@ -66,6 +66,8 @@ class Estimator:
             self._filter = BlurFilter(
                 rig.plant, self._observation, process_noise=options.process_noise, gate=options.gate, predict=predict
             )
+            if isinstance(self._observation, JointMoments | JointProfile):
+                _warm_up(rig, BlurFilter(rig.plant, self._observation))
         self.several: NDArray[np.bool_] | None = None
         """Which axes of the last exposure have a blur of more than one reading; None of estimators that do not look."""
         self._next_step: int | None = None
@@ -276,6 +278,16 @@ def _of_pixels(rig: Rig, name: str, options: Options) -> HypothesisFilter:
     # What profile compiles when a blur has several readings, mixture does at once.
     pixels.warm_up(MIXTURE)
     return pixels
+
+
+def _warm_up(rig: Rig, blur_filter: BlurFilter) -> None:
+    """Have a dark exposure of many spots estimated: what that compiles, a session need not wait for."""
+    assert isinstance(rig.sensor, SpotSensor)
+    steps = rig.timing.exposure_steps
+    model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
+    shape = (rig.plant.axes, rig.plant.n_outputs // 2, *rig.sensor.window)
+    dark = SpotWindows(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
+    blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
 
 
 @lru_cache(maxsize=4)

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation import stacked
+from aolink.estimation.compiled.modes import drop_repeats
 from aolink.estimation.estimate import Status
 from aolink.estimation.exposure_model import ExposureModel, InputResponse, by_axis, exposure_model
 from aolink.estimation.filter import Posterior, predicted
-from aolink.estimation.hypotheses import Hypotheses, single
+from aolink.estimation.hypotheses import Hypotheses, joined, single
 from aolink.estimation.observation import Belief
 from aolink.estimation.pixels import PixelView, Reduction
 from aolink.estimation.windowed import Profile
@@ -106,13 +107,17 @@ class HypothesisFilter:
 
     def warm_up(self, updates: Updates) -> None:
         """Have an exposure of one axis updated by these: what they compile, a session need not wait for."""
+        one = slice(0, 1)
+        twice = joined(self.belief.part(one), self.belief.part(one))
+        n = self.plant.n_states
+        twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1)
+        drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
         if self.plant.n_outputs > 1:
             return
         model, pixels = exposure_model(self.plant, 2), self.sensor.profile.pixels
         dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updates.reduction(model, self.sensor))
-        one = slice(0, 1)
         updates.update(view.part(one), self.belief.part(one), _part(self._unseen, one), 0)
         view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
 

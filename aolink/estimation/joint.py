@@ -14,13 +14,13 @@ from __future__ import annotations
 from copy import copy
 from functools import lru_cache
 from itertools import pairwise
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink import blas
 from aolink.estimation import large
-from aolink.estimation.compiled import joint as compiled_joint
 from aolink.estimation.exposure_model import InputResponse
 from aolink.estimation.factored_model import FactoredModel
 from aolink.estimation.nodes import Nodes, Quadrature, resolution
@@ -128,9 +128,9 @@ class JointPaths:
         of_shares = np.ascontiguousarray(of_shares)
         for c, own in enumerate(self._slices):
             told = np.empty((len(self.patterns), own.stop))
-            compiled_joint.informed(of_shares, self._patterns, self._course_of, c, told)
+            compiled_loops().informed(of_shares, self._patterns, self._course_of, c, told)
             lower[own, : own.stop] = blas.matmul(self._patterns[:, own].T, told)
-        compiled_joint.spread_out(lower, self.order, out)
+        compiled_loops().spread_out(lower, self.order, out)
         return out
 
     def spread(self, covariance: FloatArray) -> FloatArray:
@@ -140,13 +140,13 @@ class JointPaths:
         by_course = self._sorted(covariance)
         for c, own in enumerate(self._slices):
             left = blas.matmul(self._patterns[:, own], by_course[own, : own.stop])
-            compiled_joint.spread_of(left, self._patterns, self._starts, c, out)
+            compiled_loops().spread_of(left, self._patterns, self._starts, c, out)
         return out
 
     def _sorted(self, matrix: FloatArray) -> FloatArray:
         """Rows and columns (size, size) in the order of courses."""
         out = np.empty((self.size, self.size))
-        compiled_joint.taken(np.ascontiguousarray(matrix), self.order, out)
+        compiled_loops().taken(np.ascontiguousarray(matrix), self.order, out)
         return out
 
     def of_one_spot(self) -> Nodes:
@@ -188,6 +188,14 @@ class JointPaths:
         out = np.eye(self.size)
         out[:n, :n] = large.information(state_covariance)
         return out
+
+
+@lru_cache(maxsize=1)
+def compiled_loops() -> ModuleType:
+    """Loaded when a plant of many alike systems is there: Numba alone takes half a second."""
+    from aolink.estimation.compiled import joint
+
+    return joint
 
 
 @lru_cache(maxsize=16)

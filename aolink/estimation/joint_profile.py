@@ -26,10 +26,9 @@ from numpy.typing import NDArray
 
 from aolink import blas
 from aolink.estimation import large
-from aolink.estimation.compiled.joint import looked_at
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.factored_model import FactoredModel
-from aolink.estimation.joint import JointPaths, joint_paths
+from aolink.estimation.joint import JointPaths, compiled_loops, joint_paths
 from aolink.estimation.joint_moments import JointMoments, by_spot
 from aolink.estimation.observation import Belief, Correction
 from aolink.estimation.pixels import _masses, mehler_series
@@ -89,7 +88,7 @@ class JointPixels:
         spots, m = len(path), courses.shape[1]
         log_likelihood, score = np.empty(spots), np.empty((spots, 2 * m))
         told = np.empty((spots, 2 * m, 2 * m))
-        looked_at(
+        compiled_loops().looked_at(
             X, Y, np.array(self._terms), self.paths.weights, courses, self._area, self.y, self.mask, self._read,
             self._gain, log_likelihood, score, told,
         )  # fmt: skip

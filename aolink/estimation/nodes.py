@@ -25,7 +25,7 @@ from aolink.rig import Sensor
 FloatArray = NDArray[np.float64]
 
 # The light of a path at the nodes differs from that at all steps by so many standard deviations of noise, rms.
-_WRONG = 0.05
+_WRONG = 0.03
 _LEAST = 3
 
 

@@ -1,4 +1,4 @@
-"""The posterior of the pixels as Gaussians: `profile` carries one of them from exposure to exposure, `mixture` several.
+"""The posterior of the pixels as Gaussians: few of them are carried from exposure to exposure.
 
 Modes are not Gaussian: the blur fixes how much a path moves and leaves open which way, and such a posterior is
 bent. So the modes, and the wide Gaussians of windowed moments about them, are where points are drawn from only;
@@ -31,8 +31,10 @@ FloatArray = NDArray[np.float64]
 # Of the prior is what the plant would be without a camera; and how rarely chance makes it looked at.
 _DOUBT = 1e-3
 _DOUBTED = 1e-3
-# A second mode is one if the posterior gives it this much.
+# A second mode is one if the posterior gives it this much. Of a tenth of it are many points worth the while, for modes'
+# own evidence is rough.
 _LEAST_SHARE = 0.05
+_LEAST_DOUBTED_SHARE = 0.005
 
 
 @dataclass(frozen=True)
@@ -63,20 +65,20 @@ class PixelUpdates:
         wide = Hypotheses(
             np.full((len(unseen.mean), 1), math.log(_DOUBT)), unseen.mean[:, None], unseen.covariance[:, None]
         )
-        several = has_several(modes)
+        several = has_several(modes, _LEAST_DOUBTED_SHARE)
         after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
-        return Update(after.belief, carried, new, several)
+        return Update(after.belief, carried, new, has_several(modes))
 
 
 PROFILE = PixelUpdates(carried=3, free=0.1, share=0.25)
 MIXTURE = PixelUpdates(carried=6, free=1e-3, share=1.0)
 
 
-def has_several(modes: Modes) -> NDArray[np.bool_]:
-    """Whether there is a second mode that matters, (axes,)."""
+def has_several(modes: Modes, least: float = _LEAST_SHARE) -> NDArray[np.bool_]:
+    """Whether there is a second mode that the posterior gives so much, (axes,)."""
     share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
-    return np.asarray((share > _LEAST_SHARE).sum(axis=1) > 1)
+    return np.asarray((share > least).sum(axis=1) > 1)
 
 
 def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:

@@ -314,34 +314,47 @@ def test_small_matrices_are_those_of_numpy():
 FIRST_SESSION = """
 import dataclasses, sys
 from aolink.estimation import make_estimator
-from aolink.estimation.compiled import line, mixtures, modes, moments, small
+from aolink.estimation.compiled import joint, line, mixtures, modes, moments, small
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 def overloads():
-    each = [value for module in (small, line, modes, moments, mixtures) for value in vars(module).values()]
+    each = [value for module in (small, line, modes, moments, mixtures, joint) for value in vars(module).values()]
     return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
 
-rig = load_rig("section-vi-lively")
-rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=0.003))
+rig, name = load_rig(sys.argv[1]), sys.argv[2]
+rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=float(sys.argv[3])))
 assert overloads() == 0
-estimator = make_estimator(rig, sys.argv[1])
+estimator = make_estimator(rig, name)
 before = overloads()
 several = 0
-for exposure in simulate(rig, 30, seed=2):
+for exposure in simulate(rig, int(sys.argv[4]), seed=2):
     estimator.step(exposure)
-    several += estimator.several[0]
+    several += estimator.several is not None and estimator.several[0]
 print(before, overloads(), several)
 """
 
 
+def first_session(rig, name, noise, exposures):
+    """In a process of its own: this one has compiled before."""
+    arguments = [sys.executable, "-c", FIRST_SESSION, rig, name, str(noise), str(exposures)]
+    out = subprocess.run(arguments, capture_output=True, text=True, check=True).stdout
+    return map(int, out.split())
+
+
 @pytest.mark.parametrize("name", ["profile", "mixture"])
 def test_nothing_is_compiled_in_a_session(name):
-    """In a process of its own: this one has compiled before."""
-    out = subprocess.run([sys.executable, "-c", FIRST_SESSION, name], capture_output=True, text=True, check=True).stdout
-    before, after, several = map(int, out.split())
+    before, after, several = first_session("section-vi-lively", name, 0.003, 30)
     assert before == after > 4
     assert several
+
+
+@pytest.mark.parametrize(
+    ("rig", "name"), [("membrane-12x12", "profile"), ("membrane-12x12", "moments"), ("single-lenslet", "mixture")]
+)
+def test_nothing_is_compiled_in_a_session_of_spots(rig, name):
+    before, after, _ = first_session(rig, name, 1e-3, 4)
+    assert before == after > 2
 
 
 def test_machine_code_is_not_older_than_any_source(tmp_path):

@@ -103,5 +103,5 @@ def test_a_mean_or_a_spread_as_wrong_as_allowed_is_hardly_seen():
         )
         return np.sqrt((away**2).sum() / noise)
 
-    assert seen(np.full(2, found.mean)) == pytest.approx(0.05, rel=0.1)
-    assert seen(np.sqrt(found.square) * np.array([-1.0, 1.0])) == pytest.approx(0.05, rel=0.2)
+    assert seen(np.full(2, found.mean)) == pytest.approx(0.03, rel=0.1)
+    assert seen(np.sqrt(found.square) * np.array([-1.0, 1.0])) == pytest.approx(0.03, rel=0.2)

@@ -207,8 +207,8 @@ def limit_section(table: Sequence[Scene], effort: Effort, picture: Picture) -> l
         ),
         Table(["scene", *below], rows("distance", below)),
         Text(
-            "Exposures in which profile saw one reading of the blur, that is one mode, and a path that is known better"
-            " than the kernel is wide: their share, its distance and its NEES there:"
+            "Exposures in which profile saw one reading of the blur, no second mode of 5 %: their share, its distance"
+            " and its NEES there:"
         ),
         Table(
             ["scene", "share", "distance", "NEES"],
