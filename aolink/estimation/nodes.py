@@ -27,6 +27,8 @@ FloatArray = NDArray[np.float64]
 # The light of a path at the nodes differs from that at all steps by so many standard deviations of noise, rms.
 _WRONG = 0.03
 _LEAST = 3
+# More than these bring the path no nearer to what all steps say, of a spot that swings by ten widths of the kernel.
+_MOST = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +158,8 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     def enough(q: Quadrature) -> bool:
         return float(((light(q) - right) ** 2 / noise).sum()) <= _WRONG**2 * len(paths)
 
-    count, found = _LEAST, every
-    while count < n_steps:
+    count, found = _LEAST, blocks(n_steps, _MOST)
+    while count < min(n_steps, _MOST):
         tried = next((q for q in (gauss(n_steps, count), blocks(n_steps, count)) if enough(q)), None)
         if tried is not None:
             found = tried
