@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from contextlib import ContextDecorator
 from functools import lru_cache
-from threading import Lock
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -29,24 +29,26 @@ def _libraries() -> ThreadpoolController:
 
 
 class _ByOneThread(ContextDecorator):
-    """BLAS has one thread while anybody is inside; the number is the process's, not the caller's thread's."""
+    """BLAS has one thread while anybody is inside. One at a time, for that number is the process's."""
 
     def __init__(self) -> None:
-        self._lock = Lock()
-        self._inside = 0
+        self._lock = RLock()
+        self._depth = 0
         self._limit: Any = None
 
     def __enter__(self) -> None:
-        with self._lock:
-            if not self._inside:
-                self._limit = _libraries().limit(limits=1, user_api="blas")
-            self._inside += 1
+        self._lock.acquire()
+        self._depth += 1
+        if self._depth == 1:
+            self._limit = _libraries().limit(limits=1, user_api="blas")
 
     def __exit__(self, *_: object) -> None:
-        with self._lock:
-            self._inside -= 1
-            if not self._inside:
+        try:
+            if self._depth == 1:
                 self._limit.restore_original_limits()
+        finally:
+            self._depth -= 1
+            self._lock.release()
 
 
 by_one_thread = _ByOneThread()

@@ -1,6 +1,6 @@
 """Linear algebra by one thread, against NumPy's; and who else is given one."""
 
-from threading import Event, Thread
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -72,22 +72,23 @@ def blas_threads() -> set[int]:
 
 
 def test_one_thread_as_long_as_anybody_is_inside() -> None:
-    before, inside, leave = blas_threads(), Event(), Event()
+    before, seen = blas_threads(), []
+    if before == {1}:
+        pytest.skip("BLAS was told to have one thread when it was loaded")
 
     def other() -> None:
         with blas.by_one_thread:
-            inside.set()
-            leave.wait(60)
+            seen.append(blas_threads())
+        seen.append(blas_threads())
 
     thread = Thread(target=other)
     with blas.by_one_thread:
         thread.start()
-        assert inside.wait(60)
+        blas.matmul(np.eye(3), np.eye(3))
         assert blas_threads() == {1}
-    assert blas_threads() == {1}
-    leave.set()
+        assert not seen
     thread.join()
-    assert blas_threads() == before
+    assert seen == [{1}, before]
     with pytest.raises(np.linalg.LinAlgError):
         blas.inverse(-np.eye(3))
     assert blas_threads() == before

@@ -67,7 +67,7 @@ class Estimator:
                 rig.plant, self._observation, process_noise=options.process_noise, gate=options.gate, predict=predict
             )
             if isinstance(self._observation, JointMoments | JointProfile):
-                _warm_up(rig, BlurFilter(rig.plant, self._observation))
+                _warm_up(rig)
         self.several: NDArray[np.bool_] | None = None
         """Which axes of the last exposure have a blur of more than one reading; None of estimators that do not look."""
         self._next_step: int | None = None
@@ -277,17 +277,20 @@ def _of_pixels(rig: Rig, name: str, options: Options) -> HypothesisFilter:
     pixels = HypothesisFilter(rig.plant, rig.sensor, updates, gate=options.gate)
     # What profile compiles when a blur has several readings, mixture does at once.
     pixels.warm_up(MIXTURE)
+    updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
     return pixels
 
 
-def _warm_up(rig: Rig, blur_filter: BlurFilter) -> None:
+def _warm_up(rig: Rig) -> None:
     """Have a dark exposure of many spots estimated: what that compiles, a session need not wait for."""
     assert isinstance(rig.sensor, SpotSensor)
     steps = rig.timing.exposure_steps
     model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
     shape = (rig.plant.axes, rig.plant.n_outputs // 2, *rig.sensor.window)
     dark = SpotWindows(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
-    blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
+    for each in (JointMoments, JointProfile):
+        blur_filter = BlurFilter(rig.plant, each(rig.sensor, rig.plant.n_outputs))
+        blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
 
 
 @lru_cache(maxsize=4)

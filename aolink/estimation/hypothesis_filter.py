@@ -151,13 +151,21 @@ class HypothesisFilter:
         done: list[Update] = []
         took = np.zeros(0, dtype=np.intp)
         if measured is not None:
-            view = PixelView(self.sensor, model, response, measured, reduced)
-            seen = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
-            at_once = min(_AT_ONCE_COMPILED if view.compiled else _AT_ONCE, -(-len(seen) // thread_count()) or 1)
-            parts = [seen[k : k + at_once] for k in range(0, len(seen), at_once)]
+            usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
+            # Each axis is looked at as finely as its own path asks for, whatever is beside it.
+            level = reduced.resolution.of(model.path(prior.belief.mean, response.path))
+            views, parts = {}, []
+            for k in np.unique(level[usable]).tolist():
+                views[k] = PixelView(self.sensor, model, response, measured, reduced, k)
+                alike = usable[level[usable] == k]
+                at_once = _AT_ONCE_COMPILED if views[k].compiled else _AT_ONCE
+                at_once = min(at_once, -(-len(alike) // thread_count()))
+                parts += [alike[j : j + at_once] for j in range(0, len(alike), at_once)]
+            seen = np.concatenate([usable[:0], *parts])
 
             def updated(p: NDArray[np.intp]) -> Update:
-                u = self._updates.update(view.part(p), prior.part(p), _part(self._unseen, p), self._number)
+                view = views[int(level[p[0]])].part(p)
+                u = self._updates.update(view, prior.part(p), _part(self._unseen, p), self._number)
                 return replace(u, coefficients=reduced.coefficients(u.coefficients))
 
             done = in_threads(updated, parts)
@@ -167,7 +175,7 @@ class HypothesisFilter:
             self._missed[seen] = np.where(trusted, 0, np.where(lost[seen], 1, self._missed[seen] + 1))
             status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
             status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
-        if len(took) < axes:
+        if not np.array_equal(took, np.arange(axes)):
             coefficients = reduced.coefficients(reduced.prior(prior.belief))
             end = _moved(prior, model.transition, model.process_noise, response.end)
         if len(took):
@@ -177,7 +185,7 @@ class HypothesisFilter:
                 after = [each[trusted] for each in after]
             kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
             several[took] = after[5]
-            if len(took) == axes:
+            if np.array_equal(took, np.arange(axes)):
                 coefficients, end = Belief(after[3], after[4]), kicked
             else:
                 coefficients.mean[took], coefficients.covariance[took] = after[3], after[4]

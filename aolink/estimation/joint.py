@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from aolink import blas
 from aolink.estimation import large
-from aolink.estimation.exposure_model import InputResponse
+from aolink.estimation.exposure_model import InputResponse, exposure_model
 from aolink.estimation.factored_model import FactoredModel
-from aolink.estimation.nodes import Nodes, Quadrature, resolution
+from aolink.estimation.nodes import Nodes, Quadrature, Resolution, resolution
 from aolink.plant import psd_root
 from aolink.sensor import SpotSensor
 
@@ -71,11 +71,20 @@ class JointPaths:
         self._slices = [slice(start, end) for start, end in pairwise(self._starts.tolist())]
         self.course_of = course_of
         self._functions = model.functions[:, :used]
-        self.resolution = resolution(self._unseen(), variance, sensor.profile)
-        self.functions, self.weights = self._at(self.resolution.quadrature)
+        self.resolution = self._resolution(variance, sensor)
+        self._quadrature = self.resolution.levels[0]
+        self.functions, self.weights = self._at(self._quadrature)
         """The courses at the nodes, (nodes, m), and each node's share of the exposure, (nodes,)."""
         self.inputs = np.zeros((model.plant.n_outputs, len(self.weights)))
         """The response to the inputs, (n_outputs, nodes)."""
+
+    def _resolution(self, variance: float, sensor: SpotSensor) -> Resolution:
+        """The same whenever in a step an exposure starts."""
+        if not self.model.moved:
+            return resolution(self._unseen(), variance, sensor.profile)
+        model = exposure_model(self.model.plant, self.model.n_steps)
+        assert isinstance(model, FactoredModel)
+        return joint_paths(model, sensor).resolution
 
     def _unseen(self) -> FloatArray:
         """Paths of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
@@ -93,13 +102,19 @@ class JointPaths:
         after = self.model.after[: functions.shape[1]]
         return np.vstack([functions, self._functions[0], after]), np.append(weights, [-moved, moved])
 
-    def with_inputs(self, response: InputResponse, axis: int) -> JointPaths:
-        """The same with what the inputs of an exposure do."""
+    def foreseen(self, mean: FloatArray, response: InputResponse, axis: int) -> JointPaths:
+        """The same with what the inputs of an exposure do, as fine as paths about this mean ask for.
+
+        Parameters
+        ----------
+        mean:
+            Of the coefficients before the exposure, (size,).
+        """
         paths, path = copy(self), response.path[axis]
-        q = self.resolution.with_inputs(path[None])
-        if q is not self.resolution.quadrature:
-            paths.functions, paths.weights = self._at(q)
-        paths.inputs = q.at(path)
+        expected = self.shares(mean) @ self._functions.T + path
+        paths._quadrature = self.resolution.levels[int(self.resolution.of(expected[None])[0])]
+        paths.functions, paths.weights = self._at(paths._quadrature)
+        paths.inputs = paths._quadrature.at(path)
         if self.model.moved:
             late = [path[:, 0], self.model.last_response(response.end)[axis]]
             paths.inputs = np.concatenate([paths.inputs, np.stack(late, axis=1)], axis=1)

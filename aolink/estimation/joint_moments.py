@@ -62,7 +62,7 @@ class JointMoments:
             some = slice(0, paths.size)
             before = Belief(mean[axis, some], covariance[axis, :n, :n])
             windows = by_spot(measured, axis)
-            t, P, *told = self.corrected(model, paths.with_inputs(response, axis), before, windows)
+            t, P, *told = self.corrected(model, paths.foreseen(mean[axis, some], response, axis), before, windows)
             mean[axis, some], covariance[axis, some, some] = t, P
             rest.append(told)
         new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))

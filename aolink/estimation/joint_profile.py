@@ -197,10 +197,9 @@ class JointProfile:
         found = []
         for axis in range(len(mean)):
             light = None if measured.light is None else measured.light[axis]
-            view = JointPixels(
-                self.sensor, paths.with_inputs(response, axis), measured.density[axis], measured.mask[axis], light
-            )
             before, P = prior.mean[axis, : paths.size], prior.covariance[axis, :n, :n]
+            foreseen = paths.foreseen(before, response, axis)
+            view = JointPixels(self.sensor, foreseen, measured.density[axis], measured.mask[axis], light)
             if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
                 mode = find_mode(view, before, paths.prior_information(P), before)
                 t, after, at = mode.t, large.covariance(mode.precision), mode.at

@@ -4,7 +4,8 @@ Blur is a mean over the steps, and paths are smooth: so it is a mean over few no
 these are the nodes of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree 2 n - 1
 (zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969)), between two
 steps on a straight line. Of one that goes back and forth they are means over equal blocks of steps. As many are taken
-as show the light of paths like the plant's as right as the noise of the camera asks for.
+as show the light of paths like the plant's as right as the noise of the camera asks for; and of an axis whose path is
+foreseen to go further from one to the next than a spot is wide, more.
 """
 
 from __future__ import annotations
@@ -25,10 +26,15 @@ from aolink.rig import Sensor
 FloatArray = NDArray[np.float64]
 
 # The light of a path at the nodes differs from that at all steps by so many standard deviations of noise, rms.
-_WRONG = 0.03
+_WRONG = 0.05
 _LEAST = 3
 # More than these bring the path no nearer to what all steps say, of a spot that swings by ten widths of the kernel.
 _MOST = 100
+# Paths whose light is seen in the mean by less than this say nothing of how many there should be.
+_LEAST_LIGHT = 0.01
+# From node to node a path that is foreseen goes no further than so many standard deviations of kernel and pixel: a mean
+# over Gaussians at such distances has hardly any ripple, exp(-2 pi^2 / 1.2^2).
+_STRIDE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,30 +109,29 @@ def nodes_of(model: ExposureModel, response: InputResponse, q: Quadrature) -> No
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """How finely the time of an exposure is to be looked at."""
+    """How finely the time of an exposure is to be looked at: the coarser, the less a path moves."""
 
-    quadrature: Quadrature
-    mean: float
-    """By how much the mean of a path may be wrong, slope units."""
-    square: float
-    """And its mean square, slope units squared."""
+    levels: tuple[Quadrature, ...]
+    """From what does for paths about rest to all steps."""
+    stride: float
+    """How far a path may go from node to node, slope units."""
 
-    def with_inputs(self, path: FloatArray) -> Quadrature:
-        """Of paths that inputs move, too, (axes, n_outputs, n_steps): finer where so few nodes do not show that."""
-        if not path.any():
-            return self.quadrature
-        n_steps = path.shape[-1]
-        # Where on the camera they are does not matter.
-        path = path - path[..., :1]
-        mean, square = stacked.mean_over_path(path), stacked.mean_over_path(path * path)
-        q = self.quadrature
-        while len(q.weights) < n_steps:
-            at = q.at(path)
-            wrong = np.abs(at @ q.weights - mean)
-            if wrong.max() <= self.mean and np.abs((at * at) @ q.weights - square).max() <= self.square:
+    def of(self, path: FloatArray) -> NDArray[np.intp]:
+        """The level of each axis by the path that is foreseen, (axes, n_outputs, n_steps) -> (axes,)."""
+        level = np.zeros(len(path), dtype=np.intp)
+        far = np.arange(len(path))
+        for k, q in enumerate(self.levels[:-1]):
+            at = q.at(path[far])
+            far = far[np.abs(np.diff(at, axis=-1)).reshape(len(far), -1).max(axis=1, initial=0.0) > self.stride]
+            level[far] = k + 1
+            if not len(far):
                 break
-            q = blocks(n_steps, min(n_steps, 2 * max(len(q.weights), 8)))
-        return q
+        return level
+
+
+def all_steps(n_steps: int) -> Resolution:
+    """Every step is a node."""
+    return Resolution((blocks(n_steps, n_steps),), math.inf)
 
 
 def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution:
@@ -135,7 +140,7 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     Parameters
     ----------
     paths:
-        Like the plant's, of one spot each, (paths, n_steps).
+        Like the plant's about rest, of one spot each, (paths, n_steps).
     variance:
         Of the kernel, slope units squared.
     sensor:
@@ -151,24 +156,21 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
             left += w / 2 * erf(edges - place[:, None])
         return np.diff(left, axis=1) / sensor.pixel_width
 
-    every = blocks(n_steps, n_steps)
-    right = light(every)
+    right = light(blocks(n_steps, n_steps))
     noise = effective_noise_density(sensor) / sensor.pixel_size + shot_gain(sensor) * np.maximum(right, 0.0)
+    seen = float(right.sum()) * sensor.pixel_width
 
     def enough(q: Quadrature) -> bool:
-        return float(((light(q) - right) ** 2 / noise).sum()) <= _WRONG**2 * len(paths)
+        return float(((light(q) - right) ** 2 / noise).sum()) <= _WRONG**2 * seen
 
     count, found = _LEAST, blocks(n_steps, _MOST)
-    while count < min(n_steps, _MOST):
+    while count < min(n_steps, _MOST) and seen > _LEAST_LIGHT * len(paths):
         tried = next((q for q in (gauss(n_steps, count), blocks(n_steps, count)) if enough(q)), None)
         if tried is not None:
             found = tried
             break
-        count += max(1, count // 8)
-    # A spot that rests: what a shift of it changes, and what a spread of it, in standard deviations of noise.
-    bell = np.exp(-edges * edges) / math.sqrt(2 * math.pi * variance)
-    quiet = noise.min()
-    shift = np.diff(bell) / sensor.pixel_width
-    wider = np.diff(edges * bell) / math.sqrt(2 * variance) / sensor.pixel_width
-    by_shift, by_spread = (math.sqrt(float((each**2).sum() / quiet)) for each in (shift, wider))
-    return Resolution(found, _WRONG / by_shift, _WRONG / by_spread)
+        count += max(1, count // 6)
+    levels = [found]
+    while len(levels[-1].weights) < n_steps:
+        levels.append(blocks(n_steps, min(n_steps, 2 * max(len(levels[-1].weights), 8))))
+    return Resolution(tuple(levels), _STRIDE * math.sqrt(variance + sensor.pixel_width**2 / 12))

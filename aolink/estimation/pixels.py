@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.estimation import stacked
-from aolink.estimation.exposure_model import ExposureModel, InputResponse
-from aolink.estimation.nodes import Nodes, Resolution, blocks, nodes_of, resolution
+from aolink.estimation import nodes, stacked
+from aolink.estimation.exposure_model import ExposureModel, InputResponse, exposure_model
+from aolink.estimation.nodes import Nodes
 from aolink.estimation.observation import Belief
 from aolink.estimation.windowed import Profile, Regression, Windowed, WindowedMoments
 from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
@@ -63,7 +63,7 @@ class Reduction:
     """Covariance of the end state that t leaves out, (n_states, n_states)."""
     widening: float
     """Mean variance of the path that t leaves out, which the kernel is to be widened by."""
-    resolution: Resolution
+    resolution: nodes.Resolution
 
     @property
     def size(self) -> int:
@@ -123,9 +123,11 @@ def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_st
     hidden[n:, n:] = np.eye(size) - V @ V.T
     remainder = model.end_remainder + model.end_rows @ hidden @ model.end_rows.T
     if all_steps:
-        seen = Resolution(blocks(model.n_steps, model.n_steps), math.inf, math.inf)
+        seen = nodes.all_steps(model.n_steps)
+    elif model.moved:  # it is the same whenever in a step an exposure starts
+        seen = _reduction(exposure_model(model.plant, model.n_steps), sensor, left_out, all_steps).resolution
     else:
-        seen = resolution(_paths(model, expand), variance, sensor.profile)
+        seen = nodes.resolution(_paths(model, expand), variance, sensor.profile)
     return Reduction(
         expand=expand, left_out=hidden, end_rows=model.end_rows @ expand, end_remainder=remainder,
         widening=float(rest[kept]), resolution=seen,
@@ -143,20 +145,21 @@ def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
 class PixelView:
     """What one frame shows, as a function of the reduced coefficients of each axis.
 
-    Hypotheses of each axis lie along the second dimension of every argument, (axes, hypotheses, ...).
+    Hypotheses of each axis lie along the second dimension of every argument, (axes, hypotheses, ...). ``level`` is that
+    of the reduction's resolution.
     """
 
     def __init__(
         self, sensor: BaseSensor, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows,
-        reduced: Reduction,
+        reduced: Reduction, level: int = 0,
     ) -> None:  # fmt: skip
         self.sensor, self.reduced = sensor, reduced
         line = isinstance(measured, Profile)
         self._optics = sensor.profile if line else sensor
-        nodes = nodes_of(model, response, reduced.resolution.with_inputs(response.path))
-        self._basis = nodes.basis @ reduced.expand
-        self._weights = nodes.weights
-        self._inputs = nodes.inputs
+        at = nodes.nodes_of(model, response, reduced.resolution.levels[level])
+        self._basis = at.basis @ reduced.expand
+        self._weights = at.weights
+        self._inputs = at.inputs
         axes = len(measured.density)
         self.y = measured.density.reshape(axes, -1)
         """Densities of all pixels of an axis, (axes, pixels)."""
@@ -211,8 +214,8 @@ class PixelView:
 
     def moments(self, about: Belief) -> tuple[FloatArray, FloatArray, Regression]:
         """Windowed moments about a belief of t, their noise and regression, as `Windowed.look`; of all axes."""
-        nodes = Nodes(basis=self._basis, weights=self._weights, inputs=self._inputs)
-        return self._windowed.look(nodes, about, self._measured)
+        at = Nodes(basis=self._basis, weights=self._weights, inputs=self._inputs)
+        return self._windowed.look(at, about, self._measured)
 
     def paths(self, t: FloatArray) -> FloatArray:
         """Outputs at the nodes, (axes, hypotheses, n_outputs, nodes)."""

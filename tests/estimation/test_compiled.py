@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from aolink.estimation import exposure_model, make_estimator, pixels
+from aolink.estimation import exposure_model, make_estimator, modes, pixels
 from aolink.estimation.compiled import forget_stale, small
 from aolink.estimation.hypotheses import Hypotheses, log_determinant, single
 from aolink.estimation.hypothesis_filter import HypothesisFilter
@@ -139,8 +139,27 @@ def test_every_start_leads_to_the_same_mode(pair):
         assert np.quantile(np.abs(ours.log_evidence - theirs.log_evidence)[settled], 0.95) < 0.15
 
 
+def test_reversals(pair):
+    """With no pass of the search modes are where it starts, and after them the reversals of the best."""
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    starts, _ = spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    starts = np.ascontiguousarray(starts[:, :3])
+    found = modes._found_compiled(
+        view.line, prior, starts, np.full(AXES, 3), view.whole_nodes, modes._reversed_precision(view), passes=0
+    )
+    own = find_modes(in_numpy, prior, starts, passes=0)
+    best = own.mean[np.arange(AXES), np.argmin(found.objective[:, :3], axis=1)]
+    expected = modes.reversed_starts(in_numpy, prior, best[:, None])
+    ours = whitened(prior, found.mean[:, 3:])
+    there = np.isfinite(found.log_evidence[:, 3:])
+    assert there.mean() > 0.3
+    assert len(set(np.argmin(found.objective[1:, :3], axis=1))) > 1
+    np.testing.assert_allclose(ours[there], expected[there], atol=1e-4 * np.abs(expected[there]).max())
+
+
 def test_all_modes_together(pair):
-    """With reversals, and searches that end next to a mode that is known: the same modes that matter."""
+    """With searches that end next to a mode that is known: the same modes that matter."""
     view, in_numpy, state = pair
     prior, some = view.reduced.prior(state), slice(1, None)  # not the one beyond the sensor
     prior = Belief(prior.mean[some], prior.covariance[some])
@@ -229,6 +248,26 @@ def test_importance_sampling_with_the_same_points(pair):
     sd = np.sqrt(np.einsum("aii->ai", theirs.belief.covariance))
     np.testing.assert_allclose(ours.belief.mean / sd, theirs.belief.mean / sd, atol=5e-3)
     np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.belief.covariance)) / sd, 1.0, atol=5e-3)
+
+
+def test_maps_of_mixtures():
+    rng = np.random.default_rng(8)
+    root, rows = rng.standard_normal((5, 4, 3, 3)), rng.standard_normal((2, 3))
+    weight = rng.uniform(0.1, 1, (5, 4))
+    weight[1, 2] = 0.0
+    with np.errstate(divide="ignore"):
+        m = Hypotheses(
+            np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((5, 4, 3)), root @ root.swapaxes(-1, -2)
+        )
+    own, seen = m.belief, m.mapped(rows, np.diag([0.5, 2.0]))
+    w = np.exp(m.log_weight)
+    mean = np.einsum("ac,aci->ai", w, m.mean)
+    away = m.mean - mean[:, None]
+    np.testing.assert_allclose(own.mean, mean, atol=1e-12)
+    spread = np.einsum("ac,acij->aij", w, m.covariance) + np.einsum("ac,aci,acj->aij", w, away, away)
+    np.testing.assert_allclose(own.covariance, spread, atol=1e-12)
+    np.testing.assert_allclose(seen.belief.mean, mean @ rows.T, atol=1e-12)
+    np.testing.assert_allclose(seen.belief.covariance, rows @ spread @ rows.T + np.diag([0.5, 2.0]), atol=1e-12)
 
 
 def merged_once(m):

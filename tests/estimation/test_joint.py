@@ -1,6 +1,7 @@
 """All spots of one large plant at once: against the dense estimators on a small membrane, and a large one's claims."""
 
 import dataclasses
+import math
 import tracemalloc
 from copy import copy
 
@@ -32,6 +33,7 @@ from aolink.estimation.joint_moments import JointMoments
 from aolink.estimation.joint_profile import JointPixels, find_mode
 from aolink.estimation.measuring import measure
 from aolink.estimation.modes import find_modes, whitened
+from aolink.estimation.nodes import Resolution
 from aolink.estimation.observation import Belief, PathMoments, steady_gain
 from aolink.estimation.options import Options
 from aolink.estimation.pixels import PixelView, Reduction
@@ -86,14 +88,21 @@ def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
     model, size = frame.model, paths.size
     reduced = Reduction(
         expand=np.eye(model.n_coefficients)[:, :size], left_out=np.zeros((0, 0)), end_rows=model.end_rows[:, :size],
-        end_remainder=model.end_remainder, widening=paths.widening, resolution=paths.resolution,
+        end_remainder=model.end_remainder, widening=paths.widening,
+        resolution=Resolution((foreseen(frame, paths)._quadrature,), math.inf),
     )  # fmt: skip
     return PixelView(rig.sensor, model, frame.response, frame.windows, reduced)
 
 
+def foreseen(frame: Frame, paths: JointPaths) -> JointPaths:
+    return paths.foreseen(np.zeros(paths.size), frame.response, 0)
+
+
 def joint_view(rig: Rig, frame: Frame, paths: JointPaths) -> JointPixels:
     seen = frame.windows
-    return JointPixels(rig.sensor, paths.with_inputs(frame.response, 0), seen.density[0], seen.mask[0], None)
+    return JointPixels(
+        rig.sensor, paths.foreseen(np.zeros(paths.size), frame.response, 0), seen.density[0], seen.mask[0], None
+    )
 
 
 def whole_prior(frame: Frame, size: int) -> Belief:
@@ -143,8 +152,14 @@ def test_slopes_are_those_of_finite_differences(rig, frame):
             sides.append(moved.at(t))
         total = at.displacement_score[:, d].sum()
         assert total == pytest.approx((sides[0].log_likelihood - sides[1].log_likelihood) / 2e-5, rel=1e-4)
-    # The displacement is a course that is one: what tells of it is what tells of a constant.
-    assert at.displaced.shape == (paths.spots, 2, len(paths.groups), 2)
+    # What tells of a displacement is what tells of a course that is one.
+    constant = copy(view)
+    constant.paths = copy(view.paths)
+    constant.paths.functions = np.column_stack([np.ones(len(view.paths.weights)), view.paths.functions[:, 1:]])
+    at = constant.at(t)
+    np.testing.assert_allclose(at.of_displacement, at.information[:, :, 0, :, 0], rtol=1e-9)
+    np.testing.assert_allclose(at.displaced, at.information[:, :, :, :, 0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(at.displacement_score, at.score[:, :, 0], rtol=1e-9)
 
 
 def test_the_mode_and_its_covariance_are_those_of_the_dense_search(rig, frame, monkeypatch):
@@ -197,7 +212,7 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
     assert paths.size == frame.model.n_coefficients
     spots = rig.plant.n_outputs // 2
     theirs = WindowedSpots(rig.sensor, spots, flux=flux)
-    monkeypatch.setattr(windowed, "blocks", lambda *_: paths.resolution.quadrature)
+    monkeypatch.setattr(windowed, "blocks", lambda *_: paths.resolution.levels[0])
     whole = WindowedSpots.regression
 
     def of_each_spot(*arguments):

@@ -43,7 +43,7 @@ def wrong(rig, seed=5, count=200):
     """Rms error of the light of paths at the nodes, in standard deviations of the pixels' noise; and their number."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps)
     reduced = pixels.reduction(model, rig.sensor)
-    q = reduced.resolution.quadrature
+    q = reduced.resolution.levels[0]
     rng, n = np.random.default_rng(seed), rig.plant.n_states
     t = rng.standard_normal((count, reduced.size))
     t[:, :n] = t[:, :n] @ np.linalg.cholesky(rig.plant.initial_covariance + 1e-15 * np.eye(n)).T
@@ -79,29 +79,59 @@ def test_a_spot_that_goes_back_and_forth_needs_many():
     assert 12 < count <= SHAKEN.timing.exposure_steps
 
 
-def test_as_fine_as_the_inputs_ask_for():
-    model = exposure_model(LIVELY.plant, 200)
-    found = pixels.reduction(model, LIVELY.sensor).resolution
+def light_of(sensor, paths, weights):
+    return sum(
+        w * np.stack([exposure_density(sensor.kernel, sensor.edges, place[None]) for place in places])
+        for w, places in zip(weights, paths.T, strict=True)
+    )
+
+
+@pytest.mark.parametrize("rig", [LIVELY, load_rig("section-vi")])
+def test_a_foreseen_path_is_looked_at_as_finely_as_it_asks_for(rig):
+    """Ramps, swings and jumps of up to the whole sensor; old commands may be behind them as well as new ones."""
+    sensor, found = rig.sensor, pixels.reduction(exposure_model(rig.plant, 200), rig.sensor).resolution
     time = np.linspace(0, 1, 200)
-    smooth, jump = 0.05 * time**2, np.where(time > 0.37, 0.4, 0.0)
-    assert found.with_inputs(np.zeros((3, 1, 200))) is found.quadrature
-    assert found.with_inputs((smooth + 3.0)[None, None]) is found.quadrature
-    q = found.with_inputs(np.stack([smooth, jump])[:, None])
-    assert len(q.weights) > len(found.quadrature.weights)
-    assert abs(q.at(jump) @ q.weights - jump.mean()) <= found.mean
-    assert abs(q.at(jump) ** 2 @ q.weights - (jump**2).mean()) <= found.square
-
-
-def test_a_mean_or_a_spread_as_wrong_as_allowed_is_hardly_seen():
-    sensor = LIVELY.sensor
-    found = pixels.reduction(exposure_model(LIVELY.plant, 200), sensor).resolution
+    shapes = np.stack([time - 0.5, np.sin(9 * time), np.where(time > 0.37, 0.5, -0.5), np.abs(time - 0.4)])
     noise = effective_noise_density(sensor) / sensor.pixel_size
+    levels = []
+    for size in (0.0, 0.01, 0.1, 0.3, 1.0):
+        paths = size * shapes
+        level = found.of(paths[:, None])
+        for path, k in zip(paths, level, strict=True):
+            q = found.levels[k]
+            away = light_of(sensor, q.at(path)[None], q.weights) - exposure_density(sensor.kernel, sensor.edges, path)
+            assert np.sqrt((away**2).sum() / noise) < 0.3
+        levels.append(level)
+    assert np.all(levels[0] == 0)
+    assert np.all(np.diff(levels, axis=0) >= 0)
+    assert np.all(levels[-1] > 0)
+    # An axis does not depend on those beside it.
+    assert np.array_equal(found.of(shapes[:, None]), [found.of(each[None, None])[0] for each in shapes])
+    assert len(found.levels[-1].weights) == 200
 
-    def seen(path):
-        away = exposure_density(sensor.kernel, sensor.edges, path) - exposure_density(
-            sensor.kernel, sensor.edges, np.zeros(2)
-        )
-        return np.sqrt((away**2).sum() / noise)
 
-    assert seen(np.full(2, found.mean)) == pytest.approx(0.03, rel=0.1)
-    assert seen(np.sqrt(found.square) * np.array([-1.0, 1.0])) == pytest.approx(0.03, rel=0.2)
+def test_wherever_a_step_begins_it_is_the_same():
+    late = exposure_model(LIVELY.plant, 200, 0.3)
+    assert (
+        pixels.reduction(late, LIVELY.sensor).resolution
+        is pixels.reduction(exposure_model(LIVELY.plant, 200), LIVELY.sensor).resolution
+    )
+
+
+def test_paths_without_light_say_nothing():
+    wild = dataclasses.replace(SHAKEN.plant, initial_covariance=1e8 * SHAKEN.plant.initial_covariance)
+    found = pixels.reduction(exposure_model(wild, SHAKEN.timing.exposure_steps), SHAKEN.sensor).resolution
+    assert len(found.levels[0].weights) > 50
+
+
+def test_wide_pixels_and_a_narrow_kernel():
+    sensor = dataclasses.replace(LIVELY.sensor, pixels=3, kernel=dataclasses.replace(LIVELY.sensor.kernel, sigma=0.01))
+    assert pixels.reduction(exposure_model(LIVELY.plant, 200), sensor).resolution.stride > 0
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 3, 4, 7])
+def test_short_exposures(n_steps):
+    found = pixels.reduction(exposure_model(LIVELY.plant, n_steps), LIVELY.sensor).resolution
+    for q in found.levels:
+        assert q.weights.sum() == pytest.approx(1.0)
+    assert found.of(np.zeros((2, 1, n_steps))).tolist() == [0, 0]

@@ -262,6 +262,51 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
 
 
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_nor_do_its_nodes(name):
+    """One axis of three is commanded; the others are looked at as coarsely as alone."""
+    density = np.random.default_rng(3).standard_normal((3, 40)) * 0.3 + exposure_density(
+        RIG.sensor.kernel, RIG.sensor.edges, np.zeros(2)
+    )
+    jump = np.zeros((200, 3))
+    jump[60:, 1] = 2.0
+
+    def estimates(rows):
+        plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(3))))
+        own, model = HypothesisFilter(plant, RIG.sensor, UPDATES[name]), exposure_model(plant, 200)
+        measured = Profile(density=density[rows], mask=np.ones(density[rows].shape, bool))
+        return own.step(model, model.response(jump[:, rows]), measured)
+
+    level = pixels.reduction(exposure_model(RIG.plant, 200), RIG.sensor).resolution.of(
+        exposure_model(dataclasses.replace(RIG.plant, axes=3), 200).response(jump).path
+    )
+    assert level[1] > level[0] == level[2] == 0
+    together = estimates(slice(0, 3))
+    for k in range(3):
+        alone = estimates(slice(k, k + 1))
+        assert alone.coefficients.mean.tobytes() == together.coefficients.mean[k : k + 1].tobytes()
+        assert alone.end.covariance.tobytes() == together.end.covariance[k : k + 1].tobytes()
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_what_commands_left_in_the_state_is_foreseen(name):
+    """A mirror that was kicked rings on by several widths of the kernel, with no input any more."""
+    rig = quiet(RIG, 0.01)
+    w, ts = 2 * np.pi * 1.5, 1e-3
+    plant = dataclasses.replace(
+        rig.plant, A=np.array([[1.0, ts], [-(w**2) * ts, 1 - 0.2 * ts]]), initial_covariance=np.diag([1e-4, 1e-2])
+    )
+    rig = dataclasses.replace(rig, plant=plant)
+    inputs = np.zeros((12 * 200, 1))
+    inputs[200:204] = 700.0 / max(1.0, abs(plant.B).max() / ts)
+    exposures = simulate(rig, 12, seed=4, inputs=inputs)
+    travel = max(np.ptp(e.truth.path) for e in exposures[3:])
+    estimates = run(rig, exposures, [name])[name]
+    errors = np.array([(e.path - x.truth.path) / e.path_sd for x, e in zip(exposures, estimates, strict=True)])[3:]
+    assert travel > 4 * np.sqrt(rig.sensor.kernel.variance)
+    assert np.mean(np.abs(errors) < 1.96) > 0.8
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
 def test_a_lost_mode_is_found_again(name):
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
     rig = load_rig("jitter")
