@@ -41,11 +41,12 @@ class _ByOneThread(ContextDecorator):
         self._depth += 1
         if self._depth == 1:
             self._limit = _libraries().limit(limits=1, user_api="blas")
+            self._limit.__enter__()
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *raised: object) -> None:
         try:
             if self._depth == 1:
-                self._limit.restore_original_limits()
+                self._limit.__exit__(*raised)
         finally:
             self._depth -= 1
             self._lock.release()
