@@ -118,6 +118,34 @@ def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
     assert_near(update.coefficients, mean, covariance, 0.45, 0.35)
 
 
+def test_profile_carries_as_many_gaussians_as_it_takes():
+    """One of a posterior that is Gaussian; of one with two readings more, whose density is that of the points."""
+    one, state = seen(quiet(load_rig("section-vi"), 0.005))
+    assert PROFILE.update(one, single(state), state, 0).end.mean.shape[1] == 1
+    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=10)
+    end = PROFILE.update(view, single(state), state, 0).end
+    assert 1 < end.mean.shape[1] <= 3
+    whole = single(end.belief)
+    points = np.concatenate([end.mean[0], whole.mean[0]])[None]
+    assert np.abs(end.log_density(points) - whole.log_density(points)).max() > 0.05
+
+
+def test_many_points_are_to_count_where_there_is_a_second_mode(monkeypatch):
+    asked = []
+
+    def noted(view, prior, proposal, share, enough):
+        asked.append((share, enough))
+        return importance_corrected(view, prior, proposal, share, enough)
+
+    monkeypatch.setattr("aolink.estimation.importance.importance_corrected", noted)
+    one, state = seen(quiet(load_rig("section-vi"), 0.005))
+    two, other = seen(quiet(RIG, 0.003), width=0.5, seed=10)
+    PROFILE.update(one, single(state), state, 0)
+    PROFILE.update(two, single(other), other, 0)
+    MIXTURE.update(one, single(state), state, 0)
+    assert [(share, enough.tolist()) for share, enough in asked] == [(0.25, [25.0]), (0.25, [100.0]), (1.0, [100.0])]
+
+
 def test_evidence_of_a_mode_has_the_weight_of_its_prior():
     view, state = seen(quiet(RIG, 0.01), width=0.3)
     apart = state.mean[:, None] + np.array([[0.0, 0.0], [0.1, 3.0]])
