@@ -137,6 +137,8 @@ def test_every_start_leads_to_the_same_mode(pair):
         apart = np.abs(ours.mean - theirs.mean) / sd
         assert np.quantile(apart[settled], 0.95) < 0.15
         assert np.quantile(np.abs(ours.log_evidence - theirs.log_evidence)[settled], 0.95) < 0.15
+        scaled = (ours.covariance - theirs.covariance) / (sd[..., :, None] * sd[..., None, :])
+        assert np.quantile(np.abs(scaled[settled]), 0.95) < 0.1
 
 
 def test_reversals(pair):
