@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from aolink.estimation.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.moments import Measurement
@@ -30,7 +31,9 @@ class FilterpyMoments(PathMoments):
         kind = KalmanFilter if linear else ExtendedKalmanFilter
         ekf = kind(dim_x=prior.mean.shape[1], dim_z=self.n_measurements)
         ekf.x, ekf.P = prior.mean[0][:, None].copy(), prior.covariance[0].copy()
-        ekf.R = np.array(measured.covariance[0])
+        # Spots share no noise, so their covariance may come as its blocks; filterpy takes the whole matrix.
+        noise = measured.covariance[0]
+        ekf.R = linalg.block_diag(*noise) if noise.ndim == 3 else np.array(noise)
         if linear:
             self._correct_linear(ekf, model, measured.value[0][:, None] - response.mean[0][:, None])
         else:

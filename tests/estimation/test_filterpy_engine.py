@@ -10,6 +10,7 @@ import pytest
 from aolink.errors import EstimatorError
 from aolink.estimation import make_estimator
 from aolink.recording.reader import Recording
+from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 
@@ -26,6 +27,18 @@ def test_filterpy_gives_our_estimates(rig, name, gain):
             value = getattr(a, field.name)
             if isinstance(value, np.ndarray):
                 np.testing.assert_allclose(value, getattr(b, field.name), atol=1e-9, rtol=0, err_msg=field.name)
+
+
+@pytest.mark.parametrize("name", ["o1", "o2", "o3"])
+@pytest.mark.parametrize("rig_name", ["tip-tilt", "sh-8x8"])
+def test_filterpy_gives_our_estimates_of_plants_that_move_whole_spots(rig_name, name):
+    """Their measurements have the noise of each spot as a block of its own."""
+    rig = load_rig(rig_name)
+    ours, theirs = make_estimator(rig, name), make_estimator(rig, name, engine="filterpy")
+    for exposure in simulate(rig, 3, seed=3):
+        a, b = ours.step(exposure), theirs.step(exposure)
+        for field in ("path", "path_sd", "end_state", "end_covariance", "innovation_covariance", "nis"):
+            np.testing.assert_allclose(getattr(a, field), getattr(b, field), atol=1e-9, rtol=1e-9, err_msg=field)
 
 
 @pytest.mark.parametrize("name", ["o1", "o2", "o3"])
