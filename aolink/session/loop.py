@@ -207,8 +207,10 @@ class SessionLoop:
             self._send_commands(self._device_step())
         if hub.virtual:
             return 0.0
-        ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
-        due = [self._next_query_ns - now, max(ahead, 0) * self._step_ns, self._keep_alive_ns() - now]
+        due = [self._next_query_ns - now, self._keep_alive_ns() - now]
+        if self._end_step is None or self._queued_until < self._end_step:
+            ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
+            due.append((max(ahead, 0) + 1) * self._step_ns)
         if (timeout_ns := self._mirror.next_timeout_ns()) is not None:
             due.append(timeout_ns - now)
         return max(0, min(due)) / 1e9

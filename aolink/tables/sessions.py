@@ -62,8 +62,8 @@ def session(report: Report) -> Table:
     table.add_row(
         "mirror",
         f"parked in {report.steps_parked} steps of the session, {report.rearmed} times told to go on after its watchdog"
-        f" had parked it; {report.blocks_retransmitted} blocks sent again, {report.reports_asked} times asked for missing"
-        " reports",
+        f" had parked it; {report.blocks_retransmitted} blocks sent again; missing reports asked for"
+        f" {report.reports_asked} times",
     )
     table.add_row(
         "clock",
