@@ -1,8 +1,9 @@
 """Frames, commands and the mirror's reports become exposures.
 
 The live session and the reader of recordings feed the same `Assembler` with the same messages in the
-same order, so both get the same exposures. It has no clock and needs no time-out: a device sends in
-order, so what is missing shows as soon as something later has come.
+same order, so both get the same exposures. It has no clock and needs no time-out. A device sends in
+order, so what is missing shows as soon as something later has come; and where a report is asked for again,
+the session says so with a message that is recorded, and says with another one that it has given up.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
-from aolink.rig import Rig
+from aolink.rig import MirrorDriver, Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.runs_pb2 import Run
 
@@ -178,17 +179,30 @@ _Blocks = list[tuple[int, NDArray[np.float64]]]
 class _InputHistory:
     """What the mirror held, and what it was told, for every fast step not yet used."""
 
-    def __init__(self, n_inputs: int, park: NDArray[np.float64]) -> None:
-        self._n_inputs = n_inputs
+    def __init__(self, mirror: MirrorDriver) -> None:
+        self._n_inputs, self._quantise = len(mirror.park), mirror.quantise
         self._applied: _Blocks = []
         self._commanded: _Blocks = []
-        self._last = park
-        self.reported_until = 0
+        self._awaited: list[tuple[int, int]] = []
+        """First steps and ends of runs of steps whose reports have been asked for again and have not come yet."""
+        self._last = mirror.park
+        self._reported_until = 0
         """First step that no report covers yet."""
 
     def add_applied(self, message: pb.Applied | Run) -> None:
+        first, end = message.first_step, message.first_step + message.n_steps
+        if isinstance(message, pb.Applied) and message.source == pb.Applied.AWAITED:
+            self._awaited.append((first, end))
+            return
+        if self._awaited:
+            parts = [part for low, high in self._awaited for part in ((low, min(high, first)), (max(low, end), high))]
+            self._awaited = [(low, high) for low, high in parts if low < high]
         self._add(self._applied, message)
-        self.reported_until = max(self.reported_until, message.first_step + message.n_steps)
+        self._reported_until = max(self._reported_until, end)
+
+    def is_known_until(self, end: int) -> bool:
+        """Whether nothing more is to be had of the steps before ``end``."""
+        return end <= self._reported_until and all(first >= end for first, _ in self._awaited)
 
     def add_command(self, message: pb.CommandBlock | Run) -> None:
         self._add(self._commanded, message)
@@ -202,7 +216,8 @@ class _InputHistory:
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
         """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
 
-        The last word on a step counts; one that nothing is known of holds the input of the step before.
+        The last word on a step counts. A step without a report is taken to hold what was commanded, as the mirror's
+        converter puts it out; one that nothing is known of holds the input of the step before.
         """
         n = max(0, end - first)
         if n and self._reports_exactly(first, n):
@@ -217,6 +232,9 @@ class _InputHistory:
                 rows[some] = u[max(first - start, 0) :][: len(rows[some])]
                 known[some] = True
             blocks[:] = _after(end, blocks)
+        only_told = told & ~reported
+        if only_told.any():
+            rows[only_told] = self._quantise(rows[only_told])
         for k in np.flatnonzero(~(told | reported)):
             rows[k] = rows[k - 1] if k else self._last
         if n:
@@ -244,7 +262,7 @@ class Assembler:
     """Frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
 
     def __init__(self, rig: Rig) -> None:
-        self._history = _InputHistory(rig.n_inputs, rig.mirror.park)
+        self._history = _InputHistory(rig.mirror)
         self._no_lead = np.empty((0, rig.n_inputs))
         self._fast_step_ns = rig.timing.fast_step_ns
         self._frames: deque[Frame] = deque()
@@ -272,7 +290,7 @@ class Assembler:
 
     def _ready(self) -> list[Exposure]:
         exposures = []
-        while self._frames and self._frames[0].last_step < self._history.reported_until:
+        while self._frames and self._history.is_known_until(self._frames[0].last_step + 1):
             exposures.append(self._expose(self._frames.popleft()))
         return exposures
 

@@ -68,7 +68,10 @@ class Exposure:
     are those of whole fast steps all the same: the start state at ``first_step``, the end state ``n_steps`` later.
     """
     inputs_assumed: int = 0
-    """Steps of ``inputs`` and ``lead_inputs`` that the device's report is missing for: they hold what was commanded."""
+    """Steps of ``inputs`` and ``lead_inputs`` that the device's report is missing for.
+
+    They hold what was commanded, rounded as the mirror's converter would.
+    """
     chunks_lost: int = 0
     """Chunks of the frame that never arrived; their pixels are masked."""
     device_start_ns: int = 0

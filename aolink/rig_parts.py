@@ -132,6 +132,8 @@ class Faults:
 
     bit_flip_rate: float = 0.0
     """Probability that a packet from the device has one bit flipped."""
+    bit_error_rate: float = 0.0
+    """Probability that a bit is flipped, in packets either way: long packets are damaged more often than short ones."""
     packet_loss_rate: float = 0.0
     """Probability that a packet from the device is lost."""
     command_loss_rate: float = 0.0

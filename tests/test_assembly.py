@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -160,7 +162,37 @@ def test_a_lost_report_is_replaced_by_the_command_and_counted() -> None:
     assembler.add_applied(applied(150, 200))
     (exposure,) = assembler.add_frame(frame_at(0))
     assert exposure.inputs_assumed == 50
-    assert np.array_equal(exposure.inputs[100:150, 0], 2e-3 * np.arange(100, 150))
+    assert np.array_equal(exposure.inputs[100:150], RIG.mirror.quantise(2e-3 * np.arange(100, 150)[:, None]))
+    assert not np.array_equal(exposure.inputs[100:150, 0], 2e-3 * np.arange(100, 150))
+
+
+def without_report(source: pb.Applied.Source, first: int, end: int) -> pb.Applied:
+    return pb.Applied(first_step=first, n_steps=end - first, source=source)
+
+
+def test_an_exposure_waits_for_reports_that_were_asked_for_again() -> None:
+    assembler = Assembler(RIG)
+    assembler.add_command(commanded(0, 400))
+    assembler.add_frame(frame_at(0))
+    assembler.add_frame(frame_at(200, frame_id=2))
+    assembler.add_applied(applied(0, 100))
+    assert assembler.add_applied(without_report(pb.Applied.AWAITED, 100, 150)) == []
+    assert assembler.add_applied(applied(150, 400)) == []
+    assert assembler.add_applied(applied(110, 150)) == []
+    first, second = assembler.add_applied(applied(100, 110))
+    assert np.array_equal(first.inputs[:, 0], 1e-3 * np.arange(200))
+    assert first.inputs_assumed == second.inputs_assumed == 0
+
+
+def test_an_exposure_waits_no_longer_when_reports_are_given_up() -> None:
+    assembler = Assembler(RIG)
+    assembler.add_command(commanded(0, 200))
+    assembler.add_frame(frame_at(0))
+    assembler.add_applied(without_report(pb.Applied.AWAITED, 0, 150))
+    assert assembler.add_applied(applied(150, 200)) == []
+    (exposure,) = assembler.add_applied(without_report(pb.Applied.NOT_REPORTED, 0, 150))
+    assert exposure.inputs_assumed == 150
+    assert np.array_equal(exposure.inputs[:150], RIG.mirror.quantise(2e-3 * np.arange(150)[:, None]))
 
 
 def test_a_step_that_nothing_is_known_of_holds_the_last_value() -> None:
@@ -205,7 +237,8 @@ takes = st.tuples(st.integers(0, 12), st.integers(0, 12))
 
 @given(st.lists(st.one_of(runs, takes), max_size=25))
 def test_every_step_has_its_last_report_or_command_or_the_input_before(calls: list[tuple[int, ...]]) -> None:
-    history, applied, commanded = _InputHistory(2, np.zeros(2)), dict[int, float](), dict[int, float]()
+    mirror = replace(RIG.mirror, park=np.zeros(2), dac_bits=0)
+    history, applied, commanded = _InputHistory(mirror), dict[int, float](), dict[int, float]()
     value, last, end = 0.0, 0.0, 0
     for call in calls:
         if len(call) == 3:

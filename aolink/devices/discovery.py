@@ -54,7 +54,7 @@ def identify_port(port: str) -> Found:
             f" exposure {camera.exposure_steps} steps of {identity.fast_step_ns / 1e6:g} ms"
         )
     else:
-        parked = ", parked" if mirror.parked else ""
+        parked = ", parked by its watchdog" if mirror.latched else ", parked" if mirror.parked else ""
         geometry = f"{mirror.n_inputs} inputs, queue of {mirror.queue_steps} steps{parked}"
     return Found(
         port=port,

@@ -28,7 +28,7 @@ class ClockSampled:
 
 @dataclass(frozen=True, slots=True)
 class CommandAnswered:
-    """A command block was acknowledged or refused."""
+    """A command block was acknowledged or refused (``ack.code``)."""
 
     ack: pb.CommandAck
     block: pb.CommandBlock
@@ -70,17 +70,30 @@ class Camera(Device, Protocol):
 
 
 class Mirror(Device, Protocol):
-    """Applies inputs at fast steps."""
+    """Applies inputs at fast steps.
+
+    Its `handle` gives what the mirror held as `Applied`, each fast step exactly once from the first command on: as a
+    report, or as ``NOT_REPORTED`` where none is to be had. ``AWAITED`` comes before either where it is asked for again.
+    """
 
     @property
     def in_flight(self) -> int:
         """Blocks sent and not yet answered."""
 
+    @property
+    def reports_asked(self) -> int:
+        """How often missing reports were asked for again."""
+
     retransmits: int
+    """Blocks sent again."""
     queue_end_step: int
     """First fast step that nothing is queued for on the device, as last heard."""
     round_trip_s: float
     """Of commands, smoothed; NaN before the first."""
+    latched: bool
+    """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
+    outage_s: float
+    """For how long the mirror had taken no command when it said that it is latched, s; 0 at the start of a session."""
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         """Send inputs (n_steps, n_inputs) for the fast steps from ``first_step``; gives the block as sent.
@@ -89,10 +102,22 @@ class Mirror(Device, Protocol):
         """
 
     def next_timeout_ns(self) -> int | None:
-        """When the oldest unanswered block is to be sent again, host clock; None if nothing is in flight."""
+        """When `retransmit` has something to do, host clock; None if nothing is waited for."""
 
-    def retransmit(self, now_ns: int) -> None:
-        """Send again what has timed out. Raises DeviceError after too many tries."""
+    def retransmit(self, now_ns: int) -> list[Event]:
+        """Send again what has timed out, ask for missing reports; gives ``NOT_REPORTED`` for those that are given up.
 
-    def park(self) -> None:
-        """Put the mirror into its safe state and empty its queue. Raises DeviceError."""
+        Raises DeviceError when a command has not been answered for twice the mirror's watchdog.
+        """
+
+    def await_reports(self, end_step: int, now_ns: int) -> list[Event]:
+        """Ask for all reports before ``end_step`` that have not come, as `handle` does where it sees a gap."""
+
+    def park(self) -> int:
+        """Put the mirror into its safe state and empty its queue; gives the first fast step that this holds for.
+
+        Blocks that are not answered are given up. Raises DeviceError if the mirror does not answer.
+        """
+
+    def rearm(self) -> int:
+        """End the latch of the watchdog; gives the first fast step that had not gone by. Otherwise as `park`."""

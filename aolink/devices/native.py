@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import count
 
 import numpy as np
@@ -11,19 +11,25 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
+from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.clock import ClockExchange, ClockRegression
-from aolink.wire.hub import Hub
+from aolink.wire.hub import ANSWER_S, TRIES, Hub
 from aolink.wire.link import Link, Received
 from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
 
 _FIRST_TIMEOUT_S = 0.1
-_MIN_TIMEOUT_S = 0.02
+_MIN_TIMEOUT_S = 0.01
+"""Between two tries of a block, whatever the round trip: a Python host is held up for some ms now and then."""
 _MAX_TIMEOUT_S = 0.5
-_PATIENCE_S = 10.0
-"""A block that is not answered for so long, however often it was sent, means that the mirror is gone."""
+_LATE_TIMEOUTS = 4
+"""A block that is late is sent again every so many time-outs: only its answer is still wanted, for the account."""
+_PATIENCE_WATCHDOGS = 2.0
+"""A mirror that answers nothing for so many times its watchdog has parked itself, and the session ends."""
+_LEAST_TRIES = 5
+"""It is not given up before so many tries: a host that was held up has not read the answers yet."""
 _MAX_QUERIES = 32
 
 
@@ -51,12 +57,13 @@ class _NativeDevice:
         exchange = ClockExchange(sent_ns, reply.device_receive_ns, reply.device_send_ns, receive_ns)
         return [ClockSampled(exchange, usable and self.clock.add(exchange))]
 
-    def _request(self, message: pb.CameraControl | pb.Park, what: str) -> None:
-        ack = self._hub.request(self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence)
+    def _request(self, message: pb.CameraControl | pb.Park | pb.Rearm, what: str, answer_s: float = ANSWER_S) -> pb.Ack:
+        ack = self._hub.request(self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s)
         if ack is None:
             raise DeviceError(f"the {self.link.name} did not answer when told to {what}: is it still connected?")
         if ack.code != pb.OK:
             raise DeviceError(f"the {self.link.name} refused to {what}: {ack.text or pb.Code.Name(ack.code)}")
+        return ack
 
 
 class NativeCamera(_NativeDevice):
@@ -98,26 +105,54 @@ class NativeCamera(_NativeDevice):
 
 @dataclass(slots=True)
 class _Flight:
-    """A block that was sent and is not answered yet."""
+    """A block that was sent and is not answered yet. All times are the host's."""
 
     block: pb.CommandBlock
-    first_sent_ns: int
-    deadline_ns: int
-    tries: int = 1
+    latest_ns: float
+    """A try that is sent later than this may not arrive before the block's first step."""
+    over_ns: float
+    """The end of the block's last step: from then on no try can do anything for it."""
+    heard_ns: int
+    """When the mirror last said something of the block; before that, when it was sent first."""
+    last_ns: int = 0
+    """The last try."""
+    tries: dict[int, int] = field(default_factory=dict)
+    """When each try was sent, by the sequence number of its packet."""
+
+    def due_ns(self, timeout_ns: int) -> int:
+        """When to try again: at every time-out; one more try just before its first step; seldom once it is over."""
+        if self.last_ns >= self.over_ns:
+            return self.last_ns + _LATE_TIMEOUTS * timeout_ns
+        due_ns = self.last_ns + timeout_ns
+        return int(self.latest_ns) if self.last_ns < self.latest_ns < due_ns else due_ns
 
 
 class NativeMirror(_NativeDevice):
-    """A mirror driver on the packet protocol: blocks are acknowledged, and sent again on time-out."""
+    """A mirror driver on the packet protocol.
+
+    Blocks are acknowledged, and sent again on time-out as often as their lead leaves room for. Reports that do not come
+    are asked for again.
+    """
 
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
         super().__init__(hub, link, identity)
         self.retransmits = 0
         self.queue_end_step = 0
+        self.latched = identity.mirror.latched
+        self.outage_s = 0.0
+        self._watchdog_s = identity.mirror.watchdog_s
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
+        self._answered_ns: int | None = None
+        """When the newest block was sent that the mirror has taken."""
+        self._reports = AppliedReports(identity.fast_step_ns, round(self._watchdog_s * 1e9))
         # Smoothed round trip and its mean deviation, as TCP has them (RFC 6298).
         self.round_trip_s = math.nan
         self._deviation_s = math.nan
+
+    @property
+    def reports_asked(self) -> int:
+        return self._reports.asked
 
     @property
     def in_flight(self) -> int:
@@ -143,56 +178,95 @@ class NativeMirror(_NativeDevice):
             u=u.ravel(),
             cause_frame_id=cause_frame_id,
         )
-        self._flights[block.block_id] = _Flight(block, now_ns, now_ns + self._timeout_ns())
-        self.link.send(block)
+        first_ns, over_ns = self._begins_ns(first_step), self._begins_ns(first_step + len(u))
+        flight = _Flight(block, first_ns - self._timeout_ns() / 2, over_ns, now_ns)
+        self._flights[block.block_id] = flight
+        self._reports.begin(first_step)
+        self._send(flight, now_ns)
         return block
 
+    def _begins_ns(self, step: int) -> float:
+        """Host time at which a fast step begins; on virtual time, where the rig waits for its commands, never."""
+        if self._hub.virtual or not self.clock.ready:
+            return math.inf
+        return self.clock.host_ns(self.identity.step_zero_ns + step * self.identity.fast_step_ns)[0]
+
+    def _send(self, flight: _Flight, now_ns: int) -> None:
+        flight.last_ns = now_ns
+        flight.tries[self.link.send(flight.block)] = now_ns
+
     def next_timeout_ns(self) -> int | None:
-        return min((flight.deadline_ns for flight in self._flights.values()), default=None)
+        timeout_ns = self._timeout_ns()
+        due_ns = [flight.due_ns(timeout_ns) for flight in self._flights.values()]
+        if (report_ns := self._reports.next_due_ns(timeout_ns)) is not None:
+            due_ns.append(report_ns)
+        return min(due_ns, default=None)
 
-    def retransmit(self, now_ns: int) -> None:
+    def retransmit(self, now_ns: int) -> list[Event]:
+        timeout_ns = self._timeout_ns()
         for flight in self._flights.values():
-            if flight.deadline_ns > now_ns:
+            if flight.due_ns(timeout_ns) > now_ns:
                 continue
-            if now_ns - flight.first_sent_ns > _PATIENCE_S * 1e9:
+            silent_s = (now_ns - flight.heard_ns) / 1e9
+            if silent_s > _PATIENCE_WATCHDOGS * self._watchdog_s and len(flight.tries) >= _LEAST_TRIES:
                 raise DeviceError(
-                    f"the mirror has not acknowledged a command that was sent {flight.tries} times:"
-                    " is it still connected?"
+                    f"the mirror has not acknowledged a command for {silent_s:.1f} s, more than twice its watchdog,"
+                    f" though it was sent {len(flight.tries)} times: is it still connected?"
+                    " (a mirror that hears nothing parks itself)"
                 )
-            flight.tries += 1
-            backed_off_ns = self._timeout_ns() << min(flight.tries, 4)
-            flight.deadline_ns = now_ns + min(backed_off_ns, round(_MAX_TIMEOUT_S * 1e9))
             self.retransmits += 1
-            self.link.send(flight.block)
+            self._send(flight, now_ns)
+        queries, given_up = self._reports.ask(now_ns, timeout_ns)
+        for query in queries:
+            self.link.send(query)
+        return list(given_up)
 
-    def park(self) -> None:
-        self._request(pb.Park(), "park")
+    def await_reports(self, end_step: int, now_ns: int) -> list[Event]:
+        return list(self._reports.expect_until(end_step, now_ns))
+
+    def park(self) -> int:
+        self._flights.clear()  # a block that came again afterwards would move the mirror
+        return self._request(pb.Park(), "park", self._answer_s()).step
+
+    def rearm(self) -> int:
+        self._flights.clear()  # whoever re-arms sends anew what is still to come
+        step = self._request(pb.Rearm(), "end the latch of its watchdog", self._answer_s()).step
+        self.latched = False
+        return step
+
+    def _answer_s(self) -> float:
+        """How long to wait for an answer, s: the tries together take the watchdog's time. Then it parks by itself."""
+        return min(ANSWER_S, max(self._watchdog_s / TRIES, self._timeout_ns() / 1e9))
 
     def handle(self, received: Received) -> list[Event]:
         message = received.message
         if isinstance(message, pb.CommandAck):
             return self._take_ack(message, received.receive_ns)
+        if isinstance(message, pb.Applied):
+            return list(self._reports.take(message, received.receive_ns))
         if isinstance(message, pb.ClockReply):
             # While something is sent again the line is busy in one direction: such a sample is worth nothing.
-            clean = all(flight.tries == 1 for flight in self._flights.values())
+            clean = all(len(flight.tries) == 1 for flight in self._flights.values())
             return self._sample_clock(message, received.receive_ns, usable=clean)
-        return [message] if isinstance(message, pb.Applied | pb.Event) else []
+        return [message] if isinstance(message, pb.Event) else []
 
     def _take_ack(self, ack: pb.CommandAck, receive_ns: int) -> list[Event]:
         flight = self._flights.get(ack.block_id)
         if flight is None:
             return []
+        sent_ns = flight.tries.get(ack.sequence)
+        if sent_ns is not None:
+            self._measure(max(0, receive_ns - sent_ns) / 1e9)
         if ack.code == pb.QUEUE_FULL:  # not an answer to keep: it is sent again when its time-out comes
+            flight.heard_ns = receive_ns
             return []
         del self._flights[ack.block_id]
         self.queue_end_step = ack.queue_end_step
-        if flight.tries == 1:  # otherwise nobody knows which of them was answered (Karn)
-            self._measure(max(0, receive_ns - flight.first_sent_ns) / 1e9)
-        if ack.code in (pb.OUT_OF_RANGE, pb.WRONG_SHAPE, pb.NOT_SUPPORTED):
-            raise DeviceError(
-                f"the mirror refused command block {ack.block_id} from fast step {flight.block.first_step}:"
-                f" {ack.text or pb.Code.Name(ack.code)}"
-            )
+        if ack.code == pb.LATCHED:
+            self.latched = True
+            self.outage_s = 0.0 if self._answered_ns is None else (receive_ns - self._answered_ns) / 1e9
+        else:
+            self._answered_ns = max(self._answered_ns or 0, flight.last_ns if sent_ns is None else sent_ns)
         return [CommandAnswered(ack, flight.block)]
 
     def _measure(self, round_trip_s: float) -> None:

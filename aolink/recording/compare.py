@@ -291,6 +291,8 @@ def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[_Key, Mess
             frame_id = value
         if frame_id is not None:
             name = str(frame_id)
+        elif isinstance(message, wire.Applied) and message.source == wire.Applied.AWAITED:
+            name = f"report awaited from fast step {message.first_step}"
         elif isinstance(message, wire.CommandBlock | wire.Applied):
             name = f"block {message.block_id} at fast step {message.first_step}"
         else:

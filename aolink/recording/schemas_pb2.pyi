@@ -64,7 +64,7 @@ class ClockSample(_message.Message):
     def __init__(self, device: _Optional[str] = ..., host_send_ns: _Optional[int] = ..., device_receive_ns: _Optional[int] = ..., device_send_ns: _Optional[int] = ..., host_receive_ns: _Optional[int] = ..., round_trip_ns: _Optional[int] = ..., accepted: _Optional[bool] = ..., offset_ns: _Optional[float] = ..., frequency_ppm: _Optional[float] = ..., sigma_ns: _Optional[float] = ...) -> None: ...
 
 class LinkStatistics(_message.Message):
-    __slots__ = ("device", "packets_received", "bytes_received", "packets_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s", "queue_end_step")
+    __slots__ = ("device", "packets_received", "bytes_received", "packets_sent", "bytes_sent", "bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "commands_in_flight", "round_trip_s", "queue_end_step", "reports_asked")
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     PACKETS_RECEIVED_FIELD_NUMBER: _ClassVar[int]
     BYTES_RECEIVED_FIELD_NUMBER: _ClassVar[int]
@@ -79,6 +79,7 @@ class LinkStatistics(_message.Message):
     COMMANDS_IN_FLIGHT_FIELD_NUMBER: _ClassVar[int]
     ROUND_TRIP_S_FIELD_NUMBER: _ClassVar[int]
     QUEUE_END_STEP_FIELD_NUMBER: _ClassVar[int]
+    REPORTS_ASKED_FIELD_NUMBER: _ClassVar[int]
     device: str
     packets_received: int
     bytes_received: int
@@ -93,7 +94,8 @@ class LinkStatistics(_message.Message):
     commands_in_flight: int
     round_trip_s: float
     queue_end_step: int
-    def __init__(self, device: _Optional[str] = ..., packets_received: _Optional[int] = ..., bytes_received: _Optional[int] = ..., packets_sent: _Optional[int] = ..., bytes_sent: _Optional[int] = ..., bad_crc: _Optional[int] = ..., bad_framing: _Optional[int] = ..., bad_payload: _Optional[int] = ..., sequence_gaps: _Optional[int] = ..., duplicates: _Optional[int] = ..., retransmits: _Optional[int] = ..., commands_in_flight: _Optional[int] = ..., round_trip_s: _Optional[float] = ..., queue_end_step: _Optional[int] = ...) -> None: ...
+    reports_asked: int
+    def __init__(self, device: _Optional[str] = ..., packets_received: _Optional[int] = ..., bytes_received: _Optional[int] = ..., packets_sent: _Optional[int] = ..., bytes_sent: _Optional[int] = ..., bad_crc: _Optional[int] = ..., bad_framing: _Optional[int] = ..., bad_payload: _Optional[int] = ..., sequence_gaps: _Optional[int] = ..., duplicates: _Optional[int] = ..., retransmits: _Optional[int] = ..., commands_in_flight: _Optional[int] = ..., round_trip_s: _Optional[float] = ..., queue_end_step: _Optional[int] = ..., reports_asked: _Optional[int] = ...) -> None: ...
 
 class Latency(_message.Message):
     __slots__ = ("frame_id", "exposure_end_ns", "first_byte_ns", "complete_ns", "estimated_ns", "command_sent_ns", "command_acknowledged_ns", "command_applied_ns")

@@ -170,6 +170,7 @@ def record(
                 loop.make_safe()
             except AolinkError as unsafe:
                 report.warnings.append(str(unsafe))
+            loop.close_account()
             if not (stop() and isinstance(error, PortError | DeviceError)):
                 with contextlib.suppress(AolinkError):
                     writer.close(report.counts())

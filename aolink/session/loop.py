@@ -25,6 +25,7 @@ from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import MirrorDriver, Rig
+from aolink.session.account import REFUSALS, Account
 from aolink.session.report import LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.clock import QUERY_PERIOD_S, WARM_UP_QUERIES
@@ -41,6 +42,10 @@ _ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """Real time: how long a frame may take after its exposure's end before it counts as lost."""
+_KEEP_ALIVES = 3
+"""Packets on the mirror's line in the time of its watchdog, at least."""
+_OUTAGE_WATCHDOGS = 2.0
+"""A mirror that was out of reach for more than so many times its watchdog is not told to go on."""
 _NOT_YET = 1 << 63
 """The first fast step of a session that has not begun."""
 
@@ -94,11 +99,16 @@ class SessionLoop:
         self._end_step: int | None = None
         """First fast step after the session; None if it goes on until it is stopped."""
         self._is_safe = False
+        self._parked_from: int | None = None
+        """First fast step of the safe state that `make_safe` asked for."""
+        self._account = Account(self.report)
         self._latencies = LatencyBook(self.report, partial(self._record, topics.LATENCY))
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
         self._warm_up_clocks()
         timing, hub = self._rig.timing, self._hub
+        if self._mirror.latched:
+            self._rearm("in a session before")
         self._first_step = self._queued_until = self._choose_first_step()
         if exposures:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
@@ -123,9 +133,16 @@ class SessionLoop:
             return
         self._is_safe = True
         try:
-            self._mirror.park()
+            self._parked_from = self._mirror.park()
         finally:
             self._camera.stop()
+
+    def close_account(self) -> None:
+        """Nothing more will be heard of the mirror: each commanded step that is still open ends now."""
+        if self._parked_from is not None:
+            self._account.parked_from(self._parked_from)
+        self._account.close()
+        self._count_tries()
 
     def _receive(self, timeout_s: float) -> int:
         """Deal with what comes within ``timeout_s``; gives the number of clock queries that were answered."""
@@ -170,15 +187,19 @@ class SessionLoop:
 
     def _send_due(self) -> float:
         """Send what is due; gives the time until the next thing is, s."""
-        hub, now = self._hub, self._hub.now_ns()
-        timeout_ns = self._mirror.next_timeout_ns()
+        hub = self._hub
+        if self._mirror.latched:
+            self._rearm("in this session")
+        now, timeout_ns = hub.now_ns(), self._mirror.next_timeout_ns()
         if timeout_ns is not None and hub.virtual:  # the rig has dealt with everything, so this one was lost
             hub.elapse_until(timeout_ns)
             now = hub.now_ns()
         if timeout_ns is not None and timeout_ns <= now:
-            self._mirror.retransmit(now)
+            self._take(self._mirror.link, self._mirror.retransmit(now), now)
         if now >= self._next_query_ns:
             self._query_next_clock(now)
+        if not hub.virtual and now >= self._keep_alive_ns():
+            self._mirror.query_clock(now)
         if now >= self._next_link_ns:
             self._record_links(now)
             self._next_link_ns = now + round(_LINK_PERIOD_S * 1e9)
@@ -186,11 +207,31 @@ class SessionLoop:
             self._send_commands(self._device_step())
         if hub.virtual:
             return 0.0
-        ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
-        due = [self._next_query_ns - now, max(ahead, 0) * self._step_ns]
+        due = [self._next_query_ns - now, self._keep_alive_ns() - now]
+        if self._end_step is None or self._queued_until < self._end_step:
+            ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
+            due.append((max(ahead, 0) + 1) * self._step_ns)
         if (timeout_ns := self._mirror.next_timeout_ns()) is not None:
             due.append(timeout_ns - now)
         return max(0, min(due)) / 1e9
+
+    def _keep_alive_ns(self) -> int:
+        """Host time at which the mirror has to hear something, whether there is a command or not."""
+        return self._mirror.link.last_sent_ns + round(self._rig.mirror.watchdog_s * 1e9 / _KEEP_ALIVES)
+
+    def _rearm(self, when: str) -> None:
+        """The watchdog has parked the mirror: tell it to go on, unless it was out of reach for too long."""
+        watchdog_s, outage_s = self._rig.mirror.watchdog_s, self._mirror.outage_s
+        if outage_s > _OUTAGE_WATCHDOGS * watchdog_s:
+            raise DeviceError(
+                f"the mirror was parked by its watchdog: it took no command for {outage_s:.1f} s, more than twice the"
+                f" {watchdog_s:g} s of its watchdog; look why (a slow host, the line), and begin a new session"
+            )
+        step = self._mirror.rearm()
+        self.report.rearmed += 1
+        out = f", {outage_s:.2f} s after its last command" if outage_s else ""
+        self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: told to go on at fast step {step}{out}")
+        self._queued_until = min(self._queued_until, step)  # what was queued is dropped
 
     def _send_commands(self, device_step: int) -> None:
         block_steps, end_step = self._rig.mirror.block_steps, self._end_step
@@ -201,11 +242,11 @@ class SessionLoop:
             u = self._inputs(since_start, n_steps)
             now = self._hub.now_ns()
             block = self._mirror.send_block(self._queued_until, u, self._newest_frame, now)
+            self._account.commanded(block)
             self._assembler.add_command(block)
             self._record(topics.COMMAND, block, now)
             self._latencies.sent(block, self._hub.now_ns())
             self._queued_until += n_steps
-            self.report.steps_commanded += n_steps
 
     def _is_over(self, exposures: int) -> bool:
         if self._hub.virtual:
@@ -224,18 +265,32 @@ class SessionLoop:
 
     def _finish(self, exposures: int) -> None:
         """What is still on its way when the last command has been applied."""
-        now = self._hub.now_ns()
         self._receive(0.0)
+        self._collect_reports()
+        now = self._hub.now_ns()
         self._take(self._camera.link, list(self._camera.flush()), now)
         self._estimate(self._assembler.flush(), now)
         self._show_unseen()
         self._latencies.close(now)
+        self.close_account()
         if exposures and self.report.ended == "complete":
             self.report.frames_lost = exposures - self.report.frames_received
             if self._rig.scene:
                 self.report.scenes_lost = exposures - self.report.scenes_received
         self._record_links(now)
         self._log(Log.INFO, f"session {self.report.ended}: {self.report.exposures} exposures")
+
+    def _collect_reports(self) -> None:
+        """Ask for the reports that have not come, now that the mirror is parked."""
+        end, now = self._queued_until, self._hub.now_ns()
+        end = end if self._parked_from is None else min(end, self._parked_from)
+        self._take(self._mirror.link, self._mirror.await_reports(end, now), now)
+        while (due_ns := self._mirror.next_timeout_ns()) is not None:
+            self._hub.elapse_until(due_ns)
+            now = self._hub.now_ns()
+            if due_ns <= now:
+                self._take(self._mirror.link, self._mirror.retransmit(now), now)
+            self._receive(max(0, due_ns - now) / 1e9)
 
     def _take(self, link: Link, events: Sequence[Event], receive_ns: int) -> None:
         for event in events:
@@ -324,24 +379,27 @@ class SessionLoop:
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._record(topics.APPLIED, applied, receive_ns)
+        if applied.source != wire.Applied.AWAITED:
+            self._account.reported(applied)
         if applied.block_id and not self._hub.virtual:
             first_ns, _ = self._mirror.clock.host_ns(applied.device_ns - applied.n_steps * self._step_ns)
             self._latencies.applied(applied.block_id, first_ns, receive_ns)
         report, end = self.report, applied.first_step + applied.n_steps
         end = end if self._end_step is None else min(end, self._end_step)
         n_steps = max(0, end - max(applied.first_step, self._first_step))  # of this session
-        if applied.source == wire.Applied.PARKED:
+        if applied.source in (wire.Applied.PARKED, wire.Applied.WATCHDOG):
             report.steps_parked += n_steps
-        else:
-            report.steps_applied += n_steps
-        if applied.source == wire.Applied.CLIPPED:
-            report.steps_clipped += n_steps
         self._estimate(self._assembler.add_applied(applied), receive_ns)
 
     def _take_answer(self, answer: CommandAnswered, receive_ns: int) -> None:
-        self.report.steps_late += answer.ack.late_steps
-        self.report.steps_superseded += answer.ack.superseded_steps
-        self._latencies.acknowledged(answer.block.block_id, receive_ns)
+        ack = answer.ack
+        self._account.answered(ack)
+        self._latencies.acknowledged(ack.block_id, receive_ns)
+        if ack.code in REFUSALS and ack.code != wire.LATCHED:
+            raise DeviceError(
+                f"the mirror refused command block {ack.block_id} from fast step {answer.block.first_step}:"
+                f" {ack.text or wire.Code.Name(ack.code)}"
+            )
 
     def _take_clock(self, device: str, sampled: ClockSampled) -> None:
         clock = (self._camera if device == "camera" else self._mirror).clock
@@ -365,7 +423,7 @@ class SessionLoop:
 
     def _record_links(self, now: int) -> None:
         report = self.report
-        report.blocks_retransmitted = self._mirror.retransmits
+        self._count_tries()
         counts = [link.counts for link in self._hub.links]
         report.packets_bad_crc = sum(each.bad_crc for each in counts)
         report.packets_bad_framing = sum(each.bad_framing for each in counts)
@@ -377,10 +435,15 @@ class SessionLoop:
             statistics = pb.LinkStatistics(device=link.name, **asdict(link.counts))
             if link is self._mirror.link:
                 statistics.retransmits = self._mirror.retransmits
+                statistics.reports_asked = self._mirror.reports_asked
                 statistics.commands_in_flight = self._mirror.in_flight
                 statistics.round_trip_s = self._mirror.round_trip_s
                 statistics.queue_end_step = self._mirror.queue_end_step
             self._record(topics.LINK, statistics, now)
+
+    def _count_tries(self) -> None:
+        self.report.blocks_retransmitted = self._mirror.retransmits
+        self.report.reports_asked = self._mirror.reports_asked
 
     def _log(self, level: Log.Level.ValueType, text: str) -> None:
         now = self._hub.now_ns()

@@ -37,13 +37,24 @@ class Report:
     chunks_refused: int = 0
     """Pieces of frames that made no sense."""
     steps_commanded: int = 0
+    """Of every command block; at the end of the session they are the sum of the five that follow."""
     steps_applied: int = 0
-    steps_parked: int = 0
-    """Steps of the session in which the mirror was parked for want of a command."""
-    steps_late: int = 0
     steps_superseded: int = 0
+    """Queued, and replaced by a later command, or dropped when the mirror parked."""
+    steps_late: int = 0
+    """Had gone by when their block came; or the block never got an answer, and something else was applied."""
+    steps_refused: int = 0
+    steps_not_reported: int = 0
+    """Nobody knows what the mirror held: the reports did not come, though they were asked for again."""
     steps_clipped: int = 0
+    """Of the applied ones: changed by the device's own protection."""
+    steps_parked: int = 0
+    """Fast steps of the session in which the mirror held its safe input, whatever became of commands for them."""
     blocks_retransmitted: int = 0
+    reports_asked: int = 0
+    """How often missing reports of the mirror were asked for again."""
+    rearmed: int = 0
+    """How often the mirror was parked by its watchdog and told to go on."""
     clock_offset_ns: float = float("nan")
     clock_frequency_ppm: float = float("nan")
     clock_sigma_ns: float = float("nan")

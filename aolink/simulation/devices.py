@@ -6,9 +6,11 @@ device's side of protocol version 1; a host never imports it, it meets it on the
 
 from __future__ import annotations
 
-from collections import OrderedDict
+import math
+from collections import OrderedDict, deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from google.protobuf.message import Message
@@ -24,6 +26,9 @@ Line = Literal["camera", "mirror"]
 FIRMWARE = "aolink simulated rig 1"
 _LARGEST_PATH = 65_536  # numbers in a truth's path, beyond which single precision must do
 _REMEMBERED_BLOCKS = 256
+_PACKET_INPUTS = 512  # numbers of an `Applied` that is one packet
+_HISTORY_WATCHDOGS = 4  # an outage of two is survived; what was held during it is asked for when it is over
+_HISTORY_INPUTS = 1 << 20  # numbers that are remembered at most, beside one queue
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +38,15 @@ class Outgoing:
     line: Line
     message: Message
     after_step: int | None = None
+
+
+class _Held(NamedTuple):
+    """What the mirror held in one fast step."""
+
+    block_id: int
+    source: pb.Applied.Source
+    u: NDArray[np.float64]
+    """(n_inputs,)"""
 
 
 class SimulatedDevices:
@@ -47,9 +61,15 @@ class SimulatedDevices:
         self._serial_number = f"{rig.digest[:8]}-{rig.simulation.seed if seed is None else seed}"
         self._queue: dict[int, tuple[int, NDArray[np.float64]]] = {}
         self._acks: OrderedDict[int, pb.CommandAck] = OrderedDict()
+        self._history: deque[_Held] = deque(maxlen=history_steps(rig))
         self._reporting = False
         self._camera_start: int | None = None
         self.parked = True
+        """Whether the mirror holds its safe input."""
+        self.armed = False
+        """Whether the watchdog runs: a block was taken, and nothing has parked the mirror for good since."""
+        self.latched = False
+        """Whether the watchdog has parked the mirror and no Rearm has come since."""
 
     @property
     def step(self) -> int:
@@ -95,11 +115,18 @@ class SimulatedDevices:
         if isinstance(message, pb.Identify):
             self._begin_session(line, message.nonce)
         elif isinstance(message, pb.CommandBlock) and line == "mirror":
-            self._say(line, self._take_block(message))
+            ack = pb.CommandAck()
+            ack.CopyFrom(self._take_block(message))
+            ack.sequence = sequence
+            self._say(line, ack)
+        elif isinstance(message, pb.AppliedQuery) and line == "mirror":
+            self._answer_query(message)
         elif isinstance(message, pb.Park) and line == "mirror":
-            self.park()
-            self._reporting = False
-            self._say(line, pb.Ack(sequence=sequence))
+            self._park()
+            self._say(line, pb.Ack(sequence=sequence, step=self.step))
+        elif isinstance(message, pb.Rearm) and line == "mirror":
+            self.latched = False
+            self._say(line, pb.Ack(sequence=sequence, step=self.step))
         elif isinstance(message, pb.CameraControl) and line == "camera":
             self._say(line, self._control_camera(message, sequence))
         else:
@@ -111,22 +138,29 @@ class SimulatedDevices:
         self.outbox = [o for o in self.outbox if o.line != line]
         identity = self._identity(line, nonce)
         if line == "mirror":
-            self.park()
+            self._park()
             self._acks.clear()
-            self._reporting = False
             identity.next_step = self.queue_end
         else:
             self._model.stop_camera()
             self._camera_start = None
         self._say(line, identity)
 
-    def park(self, why: str = "") -> None:
-        """Put the mirror into its safe state and empty the queue."""
+    def _park(self) -> None:
+        """Told to: put the mirror into its safe state, empty the queue, report no more."""
         self._queue.clear()
-        if why and not self.parked:
-            event = pb.Event(level=pb.Event.WARNING, device_ns=self.device_ns(self.step), text=f"mirror parked: {why}")
-            self._say("mirror", event)
-        self.parked = True
+        self.parked, self.armed, self._reporting = True, False, False
+
+    def watchdog_expires(self) -> None:
+        """No valid packet has come on the mirror's line for so long that it parks itself, until it is told to go on."""
+        if not self.armed:
+            return
+        self._queue.clear()
+        self.parked, self.armed, self.latched = True, False, True
+        self._warn(f"mirror parked by its watchdog: no valid packet for {self.rig.mirror.watchdog_s:g} s")
+
+    def _warn(self, text: str) -> None:
+        self._say("mirror", pb.Event(level=pb.Event.WARNING, device_ns=self.device_ns(self.step), text=text))
 
     def advance_to(self, step: int) -> None:
         """Let the plant run until ``step`` is the next one; reports and frames are in the outbox."""
@@ -134,16 +168,19 @@ class SimulatedDevices:
         if step <= first:
             return
         park = self.rig.mirror.park
-        sources, rows = [], np.empty((step - first, self.rig.n_inputs))
+        nothing = pb.Applied.WATCHDOG if self.latched else pb.Applied.PARKED
+        held, rows = [], np.empty((step - first, self.rig.n_inputs))
         for k in range(first, step):
             block_id, rows[k - first] = self._queue.pop(k, (0, park))
-            sources.append(block_id)
+            held.append(_Held(block_id, pb.Applied.COMMAND if block_id else nothing, rows[k - first]))
             if not block_id and not self.parked:
-                self.park("its queue ran empty")
+                self._warn("mirror parked: its queue ran empty")
             self.parked = not block_id
+        self._history.extend(held)
         frames = self._model.advance(rows)
         if self._reporting:
-            self._report(first, sources, rows)
+            for run in self._runs(first, held, self.rig.mirror.block_steps):
+                self._say("mirror", run, run.first_step + run.n_steps - 1)
         for frame in frames:
             self._send_frame(frame)
         self.outbox.sort(key=lambda o: -1 if o.after_step is None else o.after_step)
@@ -194,6 +231,8 @@ class SimulatedDevices:
                     queue_steps=mirror.queue_steps,
                     watchdog_s=mirror.watchdog_s,
                     parked=self.parked,
+                    latched=self.latched,
+                    history_steps=history_steps(self.rig),
                 )
             )
         return identity
@@ -221,6 +260,9 @@ class SimulatedDevices:
         if not ((u >= mirror.input_min) & (u <= mirror.input_max)).all():  # NaN fails as well
             ack.code = pb.OUT_OF_RANGE
             ack.text = "an input is beyond the limits"
+        elif self.latched:
+            ack.code = pb.LATCHED
+            ack.text = "the watchdog has parked the mirror"
         elif end > self.step + mirror.queue_steps:
             ack.code = pb.QUEUE_FULL
             ack.text = f"the queue holds {mirror.queue_steps} steps"
@@ -237,7 +279,7 @@ class SimulatedDevices:
                 ack.superseded_steps += k in self._queue
                 self._queue[k] = (block.block_id, applied[k - block.first_step])
         ack.queue_end_step = self.queue_end
-        self._reporting = True
+        self._reporting = self.armed = True
         return ack
 
     def _control_camera(self, control: pb.CameraControl, sequence: int) -> pb.Ack:
@@ -254,23 +296,37 @@ class SimulatedDevices:
             self._camera_start = control.first_step
         return pb.Ack(sequence=sequence)
 
-    def _report(self, first: int, sources: list[int], rows: NDArray[np.float64]) -> None:
-        """`Applied` for every run of steps of one source."""
-        most = self.rig.mirror.block_steps
+    def _answer_query(self, query: pb.AppliedQuery) -> None:
+        """What the mirror held from a step on, as much of it as one report holds."""
+        first, oldest = query.first_step, self.step - len(self._history)
+        end = min(first + query.n_steps, self.step)
+        if first < min(oldest, end):
+            n_steps = min(end, oldest) - first
+            self._say("mirror", pb.Applied(first_step=first, n_steps=n_steps, source=pb.Applied.NOT_REPORTED))
+        elif first < end:
+            most = max(1, _PACKET_INPUTS // self.rig.n_inputs)
+            held = [self._history[k - oldest] for k in range(first, min(end, first + most))]
+            self._say("mirror", self._runs(first, held, most)[0])
+
+    def _runs(self, first: int, held: Sequence[_Held], most: int) -> list[pb.Applied]:
+        """Reports on the steps from ``first`` on, one for each run of one block and source, ``most`` steps or fewer."""
+        runs = []
         start = 0
-        for k in range(1, len(sources) + 1):
-            if k < len(sources) and sources[k] == sources[start] and k - start < most:
+        for k in range(1, len(held) + 1):
+            if k < len(held) and held[k][:2] == held[start][:2] and k - start < most:
                 continue
-            applied = pb.Applied(
-                block_id=sources[start],
-                first_step=first + start,
-                n_steps=k - start,
-                u=rows[start:k].ravel(),
-                source=pb.Applied.COMMAND if sources[start] else pb.Applied.PARKED,
-                device_ns=self.device_ns(first + k),
+            runs.append(
+                pb.Applied(
+                    block_id=held[start].block_id,
+                    first_step=first + start,
+                    n_steps=k - start,
+                    u=np.concatenate([each.u for each in held[start:k]]),
+                    source=held[start].source,
+                    device_ns=self.device_ns(first + k),
+                )
             )
-            self._say("mirror", applied, first + k - 1)
             start = k
+        return runs
 
     def _send_frame(self, frame: CameraFrame) -> None:
         """The spots' picture, the truth, and last the scene's: the estimators do not wait for that."""
@@ -306,6 +362,12 @@ class SimulatedDevices:
                 plane=plane,
             )
             self._say("camera", picture, last_step)
+
+
+def history_steps(rig: Rig) -> int:
+    """How many fast steps a simulated mirror remembers what it held in."""
+    watchdogs = math.ceil(_HISTORY_WATCHDOGS * rig.mirror.watchdog_s / rig.timing.fast_step_s)
+    return max(rig.mirror.queue_steps, min(watchdogs, _HISTORY_INPUTS // rig.n_inputs))
 
 
 def truth_message(frame_id: int, truth: Truth) -> pb.Truth:

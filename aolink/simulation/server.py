@@ -151,18 +151,23 @@ class FaultInjector:
         # One for each direction: how packets in and packets out take turns is a matter of speed.
         self._incoming, self._outgoing = (np.random.default_rng(each) for each in seed.spawn(2))
 
-    def loses_command(self) -> bool:
-        """Whether a packet from the host is lost."""
-        return _hits(self._incoming, self._faults.command_loss_rate)
+    def loses_command(self, n_bytes: int) -> bool:
+        """Whether a packet of ``n_bytes`` from the host is lost, or so damaged that its checksum is wrong."""
+        damaged = 1 - (1 - self._faults.bit_error_rate) ** (8 * n_bytes)
+        return _hits(self._incoming, self._faults.command_loss_rate) or _hits(self._incoming, damaged)
 
     def damage(self, packet: bytes) -> bytes:
-        """What is left of a packet to the host: nothing, twice it, one with a bit flipped, or itself."""
+        """What is left of a packet to the host: nothing, twice it, one with bits flipped, or itself."""
         if _hits(self._outgoing, self._faults.packet_loss_rate):
             return b""
-        if _hits(self._outgoing, self._faults.bit_flip_rate):
-            bit = int(self._outgoing.integers(8 * (len(packet) - 1)))
+        bits = 8 * (len(packet) - 1)  # not those of the delimiter
+        flips = 1 if _hits(self._outgoing, self._faults.bit_flip_rate) else 0
+        if self._faults.bit_error_rate:
+            flips += int(self._outgoing.binomial(bits, self._faults.bit_error_rate))
+        if flips:
             damaged = bytearray(packet)
-            damaged[bit // 8] ^= 1 << bit % 8
+            for bit in self._outgoing.integers(bits, size=flips):
+                damaged[bit // 8] ^= 1 << bit % 8
             packet = bytes(damaged)
         if _hits(self._outgoing, self._faults.duplicate_rate):
             packet *= 2
@@ -191,7 +196,7 @@ class LineEnd:
             packets = self._decoder.feed(piece)
             for packet in packets:
                 # Who is there is asked in real time, so again on a slow machine: faults begin after it.
-                lost = packet.type != PacketType.IDENTIFY and self._faults.loses_command()
+                lost = packet.type != PacketType.IDENTIFY and self._faults.loses_command(len(piece))
                 received.append((None if lost else self._parse(packet), packet.sequence))
             received.extend([(None, 0)] * (self._decoder.seen - before - len(packets)))
         return received
@@ -233,7 +238,13 @@ class RigServer:
     """Runs the simulated devices behind two lines until told to stop."""
 
     def __init__(
-        self, rig: Rig, streams: dict[Line, Stream], *, seed: int | None = None, real_time: bool = False
+        self,
+        rig: Rig,
+        streams: dict[Line, Stream],
+        *,
+        seed: int | None = None,
+        real_time: bool = False,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         simulation = rig.simulation
         seeds = np.random.SeedSequence(simulation.seed if seed is None else seed).spawn(8)[5:]
@@ -242,38 +253,48 @@ class RigServer:
             for i, (line, stream) in enumerate(streams.items())
         }
         self._latency_rng = np.random.default_rng(seeds[2])
-        self._real_time = real_time
+        self._real_time, self._clock_ns = real_time, clock_ns
         self._latency_ns = round(simulation.latency_s * 1e9)
         self._clock_rate = 1 + simulation.clock_drift_ppm * 1e-6
-        self._start_ns = time.monotonic_ns() if real_time else VIRTUAL_EPOCH_NS
+        self._start_ns = clock_ns() if real_time else VIRTUAL_EPOCH_NS
         self._step_zero_ns = self._start_ns + round(simulation.clock_offset_s * 1e9)
         self._now_ns = self._start_ns  # virtual time
         self._last_valid_ns = self._start_ns
         self._told: dict[Line, int] = {}
         self._watchdog_ns = round(rig.mirror.watchdog_s * 1e9)
         self._step_ns = rig.timing.fast_step_ns
-        self._devices = SimulatedDevices(rig, seed, virtual_time=not real_time, step_zero_ns=self._step_zero_ns)
+        self.devices = SimulatedDevices(rig, seed, virtual_time=not real_time, step_zero_ns=self._step_zero_ns)
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Serve until ``stop()``; it is asked at least twice a second."""
         while not stop():
             self._wait()
-            if self._real_time:
-                self._catch_up(whole_reports=True)
-            for line in self._lines.values():
-                for message, sequence in line.receive():
-                    self._deal_with(line, message, sequence)
-            if self._real_time:
-                self._watch()
-                self._post(self._devices.outbox)
-            for line in self._lines.values():
-                line.flush()
+            self.serve()
+
+    def serve(self) -> None:
+        """Deal with what has come, and with what is due."""
+        if self._real_time:
+            self._catch_up(whole_reports=True)
+        for line in self._lines.values():
+            for message, sequence in line.receive():
+                self._deal_with(line, message, sequence)
+        if self._real_time:
+            self._watch()
+            self._post(self.devices.outbox)
+        for line in self._lines.values():
+            line.flush()
+
+    def idle_s(self) -> float:
+        """How long there is nothing to do if nothing comes, s; at most half a second."""
+        if not self._real_time:
+            return _IDLE_S
+        due_ns = self.devices.device_ns(self.devices.next_report_step()) - self._device_ns()
+        if self.devices.armed:
+            due_ns = min(due_ns, self._last_valid_ns + self._watchdog_ns - self._host_ns())
+        return min(max(due_ns / 1e9, 0.0), _IDLE_S)
 
     def _wait(self) -> None:
-        timeout = _IDLE_S
-        if self._real_time:
-            due_ns = self._devices.device_ns(self._devices.next_report_step()) - self._device_ns()
-            timeout = min(max(due_ns / 1e9, 0.0), _IDLE_S)
+        timeout = self.idle_s()
         with selectors.DefaultSelector() as selector:
             for line in self._lines.values():
                 events = selectors.EVENT_READ | (selectors.EVENT_WRITE if line.unsent else 0)
@@ -281,7 +302,7 @@ class RigServer:
             selector.select(timeout)
 
     def _host_ns(self) -> int:
-        return time.monotonic_ns() if self._real_time else self._now_ns
+        return self._clock_ns() if self._real_time else self._now_ns
 
     def _device_ns(self) -> int:
         return self._step_zero_ns + math.floor((self._host_ns() - self._start_ns) * self._clock_rate)
@@ -291,17 +312,18 @@ class RigServer:
             line.begin_session()
             self._told.pop(line.line, None)
         if message is not None:
-            self._last_valid_ns = self._host_ns()
+            if line.line == "mirror":  # the camera's line may be alive while the mirror's is dead
+                self._last_valid_ns = self._host_ns()
             if isinstance(message, pb.ClockQuery):
                 self._answer_clock(line, message)
             else:
                 if self._real_time:  # what is late is judged by the clock, not by the last report
                     self._catch_up(whole_reports=False)
-                self._devices.handle(line.line, message, sequence)
+                self.devices.handle(line.line, message, sequence)
         if not self._real_time:
-            self._post(self._devices.outbox)
-            self._devices.advance_to(self._devices.ready_end)
-            self._post(self._devices.outbox)
+            self._post(self.devices.outbox)
+            self.devices.advance_to(self.devices.ready_end)
+            self._post(self.devices.outbox)
         line.taken += 1
         if not self._real_time:
             for each in self._lines.values():
@@ -357,15 +379,15 @@ class RigServer:
     def _catch_up(self, *, whole_reports: bool) -> None:
         """Real time: let the plant run to now; with ``whole_reports``, only to the end of a report."""
         now_step = (self._device_ns() - self._step_zero_ns) // self._step_ns
-        while (step := self._devices.next_report_step()) <= now_step:
-            self._devices.advance_to(step)
+        while (step := self.devices.next_report_step()) <= now_step:
+            self.devices.advance_to(step)
         if not whole_reports:
-            self._devices.advance_to(now_step)
+            self.devices.advance_to(now_step)
 
     def _watch(self) -> None:
-        silent_ns = time.monotonic_ns() - self._last_valid_ns
-        if silent_ns > self._watchdog_ns:
-            self._devices.park(f"no valid packet for {self._watchdog_ns / 1e9:g} s")
+        if self.devices.armed and self._host_ns() - self._last_valid_ns >= self._watchdog_ns:
+            self._catch_up(whole_reports=False)
+            self.devices.watchdog_expires()
 
 
 def open_streams(listen: str | None) -> dict[Line, Stream]:

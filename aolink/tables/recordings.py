@@ -19,9 +19,12 @@ from aolink.tables.json import without_nan
 
 _LOSSES = (
     "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
-    "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_clipped", "steps_parked",
+    "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_refused", "steps_not_reported",
+    "steps_clipped", "steps_parked",
 )  # fmt: skip
 """What a session counts of what went wrong."""
+_ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")
+"""Steps that a session commanded, and how they ended: the first is the sum of the others."""
 
 
 def recording_facts(recording: Recording) -> dict[str, Any]:
@@ -40,6 +43,9 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
             if duration_s and count > 1
         },
         "gaps": _gaps(recording),
+        "commands": {
+            end: int(steps) for end in _ENDS if (steps := recording.end_metadata.get(f"steps_{end}", "")).isdigit()
+        },
         "losses": _losses(recording),
         "damaged_parts": [loss.text() for loss in recording.losses],
         "truth": topics.TRUTH in recording.counts,
@@ -87,7 +93,7 @@ def facts(values: Mapping[str, Any]) -> Table:
     table.add_column(overflow="fold")
     flat = {name: value for name, value in values.items() if name != "session"} | values["session"]
     for name, value in flat.items():
-        if name in ("damage", "warnings") and not value:
+        if name in ("damage", "warnings", "commands") and not value:
             continue
         if isinstance(value, Mapping):
             value = ", ".join(f"{key} {count}" for key, count in value.items())

@@ -55,9 +55,15 @@ def session(report: Report) -> Table:
     )
     table.add_row(
         "commands",
-        f"{report.steps_commanded} steps commanded, {report.steps_applied} applied, {report.steps_late} late,"
-        f" {report.steps_superseded} superseded, {report.steps_clipped} clipped, {report.steps_parked} parked;"
-        f" {report.blocks_retransmitted} blocks sent again",
+        f"{report.steps_commanded} steps commanded: {report.steps_applied} applied ({report.steps_clipped} of them"
+        f" clipped), {report.steps_superseded} superseded, {report.steps_late} late, {report.steps_refused} refused,"
+        f" {report.steps_not_reported} not reported",
+    )
+    table.add_row(
+        "mirror",
+        f"parked in {report.steps_parked} steps of the session, {report.rearmed} times told to go on after its watchdog"
+        f" had parked it; {report.blocks_retransmitted} blocks sent again; missing reports asked for"
+        f" {report.reports_asked} times",
     )
     table.add_row(
         "clock",

@@ -22,7 +22,7 @@ LATENCY_STEPS = (
 )
 """Fields of a Latency in the order in which they happen, and their names."""
 
-LINK_COUNTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits")
+LINK_COUNTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "reports_asked")
 """Fields of LinkStatistics that count faults."""
 
 _LEVELS = dict(enumerate(("TRACE", "DEBUG", "INFO", "WARN", "ERROR", "CRITICAL")))
@@ -46,6 +46,8 @@ def log_commands(stream: rr.RecordingStream, timebase: Timebase, blocks: Sequenc
 
 def log_applied(stream: rr.RecordingStream, timebase: Timebase, blocks: Sequence[Any]) -> None:
     """What the mirror held (Applied), at every fast step: ``/mirror/applied``; and why: ``/status/mirror``."""
+    # A report that was asked for again came out of order; what was never reported shows only in the status.
+    blocks = sorted((b for b in blocks if b.source != Applied.AWAITED), key=lambda b: b.first_step)
     if not blocks:
         return
     _send_blocks(stream, "mirror/applied", timebase, blocks, Style("applied", APPLIED, width=3.5, steps=True))
@@ -147,7 +149,7 @@ def _send_blocks(
     stream: rr.RecordingStream, path: str, timebase: Timebase, blocks: Sequence[Any], style: Style
 ) -> None:
     """Send (first_step, n_steps, u) blocks as one value a fast step and input."""
-    blocks = [b for b in blocks if b.n_steps]
+    blocks = [b for b in blocks if len(b.u)]
     if not blocks:
         return
     steps = np.concatenate([np.arange(b.first_step, b.first_step + b.n_steps, dtype=np.int64) for b in blocks])

@@ -80,22 +80,28 @@ class Hub:
         return pending
 
     def request(
-        self, link: Link, request: Message, answers: type[AnyMessage], is_it: Callable[[AnyMessage, int], bool]
+        self,
+        link: Link,
+        request: Message,
+        answers: type[AnyMessage],
+        is_it: Callable[[AnyMessage, int], bool],
+        answer_s: float = ANSWER_S,
     ) -> AnyMessage | None:
         """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
 
-        ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number.
+        ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number. Each of the
+        `TRIES` tries waits for ``answer_s``.
         """
         for attempt in range(TRIES):
             if attempt and self._stop():
                 break
             sequence = link.send(request)
-            deadline = time.monotonic() + ANSWER_S
+            deadline_ns = self.now_ns() + round(answer_s * 1e9)
             while True:
                 kept = self._pending
                 self._pending = []
                 answer = None
-                for source, received in self.wait(deadline - time.monotonic()):
+                for source, received in self.wait((deadline_ns - self.now_ns()) / 1e9):
                     message = received.message
                     if answer is None and source is link and isinstance(message, answers) and is_it(message, sequence):
                         answer = message
@@ -104,7 +110,7 @@ class Hub:
                 self._pending = kept
                 if answer is not None:
                     return answer
-                if self.virtual or time.monotonic() >= deadline:
+                if self.virtual or self.now_ns() >= deadline_ns:
                     break
         return None
 

@@ -57,6 +57,8 @@ class Link:
         """The last `VirtualTime` that came."""
         self.sent_packets = 0
         """Since the last Identify, which is packet 1."""
+        self.last_sent_ns = 0
+        """Host time at which something was sent last."""
         self.before_send: Callable[[], None] = lambda: None
         """Called before anything is sent; the hub keeps the lines in step with it on virtual time."""
         self._now_ns = now_ns
@@ -82,6 +84,7 @@ class Link:
             self.sent_packets += 1
             self.counts.packets_sent += 1
             self.counts.bytes_sent += len(data)
+        self.last_sent_ns = self._now_ns()
         return (self._next_sequence - 1) & 0xFFFF
 
     def receive(self) -> list[Received]:

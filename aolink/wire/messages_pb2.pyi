@@ -15,12 +15,14 @@ class Code(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     QUEUE_FULL: _ClassVar[Code]
     NOT_SUPPORTED: _ClassVar[Code]
     TOO_LATE: _ClassVar[Code]
+    LATCHED: _ClassVar[Code]
 OK: Code
 OUT_OF_RANGE: Code
 WRONG_SHAPE: Code
 QUEUE_FULL: Code
 NOT_SUPPORTED: Code
 TOO_LATE: Code
+LATCHED: Code
 
 class Identify(_message.Message):
     __slots__ = ("nonce",)
@@ -89,7 +91,7 @@ class CameraGeometry(_message.Message):
     def __init__(self, width: _Optional[int] = ..., height: _Optional[int] = ..., bit_depth: _Optional[int] = ..., exposure_steps: _Optional[int] = ..., frame_period_steps: _Optional[int] = ..., scene_width: _Optional[int] = ..., scene_height: _Optional[int] = ..., scene_bit_depth: _Optional[int] = ...) -> None: ...
 
 class MirrorLimits(_message.Message):
-    __slots__ = ("n_inputs", "input_min", "input_max", "park", "dac_bits", "queue_steps", "watchdog_s", "parked")
+    __slots__ = ("n_inputs", "input_min", "input_max", "park", "dac_bits", "queue_steps", "watchdog_s", "parked", "latched", "history_steps")
     N_INPUTS_FIELD_NUMBER: _ClassVar[int]
     INPUT_MIN_FIELD_NUMBER: _ClassVar[int]
     INPUT_MAX_FIELD_NUMBER: _ClassVar[int]
@@ -98,6 +100,8 @@ class MirrorLimits(_message.Message):
     QUEUE_STEPS_FIELD_NUMBER: _ClassVar[int]
     WATCHDOG_S_FIELD_NUMBER: _ClassVar[int]
     PARKED_FIELD_NUMBER: _ClassVar[int]
+    LATCHED_FIELD_NUMBER: _ClassVar[int]
+    HISTORY_STEPS_FIELD_NUMBER: _ClassVar[int]
     n_inputs: int
     input_min: _containers.RepeatedScalarFieldContainer[float]
     input_max: _containers.RepeatedScalarFieldContainer[float]
@@ -106,7 +110,9 @@ class MirrorLimits(_message.Message):
     queue_steps: int
     watchdog_s: float
     parked: bool
-    def __init__(self, n_inputs: _Optional[int] = ..., input_min: _Optional[_Iterable[float]] = ..., input_max: _Optional[_Iterable[float]] = ..., park: _Optional[_Iterable[float]] = ..., dac_bits: _Optional[int] = ..., queue_steps: _Optional[int] = ..., watchdog_s: _Optional[float] = ..., parked: _Optional[bool] = ...) -> None: ...
+    latched: bool
+    history_steps: int
+    def __init__(self, n_inputs: _Optional[int] = ..., input_min: _Optional[_Iterable[float]] = ..., input_max: _Optional[_Iterable[float]] = ..., park: _Optional[_Iterable[float]] = ..., dac_bits: _Optional[int] = ..., queue_steps: _Optional[int] = ..., watchdog_s: _Optional[float] = ..., parked: _Optional[bool] = ..., latched: _Optional[bool] = ..., history_steps: _Optional[int] = ...) -> None: ...
 
 class CommandBlock(_message.Message):
     __slots__ = ("block_id", "first_step", "n_steps", "u", "cause_frame_id")
@@ -123,20 +129,22 @@ class CommandBlock(_message.Message):
     def __init__(self, block_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., u: _Optional[_Iterable[float]] = ..., cause_frame_id: _Optional[int] = ...) -> None: ...
 
 class CommandAck(_message.Message):
-    __slots__ = ("block_id", "code", "text", "late_steps", "superseded_steps", "queue_end_step")
+    __slots__ = ("block_id", "code", "text", "late_steps", "superseded_steps", "queue_end_step", "sequence")
     BLOCK_ID_FIELD_NUMBER: _ClassVar[int]
     CODE_FIELD_NUMBER: _ClassVar[int]
     TEXT_FIELD_NUMBER: _ClassVar[int]
     LATE_STEPS_FIELD_NUMBER: _ClassVar[int]
     SUPERSEDED_STEPS_FIELD_NUMBER: _ClassVar[int]
     QUEUE_END_STEP_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     block_id: int
     code: Code
     text: str
     late_steps: int
     superseded_steps: int
     queue_end_step: int
-    def __init__(self, block_id: _Optional[int] = ..., code: _Optional[_Union[Code, str]] = ..., text: _Optional[str] = ..., late_steps: _Optional[int] = ..., superseded_steps: _Optional[int] = ..., queue_end_step: _Optional[int] = ...) -> None: ...
+    sequence: int
+    def __init__(self, block_id: _Optional[int] = ..., code: _Optional[_Union[Code, str]] = ..., text: _Optional[str] = ..., late_steps: _Optional[int] = ..., superseded_steps: _Optional[int] = ..., queue_end_step: _Optional[int] = ..., sequence: _Optional[int] = ...) -> None: ...
 
 class Applied(_message.Message):
     __slots__ = ("block_id", "first_step", "n_steps", "u", "source", "device_ns")
@@ -145,9 +153,15 @@ class Applied(_message.Message):
         COMMAND: _ClassVar[Applied.Source]
         PARKED: _ClassVar[Applied.Source]
         CLIPPED: _ClassVar[Applied.Source]
+        WATCHDOG: _ClassVar[Applied.Source]
+        NOT_REPORTED: _ClassVar[Applied.Source]
+        AWAITED: _ClassVar[Applied.Source]
     COMMAND: Applied.Source
     PARKED: Applied.Source
     CLIPPED: Applied.Source
+    WATCHDOG: Applied.Source
+    NOT_REPORTED: Applied.Source
+    AWAITED: Applied.Source
     BLOCK_ID_FIELD_NUMBER: _ClassVar[int]
     FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
     N_STEPS_FIELD_NUMBER: _ClassVar[int]
@@ -177,14 +191,16 @@ class Park(_message.Message):
     def __init__(self) -> None: ...
 
 class Ack(_message.Message):
-    __slots__ = ("sequence", "code", "text")
+    __slots__ = ("sequence", "code", "text", "step")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     CODE_FIELD_NUMBER: _ClassVar[int]
     TEXT_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     code: Code
     text: str
-    def __init__(self, sequence: _Optional[int] = ..., code: _Optional[_Union[Code, str]] = ..., text: _Optional[str] = ...) -> None: ...
+    step: int
+    def __init__(self, sequence: _Optional[int] = ..., code: _Optional[_Union[Code, str]] = ..., text: _Optional[str] = ..., step: _Optional[int] = ...) -> None: ...
 
 class FrameChunk(_message.Message):
     __slots__ = ("frame_id", "offset", "total", "width", "height", "first_step", "last_step", "exposure_start_ns", "exposure_end_ns", "data", "exposure_offset_ns", "plane")
@@ -263,6 +279,18 @@ class Part(_message.Message):
     total: int
     data: bytes
     def __init__(self, type: _Optional[int] = ..., offset: _Optional[int] = ..., total: _Optional[int] = ..., data: _Optional[bytes] = ...) -> None: ...
+
+class AppliedQuery(_message.Message):
+    __slots__ = ("first_step", "n_steps")
+    FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
+    N_STEPS_FIELD_NUMBER: _ClassVar[int]
+    first_step: int
+    n_steps: int
+    def __init__(self, first_step: _Optional[int] = ..., n_steps: _Optional[int] = ...) -> None: ...
+
+class Rearm(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
 
 class TruthChunk(_message.Message):
     __slots__ = ("frame_id", "offset", "total", "data")

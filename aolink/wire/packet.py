@@ -52,6 +52,8 @@ class PacketType(IntEnum):
     CLOCK_REPLY = 11
     EVENT = 12
     PART = 13
+    APPLIED_QUERY = 14
+    REARM = 15
     TRUTH_CHUNK = 120
     VIRTUAL_TIME = 121
 
@@ -70,6 +72,8 @@ MESSAGE_OF_TYPE: dict[int, type[Message]] = {
     PacketType.CLOCK_REPLY: pb.ClockReply,
     PacketType.EVENT: pb.Event,
     PacketType.PART: pb.Part,
+    PacketType.APPLIED_QUERY: pb.AppliedQuery,
+    PacketType.REARM: pb.Rearm,
     PacketType.TRUTH_CHUNK: pb.TruthChunk,
     PacketType.VIRTUAL_TIME: pb.VirtualTime,
 }

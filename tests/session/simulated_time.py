@@ -1,0 +1,203 @@
+"""A rig in real time on a clock that is simulated: sessions with latency, cuts and hold-ups, to the nanosecond the same.
+
+Session, protocol and rig are the real ones, bytes and packets too; only the clock and the line between them are not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from aolink.devices.native import NativeCamera, NativeMirror, identify
+from aolink.estimation import Driver
+from aolink.exposure import Exposure
+from aolink.recording.writer import RecordingWriter
+from aolink.rig import Rig
+from aolink.session.loop import Inputs, SessionLoop
+from aolink.session.report import Report
+from aolink.simulation.devices import Line
+from aolink.simulation.server import RigServer
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.hub import Hub
+from aolink.wire.link import Link, Received
+
+_EPOCH_NS = 1_767_225_600_000_000_000
+_TRUTH_STEPS = 1000
+_TURN_NS = 20_000
+"""What the host takes for one turn of its loop."""
+
+
+class Way:
+    """Bytes in one direction."""
+
+    def __init__(self, hub: SimulatedTimeHub) -> None:
+        self._hub = hub
+        self.latency_ns = 500_000
+        self.cut = False
+        """Nothing gets through."""
+        self._bytes: deque[tuple[int, bytes]] = deque()
+
+    def write(self, data: bytes) -> int:
+        if not self.cut:
+            self._bytes.append((self._hub.clock_ns + self.latency_ns, data))
+        return len(data)
+
+    def read(self) -> bytes:
+        data = b""
+        while self._bytes and self._bytes[0][0] <= self._hub.clock_ns:
+            data += self._bytes.popleft()[1]
+        return data
+
+    def next_ns(self) -> float:
+        """When the next bytes come."""
+        return self._bytes[0][0] if self._bytes else math.inf
+
+
+class End:
+    """One end of a line, as a host's transport and as a device's stream."""
+
+    def __init__(self, name: str, incoming: Way, outgoing: Way) -> None:
+        self.name = name
+        self.read = self.read_some = incoming.read
+        self._outgoing = outgoing
+
+    def write(self, data: bytes) -> int:
+        return self._outgoing.write(data)
+
+    def fileno(self) -> int:
+        raise AssertionError("nobody waits on a simulated line")
+
+    def close(self) -> None:
+        pass
+
+
+class SimulatedTimeHub(Hub):
+    """Both ends: the host's hub and the rig's server, on one clock that moves from event to event."""
+
+    def __init__(self, rig: Rig, seed: int | None = None, stop: Callable[[], bool] = lambda: False) -> None:
+        super().__init__(stop)
+        self.clock_ns = 0
+        self.at: list[tuple[int, Callable[[], object]]] = []
+        """What is to happen when, on the clock."""
+        self.held: dict[int, tuple[int, int]] = {}
+        """What the mirror really held: the command's block and the source, by fast step."""
+        names: tuple[Line, Line] = ("camera", "mirror")
+        self.to_device, self.to_host = ({name: Way(self) for name in names} for _ in range(2))
+        streams = {name: End(name, self.to_device[name], self.to_host[name]) for name in names}
+        self.server = RigServer(rig, streams, seed=seed, real_time=True, clock_ns=lambda: self.clock_ns)  # type: ignore[arg-type] # an End is a Stream
+        for name in names:
+            self.links.append(Link(name, End(name, self.to_host[name], self.to_device[name]), self.now_ns))
+
+    def now_ns(self) -> int:
+        return _EPOCH_NS + self.clock_ns
+
+    def cut(self, *, to_device: bool = True, to_host: bool = True) -> None:
+        """Cut or mend the mirror's line."""
+        self.to_device["mirror"].cut, self.to_host["mirror"].cut = to_device, to_host
+
+    def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
+        pending, self._pending = self._pending, []
+        self.clock_ns += _TURN_NS
+        end_ns = self.clock_ns + math.ceil(max(0.0, min(timeout_s, 0.1)) * 1e9)
+        while True:
+            self._serve()
+            pending += [(link, received) for link in self.links for received in link.receive()]
+            if pending or self.clock_ns >= end_ns:
+                return pending
+            self._move(end_ns)
+
+    def hold_up(self, seconds: float) -> None:
+        """The host does nothing for a while; the rig goes on."""
+        end_ns = self.clock_ns + round(seconds * 1e9)
+        while self.clock_ns < end_ns:
+            self._serve()
+            self._move(end_ns)
+
+    def truth(self) -> dict[int, tuple[int, int]]:
+        """`held`, up to now."""
+        devices, step = self.server.devices, len(self.held)
+        while step < devices.step:
+            devices.handle("mirror", pb.AppliedQuery(first_step=step, n_steps=devices.step - step), 0)
+            answer = devices.outbox.pop().message
+            assert isinstance(answer, pb.Applied)
+            assert answer.source != pb.Applied.NOT_REPORTED
+            for _ in range(answer.n_steps):
+                self.held[step] = (answer.block_id, answer.source)
+                step += 1
+        return self.held
+
+    def _serve(self) -> None:
+        while self.at and self.at[0][0] <= self.clock_ns:
+            self.at.pop(0)[1]()
+        self.server.serve()
+        if self.server.devices.step - len(self.held) > _TRUTH_STEPS:
+            self.truth()
+
+    def _move(self, end_ns: int) -> None:
+        """On to the next event, but not beyond ``end_ns``."""
+        ways = [*self.to_device.values(), *self.to_host.values()]
+        due_ns = min(
+            self.clock_ns + math.ceil(self.server.idle_s() * 1e9),
+            *(way.next_ns() for way in ways),
+            self.at[0][0] if self.at else math.inf,
+            end_ns,
+        )
+        self.clock_ns = max(self.clock_ns + 1000, int(due_ns))
+
+
+@dataclass
+class Run:
+    """A session on simulated time."""
+
+    hub: SimulatedTimeHub
+    loop: SessionLoop
+    mirror: NativeMirror
+    path: Path
+    exposures: list[Exposure]
+    """As they were made live."""
+    first_step: int = -1
+    """Of the session."""
+    error: Exception | None = None
+
+    @property
+    def report(self) -> Report:
+        return self.loop.report
+
+
+def run_session(
+    hub: SimulatedTimeHub,
+    rig: Rig,
+    path: Path,
+    exposures: int,
+    *,
+    inputs: Inputs | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[int], None] = lambda exposures: None,
+) -> Run:
+    """A session from Identify to the end of its account, as `aolink.session.record` makes it; errors are kept."""
+    live: list[Exposure] = []
+    camera_link, mirror_link = hub.links
+    camera = NativeCamera(hub, camera_link, identify(hub, camera_link, 1))
+    mirror = NativeMirror(hub, mirror_link, identify(hub, mirror_link, 2))
+    for link in hub.links:
+        link.reset_counts()
+    with RecordingWriter(path, rig, {}, hub.now_ns(), deterministic=True) as writer:
+        loop = SessionLoop(
+            rig, hub, camera, mirror, writer, Driver(rig, []), inputs, lambda exposure, _: live.append(exposure)
+        )
+        run = Run(hub, loop, mirror, path, live)
+        try:
+            loop.run(exposures, stop, progress)
+        except Exception as error:
+            run.error = error
+            try:
+                loop.make_safe()
+            except Exception as unsafe:
+                loop.report.warnings.append(str(unsafe))
+            loop.close_account()
+        writer.close(loop.report.counts())
+    hub.truth()
+    return run
