@@ -14,7 +14,7 @@ from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.errors import DeviceError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.clock import ClockExchange, ClockRegression
+from aolink.wire.clock import ClockExchange, ClockRegression, StepClock
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link, Received
 from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
@@ -33,6 +33,7 @@ class _NativeDevice:
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
         self.link, self.identity = link, identity
         self.clock = ClockRegression()
+        self.steps = StepClock(self.clock, identity.step_zero_ns, identity.fast_step_ns)
         self._hub = hub
         self._query_ids = count(1)
         self._queries: dict[int, int] = {}
@@ -49,7 +50,9 @@ class _NativeDevice:
         if sent_ns is None or sent_ns != reply.host_send_ns:
             return []
         exchange = ClockExchange(sent_ns, reply.device_receive_ns, reply.device_send_ns, receive_ns)
-        return [ClockSampled(exchange, usable and self.clock.add(exchange))]
+        before = self.clock.step
+        accepted = usable and self.clock.add(exchange)
+        return [ClockSampled(exchange, accepted, self.clock.step if self.clock.step is not before else None)]
 
     def _request(self, message: pb.CameraControl | pb.Park, what: str) -> None:
         ack = self._hub.request(self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence)
