@@ -59,7 +59,13 @@ def rig(
     ] = False,
     real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not with the commands.")] = False,
     seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
-    listen: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports, not terminals.")] = None,
+    listen: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports of this machine, not terminals.")
+    ] = None,
+    allow_remote: Annotated[
+        bool,
+        typer.Option("--allow-remote", help="Let --listen take an address that other machines can reach."),
+    ] = False,
     light: Annotated[
         str | None,
         typer.Option(
@@ -80,9 +86,10 @@ def rig(
     loaded = load_checked(rig)
     if light is not None:
         loaded = replace(loaded, simulation=replace(loaded.simulation, light=parse_light(light, "--light")))
-    from aolink.simulation.server import RigServer, open_streams
+    from aolink.simulation.server import RigServer
+    from aolink.simulation.streams import open_streams
 
-    streams = open_streams(listen)
+    streams = open_streams(listen, allow_remote=allow_remote)
     with StopRequest().installed() as stop:
         server = RigServer(loaded, streams, seed=seed, real_time=real_time)
         ports = {line: stream.name for line, stream in streams.items()}

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.clock import ClockExchange, ClockRegression
+from aolink.wire.clock import ClockExchange, ClockRegression, ClockStep, StepClock
 from aolink.wire.link import Link, Received
 
 
@@ -24,6 +24,8 @@ class ClockSampled:
 
     exchange: ClockExchange
     accepted: bool
+    step: ClockStep | None = None
+    """The step of the device's clock that is certain with this answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +46,8 @@ class Device(Protocol):
     link: Link
     identity: pb.Identity
     clock: ClockRegression
+    steps: StepClock
+    """The same clock beside the device's count of fast steps: for times of what carries both."""
 
     def handle(self, received: Received) -> list[Event]:
         """What a message from the device means."""

@@ -15,7 +15,7 @@ from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.clock import ClockExchange, ClockRegression
+from aolink.wire.clock import ClockExchange, ClockRegression, StepClock
 from aolink.wire.hub import ANSWER_S, TRIES, Hub
 from aolink.wire.link import Link, Received
 from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
@@ -39,6 +39,7 @@ class _NativeDevice:
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
         self.link, self.identity = link, identity
         self.clock = ClockRegression()
+        self.steps = StepClock(self.clock, identity.step_zero_ns, identity.fast_step_ns)
         self._hub = hub
         self._query_ids = count(1)
         self._queries: dict[int, int] = {}
@@ -55,7 +56,9 @@ class _NativeDevice:
         if sent_ns is None or sent_ns != reply.host_send_ns:
             return []
         exchange = ClockExchange(sent_ns, reply.device_receive_ns, reply.device_send_ns, receive_ns)
-        return [ClockSampled(exchange, usable and self.clock.add(exchange))]
+        before = self.clock.step
+        accepted = usable and self.clock.add(exchange)
+        return [ClockSampled(exchange, accepted, self.clock.step if self.clock.step is not before else None)]
 
     def _request(self, message: pb.CameraControl | pb.Park | pb.Rearm, what: str, answer_s: float = ANSWER_S) -> pb.Ack:
         ack = self._hub.request(self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s)
@@ -189,7 +192,7 @@ class NativeMirror(_NativeDevice):
         """Host time at which a fast step begins; on virtual time, where the rig waits for its commands, never."""
         if self._hub.virtual or not self.clock.ready:
             return math.inf
-        return self.clock.host_ns(self.identity.step_zero_ns + step * self.identity.fast_step_ns)[0]
+        return self.clock.host_ns(self.steps.step_zero_ns + step * self.identity.fast_step_ns)[0]
 
     def _send(self, flight: _Flight, now_ns: int) -> None:
         flight.last_ns = now_ns

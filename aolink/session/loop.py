@@ -28,7 +28,7 @@ from aolink.rig import MirrorDriver, Rig
 from aolink.session.account import REFUSALS, Account
 from aolink.session.report import LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
-from aolink.wire.clock import QUERY_PERIOD_S, WARM_UP_QUERIES
+from aolink.wire.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
 
@@ -94,7 +94,7 @@ class SessionLoop:
         self._newest_frame = 0
         self._asked: Camera | Mirror = camera
         """Whose clock is asked next."""
-        self._next_query_ns = self._next_link_ns = 0
+        self._last_query_ns = self._next_link_ns = 0
         self._last_frame_ns = 0
         self._end_step: int | None = None
         """First fast step after the session; None if it goes on until it is stopped."""
@@ -171,7 +171,12 @@ class SessionLoop:
         """Camera and mirror in turn, so that the one's query does not wait for the other's."""
         self._asked, asked = (self._mirror if self._asked is self._camera else self._camera), self._asked
         asked.query_clock(now)
-        self._next_query_ns = now + round(QUERY_PERIOD_S / 2 * 1e9)
+        self._last_query_ns = now
+
+    def _next_query_ns(self) -> int:
+        """When to ask one of the two clocks again: soon where one may have been set, so that it is settled soon."""
+        suspected = self._camera.clock.suspected or self._mirror.clock.suspected
+        return self._last_query_ns + round((SUSPICION_PERIOD_S if suspected else QUERY_PERIOD_S) / 2 * 1e9)
 
     def _choose_first_step(self) -> int:
         if self._hub.virtual:
@@ -183,7 +188,7 @@ class SessionLoop:
         if self._hub.virtual:
             return self._queued_until
         device_ns, _ = self._mirror.clock.device_ns(self._hub.now_ns())
-        return (device_ns - self._mirror.identity.step_zero_ns) // self._step_ns
+        return (device_ns - self._mirror.steps.step_zero_ns) // self._step_ns
 
     def _send_due(self) -> float:
         """Send what is due; gives the time until the next thing is, s."""
@@ -196,7 +201,7 @@ class SessionLoop:
             now = hub.now_ns()
         if timeout_ns is not None and timeout_ns <= now:
             self._take(self._mirror.link, self._mirror.retransmit(now), now)
-        if now >= self._next_query_ns:
+        if now >= self._next_query_ns():
             self._query_next_clock(now)
         if not hub.virtual and now >= self._keep_alive_ns():
             self._mirror.query_clock(now)
@@ -207,7 +212,7 @@ class SessionLoop:
             self._send_commands(self._device_step())
         if hub.virtual:
             return 0.0
-        due = [self._next_query_ns - now, self._keep_alive_ns() - now]
+        due = [self._next_query_ns() - now, self._keep_alive_ns() - now]
         if self._end_step is None or self._queued_until < self._end_step:
             ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
             due.append((max(ahead, 0) + 1) * self._step_ns)
@@ -360,7 +365,10 @@ class SessionLoop:
 
     def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
         """Record a picture and what is known about it; gives it with the host's time of its start."""
-        host_start_ns, sigma_ns = self._camera.clock.host_ns(frame.device_start_ns)
+        since_zero_ns, clock = frame.first_step * self._step_ns + frame.exposure_offset_ns, self._camera.steps
+        length_ns = (frame.last_step + 1 - frame.first_step) * self._step_ns
+        clock.host_ns(frame.device_end_ns, since_zero_ns + length_ns, receive_ns)  # may raise the doubt about the start
+        host_start_ns, sigma_ns = clock.host_ns(frame.device_start_ns, since_zero_ns, receive_ns)
         frame = replace(frame, host_start_ns=host_start_ns, clock_sigma_ns=sigma_ns)
         info, image = convert.frame_messages(frame)
         self._record(exposure_topic, info, receive_ns)
@@ -381,9 +389,12 @@ class SessionLoop:
         self._record(topics.APPLIED, applied, receive_ns)
         if applied.source != wire.Applied.AWAITED:
             self._account.reported(applied)
-        if applied.block_id and not self._hub.virtual:
-            first_ns, _ = self._mirror.clock.host_ns(applied.device_ns - applied.n_steps * self._step_ns)
-            self._latencies.applied(applied.block_id, first_ns, receive_ns)
+        is_report = applied.source not in (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
+        if is_report and applied.first_step >= self._first_step:  # not before the clock is known
+            since_zero_ns = (applied.first_step + applied.n_steps) * self._step_ns
+            end_ns, _ = self._mirror.steps.host_ns(applied.device_ns, since_zero_ns, receive_ns)
+            if applied.block_id and not self._hub.virtual:
+                self._latencies.applied(applied.block_id, end_ns - applied.n_steps * self._step_ns, receive_ns)
         report, end = self.report, applied.first_step + applied.n_steps
         end = end if self._end_step is None else min(end, self._end_step)
         n_steps = max(0, end - max(applied.first_step, self._first_step))  # of this session
@@ -420,6 +431,14 @@ class SessionLoop:
             report.clock_offset_ns, report.clock_frequency_ppm = sample.offset_ns, sample.frequency_ppm
             report.clock_sigma_ns = sigma_ns
         self._record(topics.CLOCK, sample, exchange.host_receive_ns)
+        if sampled.step is not None:
+            size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
+            warning = (
+                f"the {device}'s clock was set {'forward' if size_s > 0 else 'back'} by {abs(size_s):.6f} s: host times"
+                f" of what it stamped in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
+            )
+            report.warnings.append(warning)
+            self._log(Log.WARNING, warning)
 
     def _record_links(self, now: int) -> None:
         report = self.report

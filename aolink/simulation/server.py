@@ -7,24 +7,17 @@ commands drive time, and the same seed gives the same bytes however fast the hos
 
 from __future__ import annotations
 
-import contextlib
-import errno
 import math
-import os
-import pty
 import selectors
-import socket
 import time
-import tty
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from google.protobuf.message import DecodeError, Message
 
-from aolink.errors import PortError
 from aolink.rig import Faults, Rig
 from aolink.simulation.devices import Line, Outgoing, SimulatedDevices
+from aolink.simulation.streams import Stream
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import (
     DELIMITER,
@@ -44,103 +37,6 @@ _IDLE_S = 0.5
 """Longest sleep in real time: the plant is never further behind than this."""
 _UNREAD_LIMIT = 16 << 20
 """Bytes that wait for a host that does not read; in real time, what is beyond it is dropped."""
-
-
-class Stream(Protocol):
-    """The device's end of a port."""
-
-    name: str
-
-    def fileno(self) -> int: ...
-    def read(self) -> bytes: ...
-    def write(self, data: bytes) -> int: ...
-    def close(self) -> None: ...
-
-
-class PtyStream:
-    """A pseudo terminal; ``name`` is the path that the host opens."""
-
-    def __init__(self) -> None:
-        self._master, self._slave = pty.openpty()  # the slave is kept open: hosts may come and go
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.name = os.ttyname(self._slave)
-
-    def fileno(self) -> int:
-        return self._master
-
-    def read(self) -> bytes:
-        with contextlib.suppress(BlockingIOError):
-            return os.read(self._master, 65_536)
-        return b""
-
-    def write(self, data: bytes) -> int:
-        with contextlib.suppress(BlockingIOError):
-            return os.write(self._master, data)
-        return 0
-
-    def close(self) -> None:
-        os.close(self._master)
-        os.close(self._slave)
-
-
-class TcpStream:
-    """A TCP port that serves one host at a time; ``name`` is the address for pyserial."""
-
-    def __init__(self, host: str, port: int) -> None:
-        try:
-            self._listener = socket.create_server((host, port))
-        except OSError as error:
-            raise PortError(f"cannot listen on {host}:{port}: {error.strerror}; give another --listen") from None
-        self._listener.setblocking(False)
-        self._peer: socket.socket | None = None
-        self.name = f"socket://{host}:{self._listener.getsockname()[1]}"
-
-    def fileno(self) -> int:
-        return (self._peer or self._listener).fileno()
-
-    def read(self) -> bytes:
-        with contextlib.suppress(BlockingIOError):
-            peer, _ = self._listener.accept()
-            if self._peer is not None:  # busy: say so at once
-                peer.close()
-            else:
-                self._peer = peer
-                self._peer.setblocking(False)
-                self._peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        if self._peer is None:
-            return b""
-        with contextlib.suppress(BlockingIOError):
-            try:
-                data = self._peer.recv(65_536)
-            except ConnectionError:
-                data = b""
-            if not data:
-                self._hang_up()
-            return data
-        return b""
-
-    def write(self, data: bytes) -> int:
-        if self._peer is None:
-            return len(data)  # nobody there to read it
-        try:
-            return self._peer.send(data)
-        except BlockingIOError:
-            return 0
-        except OSError as error:
-            if error.errno not in (errno.EPIPE, errno.ECONNRESET):
-                raise
-            self._hang_up()
-            return len(data)
-
-    def _hang_up(self) -> None:
-        if self._peer is not None:
-            self._peer.close()
-            self._peer = None
-
-    def close(self) -> None:
-        self._hang_up()
-        self._listener.close()
 
 
 class FaultInjector:
@@ -388,17 +284,6 @@ class RigServer:
         if self.devices.armed and self._host_ns() - self._last_valid_ns >= self._watchdog_ns:
             self._catch_up(whole_reports=False)
             self.devices.watchdog_expires()
-
-
-def open_streams(listen: str | None) -> dict[Line, Stream]:
-    """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any)."""
-    if listen is None:
-        return {"camera": PtyStream(), "mirror": PtyStream()}
-    host, _, port = listen.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65_534:
-        raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")
-    number = int(port)
-    return {"camera": TcpStream(host, number), "mirror": TcpStream(host, number + 1 if number else 0)}
 
 
 def _hits(rng: np.random.Generator, rate: float) -> bool:

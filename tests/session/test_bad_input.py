@@ -32,7 +32,7 @@ from aolink.rig import load_rig
 from aolink.session import open_devices, record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet, schema_hash
-from aolink.wire.port import SerialPort
+from aolink.wire.port import SerialPort, wait_readable
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -393,6 +393,8 @@ def test_a_port_that_cannot_be_waited_on(aolink: Run) -> None:
 def test_a_tcp_port_that_another_host_has(aolink: Run) -> None:
     with simulated_rig("section-vi", "--listen", "127.0.0.1:0") as (camera, _):
         held = SerialPort(camera)
+        held.write(encode_message(pb.Identify(nonce=1), 0))
+        wait_readable([held], 20.0)
         result = aolink("devices", camera)
         held.close()
     assert result.returncode in (3, 4)

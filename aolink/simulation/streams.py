@@ -1,0 +1,225 @@
+"""The device's ends of ports: pseudo terminals and TCP ports.
+
+A serial line is one wire to one host, and what is no packet on it is noise. A TCP port can be reached by every
+program of the machine, a web page in a browser among them, which may send bytes of its choice inside a request. So
+whoever connects must begin with an Identify packet, from the very first byte: no browser sends one in the place of
+"POST /". Nothing that comes before that is looked at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import ipaddress
+import os
+import pty
+import socket
+import time
+import tty
+from typing import Protocol
+
+from google.protobuf.message import DecodeError
+
+from aolink.errors import PortError
+from aolink.simulation.devices import Line
+from aolink.wire.packet import DELIMITER, PROTOCOL_VERSION, MessageDecoder, PacketDecoder, PacketType
+
+INTRODUCTION_S = 2.0
+"""Whoever connects and has not sent an Identify packet by then is dropped."""
+IDLE_S = 10.0
+"""A host that has sent nothing for so long gives way to the next one that identifies itself."""
+_MOST_GUESTS = 16
+"""Connections that may be waiting to identify themselves; beyond that, the oldest is dropped."""
+_MOST_INTRODUCTION = 64
+"""Bytes of an encoded Identify packet, and more than it can have."""
+
+
+class Stream(Protocol):
+    """The device's end of a port."""
+
+    name: str
+
+    def fileno(self) -> int: ...
+    def read(self) -> bytes: ...
+    def write(self, data: bytes) -> int: ...
+    def close(self) -> None: ...
+
+
+class PtyStream:
+    """A pseudo terminal; ``name`` is the path that the host opens."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = pty.openpty()  # the slave is kept open: hosts may come and go
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.name = os.ttyname(self._slave)
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes:
+        with contextlib.suppress(BlockingIOError):
+            return os.read(self._master, 65_536)
+        return b""
+
+    def write(self, data: bytes) -> int:
+        with contextlib.suppress(BlockingIOError):
+            return os.write(self._master, data)
+        return 0
+
+    def close(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+
+
+class _Peer:
+    """A TCP connection, and when something last came over it."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.since_s = self.heard_s = time.monotonic()
+        self.introduction = b""
+        """What has come before it has identified itself."""
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def receive(self) -> bytes | None:
+        """What has come; None once the connection is over."""
+        try:
+            data = self.connection.recv(65_536)
+        except BlockingIOError:
+            return b""
+        except OSError:
+            return None
+        if not data:
+            return None
+        self.heard_s = time.monotonic()
+        return data
+
+
+class TcpStream:
+    """A TCP port that serves one host at a time; ``name`` is the address for pyserial.
+
+    A connection that begins with anything but an Identify packet is closed at once, and one that has sent nothing is
+    closed after `INTRODUCTION_S`. A host that has identified itself keeps the port until it leaves; once it has been
+    silent for `IDLE_S`, the next host that identifies itself takes its place.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        try:
+            self._listener = socket.create_server((host, port), family=family)
+        except OSError as error:
+            raise PortError(f"cannot listen on {host}:{port}: {error.strerror}; give another --listen") from None
+        self._listener.setblocking(False)
+        self._peer: _Peer | None = None
+        self._guests: list[_Peer] = []
+        """Connections that have not identified themselves yet, oldest first."""
+        shown = f"[{host}]" if family == socket.AF_INET6 else host
+        self.name = f"socket://{shown}:{self._listener.getsockname()[1]}"
+
+    def fileno(self) -> int:
+        waiting = [self._peer] if self._peer else self._guests[-1:]
+        return (waiting[0].connection if waiting else self._listener).fileno()
+
+    def read(self) -> bytes:
+        if (introduction := self._admit()) is not None:
+            # Whatever the host before had begun to send ends here.
+            return DELIMITER + introduction
+        if self._peer is None:
+            return b""
+        data = self._peer.receive()
+        if data is None:
+            self._hang_up()
+        return data or b""
+
+    def write(self, data: bytes) -> int:
+        if self._peer is None:
+            return len(data)  # nobody there to read it
+        try:
+            return self._peer.connection.send(data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            if error.errno not in (errno.EPIPE, errno.ECONNRESET):
+                raise
+            self._hang_up()
+            return len(data)
+
+    def _admit(self) -> bytes | None:
+        """Look at those who want to be served; gives what a new host has sent, from its Identify packet on."""
+        with contextlib.suppress(BlockingIOError):
+            self._guests.append(_Peer(self._listener.accept()[0]))
+        guests, self._guests = self._guests, []
+        admitted = None
+        for guest in guests:
+            data = guest.receive()
+            guest.introduction += data or b""
+            begun = _begins_with_identify(guest.introduction)
+            if begun is None and data is not None and time.monotonic() - guest.since_s < INTRODUCTION_S:
+                self._guests.append(guest)
+            elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < IDLE_S):
+                self._hang_up()
+                self._peer, admitted = guest, guest.introduction
+            else:
+                guest.connection.close()
+        while len(self._guests) > _MOST_GUESTS:
+            self._guests.pop(0).connection.close()
+        return admitted
+
+    def _hang_up(self) -> None:
+        if self._peer is not None:
+            self._peer.connection.close()
+            self._peer = None
+
+    def close(self) -> None:
+        self._hang_up()
+        for guest in self._guests:
+            guest.connection.close()
+        self._listener.close()
+
+
+def _begins_with_identify(data: bytes) -> bool | None:
+    """Whether bytes begin with a whole Identify packet; None while that cannot be known yet."""
+    piece, end, _ = data.partition(DELIMITER)
+    if not end:
+        return False if len(data) > _MOST_INTRODUCTION else None
+    packets = PacketDecoder().feed(piece + end)
+    if not packets or packets[0].version != PROTOCOL_VERSION or packets[0].type != PacketType.IDENTIFY:
+        return False
+    try:
+        MessageDecoder().take(packets[0])
+    except DecodeError:
+        return False
+    return True
+
+
+def open_streams(listen: str | None, *, allow_remote: bool = False) -> dict[Line, Stream]:
+    """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any).
+
+    Raises
+    ------
+    PortError
+        The address cannot be listened on, or other machines could reach it and ``allow_remote`` is not given.
+    """
+    if listen is None:
+        return {"camera": PtyStream(), "mirror": PtyStream()}
+    host, _, port = listen.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65_534:
+        raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")
+    number, address = int(port), _address(host, listen)
+    if not (allow_remote or ipaddress.ip_address(address).is_loopback):
+        raise PortError(
+            f"--listen {listen} lets other machines move the mirror, for a rig asks nobody for a password:"
+            f" give 127.0.0.1:{port}, or add --allow-remote if that is what you want"
+        )
+    return {"camera": TcpStream(address, number), "mirror": TcpStream(address, number + 1 if number else 0)}
+
+
+def _address(host: str, listen: str) -> str:
+    """The address of a host, looked up once: what was checked is what is listened on."""
+    try:
+        found = socket.getaddrinfo(host.removeprefix("[").removesuffix("]"), None, type=socket.SOCK_STREAM)
+    except OSError as error:
+        raise PortError(f"--listen {listen}: there is no host {host} ({error.strerror})") from None
+    return str(found[0][4][0])

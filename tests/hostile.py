@@ -1,0 +1,103 @@
+"""A device that lies: the simulated rig's own bytes on a real port, with chosen messages changed on their way out."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import threading
+from collections.abc import Callable, Iterator
+
+from google.protobuf.message import Message
+
+from aolink.rig import Rig
+from aolink.simulation.devices import Line
+from aolink.simulation.server import RigServer
+from aolink.simulation.streams import PtyStream, Stream
+from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
+
+Lie = Callable[[Message], Message | list[Message] | bytes | None]
+"""What is sent in the place of a message: itself or another, several, bytes as they are, or None for nothing."""
+
+
+class LyingStream:
+    """The device's end of a pseudo terminal. Whatever the rig writes is decoded, changed and encoded again."""
+
+    def __init__(self, lie: Lie) -> None:
+        self._pty: Stream = PtyStream()
+        self._lie = lie
+        self._packets, self._messages = PacketDecoder(), MessageDecoder()
+        self._sequence = 0
+        self.closing = threading.Event()
+        self.name = self._pty.name
+
+    def fileno(self) -> int:
+        return self._pty.fileno()
+
+    def read(self) -> bytes:
+        return self._pty.read()
+
+    def write(self, data: bytes) -> int:
+        for packet in self._packets.feed(data):
+            message = self._messages.take(packet)
+            if message is not None:
+                said = self._lie(message)
+                for each in said if isinstance(said, list) else [said]:
+                    self._send(each)
+        return len(data)
+
+    def _send(self, said: Message | bytes | None) -> None:
+        if said is None:
+            return
+        if isinstance(said, Message):
+            data = encode_message(said, self._sequence)
+            self._sequence = (self._sequence + 1) & 0xFFFF  # no message of these rigs has parts
+        else:
+            data = said
+        while data and not self.closing.is_set():
+            data = data[self._pty.write(data) :]
+            if data:
+                select.select([], [self._pty.fileno()], [], 0.05)
+
+    def close(self) -> None:
+        self._pty.close()
+
+
+@contextlib.contextmanager
+def lying_rig(
+    rig: Rig,
+    *,
+    camera: Lie = lambda message: message,
+    mirror: Lie = lambda message: message,
+    real_time: bool = False,
+) -> Iterator[tuple[str, str]]:
+    """A simulated rig in a thread whose camera and mirror change what they say; gives the paths of their ports."""
+    streams: dict[Line, LyingStream] = {"camera": LyingStream(camera), "mirror": LyingStream(mirror)}
+    done = threading.Event()
+    server = RigServer(rig, dict(streams), real_time=real_time)
+    thread = threading.Thread(target=server.run, args=(done.is_set,))
+    thread.start()
+    try:
+        yield streams["camera"].name, streams["mirror"].name
+    finally:
+        done.set()
+        for stream in streams.values():
+            stream.closing.set()
+        thread.join(10)
+        for stream in streams.values():
+            with contextlib.suppress(OSError):
+                stream.close()
+
+
+def changed(kind: type[Message], change: Callable[[Message], None], from_number: int = 1) -> Lie:
+    """A lie that changes messages of one kind in place, from the n-th on."""
+    seen = 0
+
+    def lie(message: Message) -> Message:
+        nonlocal seen
+        if isinstance(message, kind):
+            seen += 1
+            if seen >= from_number:
+                change(message)
+        return message
+
+    return lie

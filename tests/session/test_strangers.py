@@ -1,0 +1,36 @@
+"""Programs that are no hosts, on the TCP ports of `aolink rig --listen`."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import subprocess
+from collections.abc import Callable
+
+from aolink.demo import simulated_rig
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import encode_message
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def test_a_web_page_moves_no_mirror_and_keeps_nobody_out(aolink: Run) -> None:
+    command = encode_message(pb.CommandBlock(block_id=1, first_step=50, n_steps=300, u=[0.05] * 300), 0)
+    head = b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Type: text/plain\r\n\r\n"
+    with simulated_rig("section-vi", "--real-time", "--listen", "127.0.0.1:0") as (_, mirror):
+        address, port = mirror.removeprefix("socket://").rsplit(":", 1)
+        with socket.create_connection((address, int(port)), 20) as page, socket.create_connection((address, int(port))):
+            page.sendall(head + b"\0" + encode_message(pb.Identify(nonce=1), 0) + command)
+            with contextlib.suppress(ConnectionResetError):
+                assert page.recv(65_536) == b""
+            found = aolink("devices", mirror, "--json")  # while the other one stays connected and says nothing
+        assert found.returncode == 0, found.stderr
+        assert json.loads(found.stdout)[0]["geometry"].endswith("parked")
+
+
+def test_other_machines_are_served_on_request_only(aolink: Run) -> None:
+    result = aolink("rig", "section-vi", "--listen", "0.0.0.0:0")
+    assert result.returncode == 3
+    assert "--listen 0.0.0.0:0 lets other machines move the mirror" in result.stderr
+    assert "--allow-remote" in result.stderr
