@@ -25,13 +25,13 @@ from aolink.rig import Drive, Rig
 from aolink.scene import framed, read_scene_picture
 from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
-from aolink.session.report import Report
+from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside, most_waiting
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.hub import Hub
 from aolink.wire.port import SerialPort
 
-__all__ = ["Opened", "Report", "open_devices", "record"]
+__all__ = ["EstimatorReport", "Opened", "Report", "open_devices", "record"]
 
 Watch = Callable[[Exposure, Sequence[Estimate]], None]
 """Told each exposure with the estimates that have come since the one before."""

@@ -149,7 +149,7 @@ class BesideTheLoop:
 
     def get_ready(self, stop: Callable[[], bool]) -> None:
         while not stop() and not all(each.ready for each in self.processes):
-            self._wait(_SLICE_S)
+            self.serve(_SLICE_S)
             for name, why in self.failures.items():
                 raise EstimatorError(f"the estimator {name} does not start: {why}")
 
@@ -164,7 +164,7 @@ class BesideTheLoop:
     def finish(self, patience_s: float) -> list[Outcome]:
         deadline = time.monotonic() + patience_s
         while any(each.busy for each in self.processes) and (left_s := deadline - time.monotonic()) > 0:
-            self._wait(left_s)
+            self.serve(left_s)
         for each in self.processes:
             each.give_up(_OVER)
         return self.outcomes()
@@ -176,7 +176,8 @@ class BesideTheLoop:
         for each in self.processes:
             each.wait()
 
-    def _wait(self, timeout_s: float) -> None:
+    def serve(self, timeout_s: float) -> None:
+        """Wait up to ``timeout_s`` for something to send or to receive, and do that."""
         alive = [each for each in self.processes if each.alive]
         select.select(alive, [each for each in alive if each.has_to_send], [], timeout_s)
         for each in alive:
