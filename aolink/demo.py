@@ -17,7 +17,7 @@ from aolink.errors import AolinkError, DeviceError, EstimatorError, ViewerError
 from aolink.estimation import make_estimator
 from aolink.recording.deblur import Summary, write_deblurred
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import first_difference, reestimate
+from aolink.recording.reestimate import first_difference, recorded_estimates, reestimate
 from aolink.rig import Rig, Sensor
 from aolink.session import Report, record
 
@@ -150,11 +150,11 @@ def run_demo(
         )  # fmt: skip
     with part("estimate again") as tell:
         recording = Recording(path)
-        offline = reestimate(recording, estimators, tell)
+        offline = reestimate(recording, estimators, tell, as_recorded=True)
         differences = {
             name: difference
             for name, again in offline.items()
-            if (difference := first_difference(recording.estimates(name), again))
+            if (difference := first_difference(list(recorded_estimates(recording, name)), again))
         }
     deblurred, deblurred_recording = None, None
     if rig.scene is not None:

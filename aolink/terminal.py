@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import select
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 import typer
 from rich.console import Console
@@ -45,19 +45,29 @@ class StopRequest:
             raise typer.Exit(128 + self.signal)
 
 
+class Tell(Protocol):
+    """Moves a progress bar."""
+
+    def __call__(self, what: str, done: int, note: str = "") -> None:
+        """``note`` is shown behind the bar."""
+
+
 @contextmanager
-def progress_bar(console: Console, total: int | None) -> Iterator[Callable[[str, int], None]]:
+def progress_bar(console: Console, total: int | None) -> Iterator[Tell]:
     """A progress bar on a terminal; gives ``tell(what, done)``."""
-    columns = (TextColumn("{task.description:>14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description:>14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("{task.fields[note]}"),
+    )  # fmt: skip
     with Progress(*columns, console=console, transient=not console.is_terminal, disable=not console.is_terminal) as bar:
         tasks: dict[str, Any] = {}
 
-        def tell(what: str, done: int) -> None:
+        def tell(what: str, done: int, note: str = "") -> None:
             if what not in tasks:
                 for task in bar.tasks:
                     bar.update(task.id, completed=task.total or task.completed)
-                tasks[what] = bar.add_task(what, total=total)
-            bar.update(tasks[what], completed=done)
+                tasks[what] = bar.add_task(what, total=total, note=note)
+            bar.update(tasks[what], completed=done, note=note)
 
         yield tell
         for task in bar.tasks:

@@ -226,7 +226,7 @@ def compare(
         if second is None:
             second = Path(folder) / first.name
             with progress_bar(stderr, one.counts.get("/camera/image", 0)) as tell:
-                write_reestimated(one, one.estimators, second, progress=lambda n: tell("estimate", n))
+                write_reestimated(one, one.estimators, second, progress=lambda n: tell("estimate", n), as_recorded=True)
         two = open_recording(second)
         total = sum(one.counts.values()) + sum(two.counts.values())
         with progress_bar(stderr, total) as tell:

@@ -28,7 +28,7 @@ from aolink.cli.common import (
     stderr,
     stdout,
 )
-from aolink.errors import AolinkError, RigError
+from aolink.errors import AolinkError, EstimatorError, RigError
 from aolink.rig import Rig, load_rig, parse_light
 from aolink.terminal import StopRequest, ask, input_ended, progress_bar
 
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
     from aolink.recording.reader import Recording
+    from aolink.session import Report
 
 MOST_EXPOSURES = 2**32 - 1
 
@@ -228,59 +229,52 @@ def record(
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
     get_ready(loaded, estimator or [])
-    with (
-        _live_view(loaded, estimator or [], shown=view) as watch,
-        StopRequest().installed() as stop,
-        progress_bar(stderr, exposures) as tell,
-    ):
-        report = session.record(
-            loaded,
-            camera,
-            mirror,
-            output,
-            estimators=estimator or [],
-            exposures=exposures or 0,
-            note=note,
-            calibration=calibration or "",
-            watch=watch,
-            overwrite=overwrite,
-            options=options,
-            stop=stop,
-            progress=lambda done: tell("exposures", done),
-        )
+    report = session.Report()
+
+    def progress(done: int) -> None:
+        skipped = report.exposures_skipped.items()
+        tell("exposures", done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
+
+    with _live_view(loaded, estimator or [], shown=view) as watch:
+        with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
+            session.record(
+                loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
+                calibration=calibration or "", watch=watch, overwrite=overwrite, options=options, stop=stop,
+                progress=progress, report=report,
+            )  # fmt: skip
+        _print_session(report, output, as_json)
+    stop.exit_if_asked()
+    if any(each.failed for each in report.estimation.values()):
+        raise typer.Exit(EstimatorError.exit_code)
+
+
+def _print_session(report: Report, output: Path, as_json: bool) -> None:
     from aolink import tables
 
     for warning in report.warnings:
         stderr.print(f"aolink: warning: {escape(warning)}")
     if as_json:
-        print(json.dumps(tables.session_as_json(report), allow_nan=False))
+        print(json.dumps(tables.session_as_json(report), allow_nan=False), flush=True)
     else:
         stdout.print(tables.session(report))
         written = report.files[0] if report.files else output
         parts = f" in {len(report.files)} files" if len(report.files) > 1 else ""
         text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; look at it: {program()} view {written}"
         stdout.print(text, markup=False)
-    stop.exit_if_asked()
 
 
 @contextmanager
 def _live_view(
     rig: Rig, estimators: Sequence[str], *, shown: bool
 ) -> Iterator[Callable[[Exposure, Sequence[Estimate]], None] | None]:
-    """What shows a session's exposures, or nothing; says how many it skipped."""
+    """What shows a session's exposures, or nothing."""
     if not shown:
         yield None
         return
     from aolink import viewing
 
     with viewing.live_viewer(rig, estimators) as live:
-        view = viewing.Decimating(live)
-        try:
-            yield view.show
-        finally:
-            view.close()
-            if view.skipped:
-                stderr.print(f"aolink: the viewer had no time for {view.skipped} exposures; all are in the recording")
+        yield live.show
 
 
 @app.command(

@@ -2,25 +2,77 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from aolink.estimation.block import Block, blocks
 from aolink.estimation.estimate import Estimate
-from aolink.estimation.estimators import make_estimator
+from aolink.estimation.estimators import Estimator, make_estimator
 from aolink.estimation.options import Engine
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 
+_MOST_SKIPPED_STEPS = 100_000
+"""Over a longer gap an estimator is not led input by input: the first of its inputs are forgotten."""
+
+
+class SkippedInputs:
+    """The inputs of exposures that one estimator has skipped.
+
+    The next exposure that it gets carries them as its lead, so that the estimator predicts over the steps of the
+    skipped ones with what the mirror did, as it does over dead time and lost frames.
+    """
+
+    def __init__(self) -> None:
+        self._rows: deque[NDArray[np.float64]] = deque()
+        self._steps = 0
+
+    def skip(self, exposure: Exposure) -> None:
+        """Keep the inputs of an exposure that the estimator does not get."""
+        for rows in (exposure.lead_inputs, exposure.inputs):
+            self._rows.append(rows)
+            self._steps += len(rows)
+        while self._steps - len(self._rows[0]) >= _MOST_SKIPPED_STEPS:
+            self._steps -= len(self._rows.popleft())
+
+    def leading(self, exposure: Exposure) -> Exposure:
+        """An exposure that the estimator gets, with what it has skipped since the one before."""
+        if not self._rows:
+            return exposure
+        lead = np.concatenate([*self._rows, exposure.lead_inputs])[-_MOST_SKIPPED_STEPS:]
+        self._rows.clear()
+        self._steps = 0
+        return replace(exposure, lead_inputs=lead)
+
 
 class Driver:
-    """Several estimators side by side, exposure by exposure, on one engine."""
+    """Several estimators side by side, exposure by exposure, on one engine.
 
-    def __init__(self, rig: Rig, names: Sequence[str], engine: Engine = "aolink") -> None:
+    Parameters
+    ----------
+    skipped:
+        Frame ids of the exposures that an estimator does not get, by its name: those that it had no time for in a
+        session. It gives the same bits as there, and no estimate of these.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        names: Sequence[str],
+        engine: Engine = "aolink",
+        skipped: Mapping[str, Container[int]] | None = None,
+    ) -> None:
         self.rig = rig
         self.estimators = [make_estimator(rig, name, engine=engine) for name in names]
+        self._skipped = skipped or {}
+        self._inputs = {name: SkippedInputs() for name in self._skipped}
 
     def step(self, exposure: Exposure) -> list[Estimate]:
-        """What each of them says about an exposure, in the order of the names."""
+        """What each of them that gets an exposure says about it, in the order of the names."""
         ((_, estimates),) = self._steps(Block(self.rig, [exposure]))
         return estimates
 
@@ -33,9 +85,25 @@ class Driver:
             yield from self._steps(block)
 
     def _steps(self, block: Block) -> Iterator[tuple[Exposure, list[Estimate]]]:
-        series = [estimator.steps(block) for estimator in self.estimators]
+        series = [self._series(estimator, block) for estimator in self.estimators]
         for exposure in block.exposures:
-            yield exposure, list(map(next, series))
+            yield exposure, [estimate for estimate in map(next, series) if estimate is not None]
+
+    def _series(self, estimator: Estimator, block: Block) -> Iterator[Estimate | None]:
+        """The estimates of a block, None for each exposure that the estimator does not get."""
+        if estimator.name not in self._skipped:
+            return estimator.steps(block)
+        skipped, inputs = self._skipped[estimator.name], self._inputs[estimator.name]
+        given: list[Exposure | None] = []
+        for exposure in block.exposures:
+            if exposure.frame_id in skipped:
+                inputs.skip(exposure)
+                given.append(None)
+            else:
+                given.append(inputs.leading(exposure))
+        some = [exposure for exposure in given if exposure is not None]
+        made = estimator.steps(Block(self.rig, some)) if some else iter(())
+        return (None if exposure is None else next(made) for exposure in given)
 
 
 def run(rig: Rig, exposures: Iterable[Exposure], names: Sequence[str]) -> dict[str, list[Estimate]]:

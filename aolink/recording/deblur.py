@@ -230,6 +230,11 @@ def _written(
     true_scene = recording.true_scene
     copy = RecordingCopy(recording, path, recording.metadata | notes)
     summary, log_times = Summary(), dict[int, int]()
+    left_out: tuple[str, ...] = (topics.RESTORED,)
+    if estimator not in recording.estimators:
+        left_out += (topics.estimation_topic(estimator),)  # the estimates are new, and of all exposures
+    elif skipped := len(recording.skipped(estimator)):
+        summary.reasons["the session had no time to estimate it: `aolink estimate -o` does"] = skipped
 
     def add(topic: str, message: Message, log_time_ns: int) -> None:
         data = message.SerializeToString(deterministic=True)
@@ -253,7 +258,7 @@ def _written(
                     emit(*held)
                     held = next(made, None)
                 log_times[frame_id] = raw.log_time_ns
-            if not raw.topic.startswith(topics.RESTORED):
+            if not raw.topic.startswith(left_out):
                 copy.add(raw)
         while held is not None:
             emit(*held)

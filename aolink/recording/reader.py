@@ -144,6 +144,12 @@ class Recording:
         """Names of the estimators whose results are in the file."""
         return [name.removeprefix(topics.ESTIMATE) for name in self.counts if name.startswith(topics.ESTIMATE)]
 
+    def skipped(self, estimator: str) -> frozenset[int]:
+        """Frame ids of the exposures that an estimator had no time for in the session."""
+        topic = topics.estimation_topic(estimator)
+        found = (each.message for each in self.messages(topic)) if topic in self.counts else ()
+        return frozenset(each.frame_id for each in found if isinstance(each, schemas_pb2.Estimation) and each.skipped)
+
     @cached_property
     def model(self) -> ExposureModel:
         """The exposure model that expands the recorded coefficients."""

@@ -25,11 +25,18 @@ _BYTES_AT_ONCE = 4 << 20
 
 
 def reestimate(
-    recording: Recording, names: Sequence[str], progress: Callable[[int], None] = lambda exposures: None
+    recording: Recording,
+    names: Sequence[str],
+    progress: Callable[[int], None] = lambda exposures: None,
+    *,
+    as_recorded: bool = False,
 ) -> dict[str, list[Estimate]]:
-    """Run estimators over a recording; gives the estimates by name, one for each exposure."""
+    """Run estimators over a recording; gives the estimates by name, one for each exposure.
+
+    With ``as_recorded`` an estimator skips what it had no time for in the session, and gives the same bits as there.
+    """
     estimates: dict[str, list[Estimate]] = {name: [] for name in names}
-    for _, each in reestimated(recording, names, progress):
+    for _, each in reestimated(recording, names, progress, as_recorded=as_recorded):
         for estimate in each:
             estimates[estimate.estimator].append(estimate)
     return estimates
@@ -40,24 +47,35 @@ def reestimated(
     names: Sequence[str],
     progress: Callable[[int], None] = lambda exposures: None,
     engine: Engine = "aolink",
+    *,
+    as_recorded: bool = False,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
     """The same exposure by exposure, estimates in the order of ``names``; nothing of it stays in memory."""
-    driver = Driver(recording.rig, names, engine)
+    driver = Driver(recording.rig, names, engine, skipped_by(recording, names) if as_recorded else None)
     for number, done in enumerate(driver.steps(recording.exposures()), 1):
         yield done
         progress(number)
+
+
+def skipped_by(recording: Recording, names: Sequence[str]) -> dict[str, frozenset[int]]:
+    """Frame ids of what the session's estimators skipped, by the names of those that skipped any."""
+    return {name: skipped for name in names if (skipped := recording.skipped(name))}
 
 
 def recorded_estimates(recording: Recording, name: str) -> Iterator[Estimate]:
     """What `Recording.estimates` gives, one by one."""
     exposures: dict[int, Exposure] = {}
     waiting: deque[schemas_pb2.Estimate] = deque()
-    for recorded, completed in recording.assembled(topics.estimate_topic(name)):
-        if recorded is not None and isinstance(recorded.message, schemas_pb2.Estimate):
-            waiting.append(recorded.message)
+    for recorded, completed in recording.assembled(topics.estimate_topic(name), topics.estimation_topic(name)):
+        received = None if recorded is None else recorded.message
+        if isinstance(received, schemas_pb2.Estimate):
+            waiting.append(received)
+        elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
+            exposures.pop(received.frame_id, None)
         exposures.update((exposure.frame_id, exposure) for exposure in completed)
-        # At the end of the recording, an exposure that has not come will not.
-        while waiting and (recorded is None or waiting[0].frame_id in exposures):
+        # At the end of the recording, an exposure that has not come will not; nor will one of the part before this one.
+        first = next(iter(exposures), 0)
+        while waiting and (recorded is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
             message = waiting.popleft()
             if message.frame_id not in exposures:
                 continue
@@ -72,8 +90,18 @@ def scored_and_compared(
 ) -> tuple[dict[str, Score], dict[str, str | None]]:
     """Scores by name, and where estimates first differ from those in the recording, for the names that it has."""
     scorers = {name: Scorer() for name in names}
-    recorded = {name: recorded_estimates(recording, name) for name in names if name in recording.estimators}
+    skipped = skipped_by(recording, names)
+    recorded = {
+        name: recorded_estimates(recording, name)
+        for name in names
+        if name in recording.estimators and name not in skipped
+    }
     differences: dict[str, str | None] = dict.fromkeys(recorded)
+    for name, frames in skipped.items():
+        differences[name] = (
+            f"the session had no time for {len(frames)} exposures, all are estimated here;"
+            " `aolink compare` makes the others again as they were"
+        )
     count = 0
     for count, (exposure, each) in enumerate(series, 1):
         for estimate in each:
@@ -98,11 +126,12 @@ def write_reestimated(
     overwrite: bool = False,
     progress: Callable[[int], None] = lambda exposures: None,
     engine: Engine = "aolink",
+    as_recorded: bool = False,
 ) -> None:
     """Copy a recording with new estimates in the place of those that it has.
 
     Messages of other software come along as they are. The same recording and the same version of aolink give the
-    same bytes.
+    same bytes. With ``as_recorded`` estimators skip what they had no time for in the session.
 
     Raises
     ------
@@ -121,7 +150,8 @@ def write_reestimated(
         copy = RecordingCopy(recording, partial, notes)
         try:
             done = 0
-            for some in _with_estimates(recording, Driver(recording.rig, names, engine)):
+            skipped = skipped_by(recording, names) if as_recorded else None
+            for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), as_recorded):
                 copy.add(some)
                 if done < copy.result.exposures:
                     progress(done := copy.result.exposures)
@@ -131,13 +161,17 @@ def write_reestimated(
             raise
 
 
-def _with_estimates(recording: Recording, driver: Driver) -> Iterator[RawMessage]:
-    """The messages of a recording, without estimates and restored pictures, and new estimates after their exposures."""
+def _with_estimates(recording: Recording, driver: Driver, as_recorded: bool) -> Iterator[RawMessage]:
+    """The messages of a recording, without estimates and restored pictures, and new estimates after their exposures.
+
+    What the session had no time for is only told where that is so of the new estimates as well, ``as_recorded``.
+    """
+    left_out = (topics.ESTIMATE, topics.RESTORED, *([] if as_recorded else [topics.ESTIMATION]))
     assembly = ExposureAssembly(recording.rig)
     waiting: list[tuple[RawMessage, list[Exposure]]] = []
     exposures = size = 0
     for raw in recording.raw_messages():
-        if raw.topic.startswith((topics.ESTIMATE, topics.RESTORED)):
+        if raw.topic.startswith(left_out):
             continue
         message = recording.decoded_run(raw) or recording.decoded(raw)
         if message is None and raw.schema in topics.SCHEMAS:

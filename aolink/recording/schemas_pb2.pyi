@@ -171,6 +171,20 @@ class Estimate(_message.Message):
     innovation_variance: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., n_steps: _Optional[int] = ..., status: _Optional[_Union[Estimate.Status, str]] = ..., reason: _Optional[str] = ..., axes: _Optional[int] = ..., n_states: _Optional[int] = ..., n_coefficients: _Optional[int] = ..., n_measurements: _Optional[int] = ..., end_state: _Optional[_Iterable[float]] = ..., end_covariance: _Optional[_Iterable[float]] = ..., coefficients: _Optional[_Iterable[float]] = ..., coefficient_covariance: _Optional[_Iterable[float]] = ..., innovation: _Optional[_Iterable[float]] = ..., innovation_covariance: _Optional[_Iterable[float]] = ..., nis: _Optional[_Iterable[float]] = ..., innovation_variance: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class Estimation(_message.Message):
+    __slots__ = ("estimator", "frame_id", "skipped", "reason", "took_ns")
+    ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    SKIPPED_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    TOOK_NS_FIELD_NUMBER: _ClassVar[int]
+    estimator: str
+    frame_id: int
+    skipped: bool
+    reason: str
+    took_ns: int
+    def __init__(self, estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., skipped: _Optional[bool] = ..., reason: _Optional[str] = ..., took_ns: _Optional[int] = ...) -> None: ...
+
 class Restoration(_message.Message):
     __slots__ = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
     FRAME_ID_FIELD_NUMBER: _ClassVar[int]

@@ -30,6 +30,8 @@ LATENCY = "/latency"
 LOG = "/log"
 ESTIMATE = "/estimate/"
 """Prefix; the estimator's name follows."""
+ESTIMATION = "/estimation/"
+"""Prefix as well: what the estimator had time for."""
 
 SCHEMAS: dict[str, type[Message]] = {
     message.DESCRIPTOR.full_name: message
@@ -41,6 +43,7 @@ SCHEMAS: dict[str, type[Message]] = {
         schemas_pb2.LinkStatistics,
         schemas_pb2.Latency,
         schemas_pb2.Estimate,
+        schemas_pb2.Estimation,
         schemas_pb2.Restoration,
         messages_pb2.CommandBlock,
         messages_pb2.Applied,
@@ -71,3 +74,8 @@ END_METADATA = "aolink/end"
 def estimate_topic(name: str) -> str:
     """Topic of an estimator."""
     return ESTIMATE + name
+
+
+def estimation_topic(name: str) -> str:
+    """Topic of what an estimator had time for."""
+    return ESTIMATION + name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import secrets
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
@@ -15,19 +16,30 @@ import numpy as np
 
 from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig, check_kind, identify
 from aolink.errors import AolinkError, DeviceError, PortError
-from aolink.estimation import Driver
+from aolink.estimation import Driver, Estimate
+from aolink.exposure import Exposure
 from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
 from aolink.scene import framed, read_scene_picture
-from aolink.session.loop import Inputs, SessionLoop, Watch
-from aolink.session.report import Report
+from aolink.session.estimating import BesideTheLoop, Outcome
+from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
+from aolink.session.report import EstimatorReport, Report
+from aolink.session.waiting import Aside, most_waiting
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.hub import Hub
 from aolink.wire.port import SerialPort
 
-__all__ = ["Opened", "Report", "open_devices", "record"]
+__all__ = ["EstimatorReport", "Opened", "Report", "open_devices", "record"]
+
+Watch = Callable[[Exposure, Sequence[Estimate]], None]
+"""Told each exposure with the estimates that have come since the one before."""
+
+_PROGRESS_S = 0.1
+"""Real time: how often the progress is told."""
+_ASIDE_S = 2.0
+"""Real time: how long the session's end waits for who watches."""
 
 
 class Opened(NamedTuple):
@@ -101,8 +113,13 @@ def record(
     options: WriteOptions | None = None,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
+    report: Report | None = None,
 ) -> Report:
     """Record a session: play the rig's drive, record everything, run estimators on the way.
+
+    In real time nothing stands between the wire and the file. Each estimator runs in a process of its own, beside the
+    recording, and skips the exposures that it has no time for: those are counted, and recorded as skipped. So are
+    those that come after an estimator has failed. On virtual time the rig waits, and nothing is skipped.
 
     Parameters
     ----------
@@ -120,13 +137,19 @@ def record(
         What the camera is shown, of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
-        What to command, instead of the rig's drive.
+        What to command, instead of the rig's drive. It is called by the loop: the mirror gets its next commands when it
+        returns.
     watch:
-        Told each exposure with its estimates, on the loop's own time.
+        Told each exposure with its estimates. An estimate that is not there when the next exposure is comes with that
+        one or a later one. In real time it is called on a thread of its own and may take its time: exposures that
+        come meanwhile are left out and counted, and what it raises becomes a warning.
     options:
         How the recording is cut into chunks and files.
     stop, progress:
-        Asked, and told the number of exposures so far, at least ten times a second.
+        Asked, and told the number of exposures so far, at least ten times a second; the latter in real time on a
+        thread of its own.
+    report:
+        What is filled in while the session goes on, and given back in the end; a new one if None.
 
     Raises
     ------
@@ -139,7 +162,11 @@ def record(
     if calibration:
         rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
         rig = replace(rig, drive=rest)
-    with open_devices(rig, camera_port, mirror_port, stop) as (hub, camera, mirror, warnings):
+    report = report or Report()
+    with (
+        open_devices(rig, camera_port, mirror_port, stop) as (hub, camera, mirror, warnings),
+        contextlib.ExitStack() as aside,
+    ):
         start_ns = hub.now_ns()
         facts = {
             "session": f"{start_ns:x}",
@@ -159,9 +186,14 @@ def record(
             path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, attachments=attachments,
             options=options,
         )  # fmt: skip
-        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, watch)
-        report = loop.report
         report.warnings += warnings
+        show, beside = _shown(rig, watch), None
+        if not hub.virtual:
+            progress = aside.enter_context(_told_aside(progress, report))
+            show = aside.enter_context(_shown_aside(show, rig, report)) if show else None
+            beside = aside.enter_context(BesideTheLoop(rig, estimators))
+            hub.beside = beside.processes
+        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, show, beside, report)
         try:
             loop.run(exposures, stop, progress)
         except BaseException as error:
@@ -171,6 +203,8 @@ def record(
             except AolinkError as unsafe:
                 report.warnings.append(str(unsafe))
             loop.close_account()
+            with contextlib.suppress(AolinkError):
+                loop.finish_estimates(ESTIMATES_S if isinstance(error, PortError | DeviceError) else 0.0)
             if not (stop() and isinstance(error, PortError | DeviceError)):
                 with contextlib.suppress(AolinkError):
                     writer.close(report.counts())
@@ -181,3 +215,43 @@ def record(
         writer.close(report.counts())
     report.files = [str(each) for each in writer.paths]
     return report
+
+
+def _shown(rig: Rig, watch: Watch | None) -> Show | None:
+    if watch is None:
+        return None
+    return lambda exposure, outcomes: watch(exposure, [each.estimate(rig) for each in outcomes])
+
+
+@contextlib.contextmanager
+def _shown_aside(show: Show, rig: Rig, report: Report) -> Iterator[Show]:
+    """The same on a thread of its own, which leaves out what it has no time for."""
+    watching = Aside[tuple[Exposure, Sequence[Outcome]]](lambda item: show(*item), most_waiting(rig.timing))
+    try:
+        yield lambda exposure, outcomes: watching.give((exposure, outcomes))
+    finally:
+        if not watching.close(_ASIDE_S):
+            report.warnings.append(f"who watches this session is not done with an exposure after {_ASIDE_S:g} s")
+        if watching.failed is not None:
+            report.warnings.append(f"who watches this session failed: {watching.failed}")
+        report.unwatched = watching.skipped
+
+
+@contextlib.contextmanager
+def _told_aside(progress: Callable[[int], None], report: Report) -> Iterator[Callable[[int], None]]:
+    """Tell the progress on a thread of its own: a terminal that takes nothing would hold up the loop."""
+    telling, next_s = Aside[int](progress, 1), 0.0
+
+    def tell(exposures: int) -> None:
+        nonlocal next_s
+        if (now_s := time.monotonic()) >= next_s:
+            next_s = now_s + _PROGRESS_S
+            telling.give(exposures)
+
+    try:
+        yield tell
+    finally:
+        telling.give(report.exposures)
+        telling.close(_ASIDE_S)
+        if telling.failed is not None:
+            report.warnings.append(f"the progress of this session could not be told: {telling.failed}")

@@ -1,8 +1,8 @@
 """The live loop: joins devices, recorder and estimators.
 
-One thread waits on both ports; what comes is recorded, made into exposures and estimated. Commands go
-out in blocks ahead of time, so the loop's own jitter does not reach the mirror. The same loop runs in
-real time and on virtual time; on virtual time it sends whenever the rig waits.
+One thread waits on both ports; what comes is recorded, made into exposures and handed to the estimators, which in
+real time run beside the loop. Commands go out in blocks ahead of time, so the loop's own jitter does not reach the
+mirror. The same loop runs in real time and on virtual time; on virtual time it sends whenever the rig waits.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 from aolink.assembly import Assembler, Frame
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
 from aolink.errors import DeviceError
-from aolink.estimation import Driver, Estimate
+from aolink.estimation import Driver
 from aolink.exposure import Exposure, Picture
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import MirrorDriver, Rig
 from aolink.session.account import REFUSALS, Account
-from aolink.session.report import LatencyBook, Report
+from aolink.session.estimating import Estimating, InTheLoop, Outcome
+from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
 from aolink.wire.hub import Hub
@@ -46,6 +47,8 @@ _KEEP_ALIVES = 3
 """Packets on the mirror's line in the time of its watchdog, at least."""
 _OUTAGE_WATCHDOGS = 2.0
 """A mirror that was out of reach for more than so many times its watchdog is not told to go on."""
+ESTIMATES_S = 5.0
+"""Real time: how long the session's end waits for estimates that are under way."""
 _NOT_YET = 1 << 63
 """The first fast step of a session that has not begun."""
 
@@ -53,8 +56,8 @@ _NOT_YET = 1 << 63
 Inputs = Callable[[int, int], NDArray[np.float64]]
 """First fast step since the session's start and number of steps -> what to command, (n_steps, n_inputs)."""
 
-Watch = Callable[[Exposure, Sequence[Estimate]], None]
-"""Told each exposure with its estimates; must not take time."""
+Show = Callable[[Exposure, Sequence[Outcome]], None]
+"""Given each exposure, with the estimates that have come since the one before; must not take time."""
 
 
 def lead_steps(mirror: MirrorDriver) -> int:
@@ -77,14 +80,23 @@ class SessionLoop:
         writer: RecordingWriter,
         driver: Driver,
         inputs: Inputs | None = None,
-        watch: Watch | None = None,
+        show: Show | None = None,
+        beside: Estimating | None = None,
+        report: Report | None = None,
     ) -> None:
-        self.report = Report(virtual_time=hub.virtual)
+        self.report = report or Report()
+        self.report.virtual_time = hub.virtual
         self._rig, self._hub, self._camera, self._mirror = rig, hub, camera, mirror
-        self._writer, self._driver = writer, driver
-        self._watch = watch
-        self._unseen: tuple[Exposure, Sequence[Estimate]] | None = None
-        """The exposure that its watcher has not been given yet."""
+        self._writer, self._estimating = writer, beside or InTheLoop(driver)
+        if beside is not None:
+            self.report.estimation |= {name: EstimatorReport() for name in beside.names}
+        self._unsettled: dict[int, list[Outcome]] = {}
+        """What is known of the exposures that not all estimators are done with, by frame."""
+        self._show = show
+        self._unseen: Exposure | None = None
+        """The exposure that its watcher has not been given yet, ..."""
+        self._unseen_estimates: list[Outcome] = []
+        """... and the estimates that it has not been given."""
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
@@ -105,6 +117,7 @@ class SessionLoop:
         self._latencies = LatencyBook(self.report, partial(self._record, topics.LATENCY))
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
+        self._estimating.get_ready(stop)
         self._warm_up_clocks()
         timing, hub = self._rig.timing, self._hub
         if self._mirror.latched:
@@ -144,6 +157,13 @@ class SessionLoop:
         self._account.close()
         self._count_tries()
 
+    def finish_estimates(self, patience_s: float = ESTIMATES_S) -> None:
+        """Wait for the estimates under way, and record the exposures that none comes for as skipped."""
+        outcomes = self._estimating.finish(patience_s)
+        self._take_outcomes(outcomes, self._hub.now_ns())
+        self._note_failures()
+        self._show_unseen(ready=True)
+
     def _receive(self, timeout_s: float) -> int:
         """Deal with what comes within ``timeout_s``; gives the number of clock queries that were answered."""
         answers = 0
@@ -151,6 +171,7 @@ class SessionLoop:
             events = self._device(link).handle(received)
             answers += sum(isinstance(event, ClockSampled) for event in events)
             self._take(link, events, received.receive_ns)
+        self._take_outcomes(self._estimating.outcomes(), self._hub.now_ns())
         return answers
 
     def _device(self, link: Link) -> Camera | Mirror:
@@ -275,8 +296,8 @@ class SessionLoop:
         now = self._hub.now_ns()
         self._take(self._camera.link, list(self._camera.flush()), now)
         self._estimate(self._assembler.flush(), now)
-        self._show_unseen()
-        self._latencies.close(now)
+        self.finish_estimates()
+        self._latencies.close(self._hub.now_ns())
         self.close_account()
         if exposures and self.report.ended == "complete":
             self.report.frames_lost = exposures - self.report.frames_received
@@ -341,27 +362,21 @@ class SessionLoop:
         self.report.scenes_lost += frame.frames_lost_before
         self._show_unseen(frame)
 
-    def _show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
-        """Hand an exposure to who watches; with a picture sensor, when its scene is there or the next one comes."""
-        if self._watch is None:
-            return
-        if self._unseen is not None:
-            self._watch(*self._unseen)
-        self._unseen = (exposure, estimates)
-        if self._rig.scene is None:
-            self._show_unseen()
+    def _show_unseen(self, scene: Frame | None = None, *, ready: bool = False) -> None:
+        """Give the exposure that waits to who watches: when all that belongs to it is there, or ``ready`` as it is.
 
-    def _show_unseen(self, scene: Frame | None = None) -> None:
-        """Hand over the exposure that waits; with ``scene`` only if it is of the same exposure."""
-        if self._watch is None or self._unseen is None:
+        With a picture sensor, its scene belongs to it. It does not wait for estimates that are not there when the next
+        exposure is; they come with that one.
+        """
+        exposure = self._unseen
+        if self._show is None or exposure is None:
             return
-        exposure, estimates = self._unseen
-        if scene is not None:
-            if scene.frame_id != exposure.frame_id:
-                return
-            exposure = replace(exposure, scene=Picture(pixels=scene.pixels, mask=scene.mask))
-        self._watch(exposure, estimates)
-        self._unseen = None
+        if scene is not None and scene.frame_id == exposure.frame_id:
+            exposure = self._unseen = replace(exposure, scene=Picture(pixels=scene.pixels, mask=scene.mask))
+        whole = self._rig.scene is None or exposure.scene is not None
+        if ready or (whole and exposure.frame_id not in self._unsettled):
+            self._show(exposure, self._unseen_estimates)
+            self._unseen, self._unseen_estimates = None, []
 
     def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
         """Record a picture and what is known about it; gives it with the host's time of its start."""
@@ -377,13 +392,46 @@ class SessionLoop:
 
     def _estimate(self, exposures: Sequence[Exposure], log_time_ns: int) -> None:
         for exposure in exposures:
-            estimates = self._driver.step(exposure)
-            for estimate in estimates:
-                self._record(topics.estimate_topic(estimate.estimator), convert.estimate_message(estimate), log_time_ns)
             self.report.exposures += 1
-            self._newest_frame = exposure.frame_id
-            self._latencies.estimated(exposure.frame_id, self._hub.now_ns())
-            self._show(exposure, estimates)
+            self._show_unseen(ready=True)
+            self._unseen = exposure
+            self._unsettled[exposure.frame_id] = []
+            outcomes = self._estimating.offer(exposure)
+            if not self._estimating.names:
+                self._settle(exposure.frame_id)
+            self._take_outcomes(outcomes, log_time_ns)
+
+    def _take_outcomes(self, outcomes: Sequence[Outcome], log_time_ns: int) -> None:
+        for outcome in outcomes:
+            name, frame_id, message = outcome.estimator, outcome.exposure.frame_id, outcome.message
+            if message is not None:
+                self._record(topics.estimate_topic(name), message, log_time_ns)
+                if self._show is not None:
+                    self._unseen_estimates.append(outcome)
+            if name in self.report.estimation:
+                self.report.estimation[name].add(outcome)
+                self._record(topics.estimation_topic(name), outcome.account(), log_time_ns)
+            self._unsettled[frame_id].append(outcome)
+            if message is None:
+                self._note_failures()
+            if len(self._unsettled[frame_id]) == len(self._estimating.names):
+                self._settle(frame_id)
+
+    def _note_failures(self) -> None:
+        for name, why in self._estimating.failures.items():
+            if not self.report.estimation[name].failed:
+                self.report.estimation[name].failed = why
+                text = f"the estimator {name} failed, the recording goes on without it: {why}"
+                self.report.warnings.append(text)
+                self._log(Log.ERROR, text)
+
+    def _settle(self, frame_id: int) -> None:
+        """All estimators are done with an exposure, or have skipped it."""
+        outcomes = self._unsettled.pop(frame_id)
+        self._newest_frame = max(self._newest_frame, frame_id)
+        skipped = bool(outcomes) and all(each.message is None for each in outcomes)
+        self._latencies.estimated(frame_id, 0 if skipped else self._hub.now_ns())
+        self._show_unseen()
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._record(topics.APPLIED, applied, receive_ns)

@@ -14,6 +14,7 @@ from aolink.exposure import Exposure
 from aolink.recording import topics
 from aolink.recording.editing import between
 from aolink.recording.reader import Recording
+from aolink.recording.reestimate import skipped_by
 from aolink.wire import messages_pb2 as wire
 
 _NAP_S = 0.1
@@ -31,7 +32,7 @@ def replay(
     now_s: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
-    """Run estimators over a recording, exposure by exposure, as a session does.
+    """Run estimators over a recording, exposure by exposure, as the session did: what it had no time for is skipped.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def replay(
     RecordingError
         There is no exposure between the two times.
     """
-    driver = Driver(recording.rig, names)
+    driver = Driver(recording.rig, names, skipped=skipped_by(recording, names))
     step_s = recording.rig.timing.fast_step_s
     first_step: int | None = None
     began: tuple[float, float] | None = None

@@ -2,13 +2,37 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 
 from aolink.recording import schemas_pb2 as pb
+from aolink.session.estimating import Outcome
 from aolink.wire import messages_pb2 as wire
 
 _KEPT_LATENCIES = 10_000
+
+
+@dataclass(kw_only=True)
+class EstimatorReport:
+    """What an estimator had time for in a session in real time."""
+
+    estimated: int = 0
+    skipped: int = 0
+    """Exposures that it had no time for, or that came after it had failed."""
+    failed: str = ""
+    """Why it gave up; empty where it did not."""
+    took_ms: list[float] = field(default_factory=list)
+    """How long its estimates took, one after the other; the newest ones, `_KEPT_LATENCIES` at most."""
+
+    def add(self, outcome: Outcome) -> None:
+        """Count what became of the next exposure."""
+        if outcome.message is None:
+            self.skipped += 1
+            return
+        self.estimated += 1
+        self.took_ms.append(outcome.took_ns / 1e6)
+        del self.took_ms[:-_KEPT_LATENCIES]
 
 
 @dataclass(kw_only=True)
@@ -58,41 +82,61 @@ class Report:
     clock_offset_ns: float = float("nan")
     clock_frequency_ppm: float = float("nan")
     clock_sigma_ns: float = float("nan")
+    estimation: dict[str, EstimatorReport] = field(default_factory=dict)
+    """By the estimator's name. Empty on virtual time, which waits for every estimate."""
+    unwatched: int = 0
+    """Exposures that who watches had no time for."""
     warnings: list[str] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
     """What was written."""
     latencies: list[pb.Latency] = field(default_factory=list)
     """The newest ones, `_KEPT_LATENCIES` at most; all of them are in the recording."""
 
+    @property
+    def exposures_skipped(self) -> dict[str, int]:
+        """How many exposures were skipped, by the names of the estimators that skipped any."""
+        return {name: each.skipped for name, each in self.estimation.items() if each.skipped}
+
     def counts(self) -> dict[str, str]:
         """Everything but the latencies, as text, for the recording's metadata."""
         facts = asdict(self)
-        del facts["latencies"], facts["warnings"], facts["files"]
+        del facts["latencies"], facts["warnings"], facts["files"], facts["estimation"], facts["unwatched"]
+        for name, each in self.estimation.items():
+            facts[f"skipped_{name}"] = each.skipped
+            if each.took_ms:
+                facts[f"estimate_ms_{name}"] = round(statistics.median(each.took_ms), 3)
         return {name: str(value) for name, value in facts.items()} | {"warnings": "; ".join(self.warnings)}
 
 
 class LatencyBook:
-    """The way of each frame from the end of its exposure to the command that knew it. Real time only."""
+    """The way of each frame from the end of its exposure to the command that knew it. Real time only.
+
+    A command knows a frame when it is sent after the last estimator was done with the frame, or had skipped it.
+    """
 
     def __init__(self, report: Report, record: Callable[[pb.Latency, int], None]) -> None:
         self._report, self._record = report, record
         self._open: dict[int, pb.Latency] = {}
         self._blocks: dict[int, int] = {}
         """First command block that knew a frame, by frame."""
+        self._known: set[int] = set()
+        """Frames that all estimators are done with, and no command is known of."""
 
     def frame(self, latency: pb.Latency) -> None:
         """A frame is complete."""
         self._open[latency.frame_id] = latency
 
     def estimated(self, frame_id: int, now_ns: int) -> None:
+        """All estimators are done with a frame; ``now_ns`` is 0 if they have skipped it."""
         if latency := self._open.get(frame_id):
             latency.estimated_ns = now_ns
+            self._known.add(frame_id)
 
     def sent(self, block: wire.CommandBlock, now_ns: int) -> None:
-        for frame_id, latency in self._open.items():
-            if frame_id <= block.cause_frame_id and not latency.command_sent_ns:
-                latency.command_sent_ns = now_ns
-                self._blocks[frame_id] = block.block_id
+        for frame_id in self._known:
+            self._open[frame_id].command_sent_ns = now_ns
+            self._blocks[frame_id] = block.block_id
+        self._known.clear()
 
     def acknowledged(self, block_id: int, receive_ns: int) -> None:
         for frame_id in [frame_id for frame_id, block in self._blocks.items() if block == block_id]:
@@ -112,6 +156,7 @@ class LatencyBook:
     def _close(self, frame_id: int, now_ns: int) -> None:
         latency = self._open.pop(frame_id)
         self._blocks.pop(frame_id, None)
+        self._known.discard(frame_id)
         self._record(latency, now_ns)
         self._report.latencies.append(latency)
         del self._report.latencies[:-_KEPT_LATENCIES]

@@ -72,6 +72,9 @@ def _losses(recording: Recording) -> dict[str, int]:
         for name in _LOSSES
         if recording.metadata.get(name, "0").isdigit() and int(recording.metadata.get(name, "0"))
     }
+    for name, value in recording.metadata.items():  # exposures, by the estimator that had no time for them
+        if name.startswith("skipped_") and value.isdigit() and int(value):
+            counted[name] = int(value)
     if recording.losses:
         counted["parts_of_the_file"] = len(recording.losses)
     return counted

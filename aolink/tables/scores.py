@@ -17,20 +17,26 @@ from aolink.tables.json import without_nan
 
 
 def score_all(recording: Recording, estimates: Mapping[str, Iterable[Estimate]]) -> dict[str, Score]:
-    """Score estimates against the truth in their recording, by estimator; one exposure at a time is in memory."""
-    names = list(estimates)
-    if not names:
+    """Score estimates against the truth in their recording, by estimator; one exposure at a time is in memory.
+
+    Estimates come in the order of their exposures, and there may be none of an exposure that the session skipped.
+    """
+    if not estimates:
         return {}
-    scorers = {name: Scorer() for name in names}
-    for exposure, each in zip(recording.exposures(), zip(*estimates.values(), strict=True), strict=True):
-        for name, estimate in zip(names, each, strict=True):
-            scorers[name].add(exposure, estimate)
+    scorers = {name: Scorer() for name in estimates}
+    series = {name: iter(each) for name, each in estimates.items()}
+    ahead = {name: next(each, None) for name, each in series.items()}
+    for exposure in recording.exposures():
+        for name, estimate in ahead.items():
+            if estimate is not None and estimate.frame_id == exposure.frame_id:
+                scorers[name].add(exposure, estimate)
+                ahead[name] = next(series[name], None)
     return {name: scorer.result() for name, scorer in scorers.items()}
 
 
 def scores(by_name: Mapping[str, Score]) -> Table:
     """RMSE against truth, NIS and NEES with their 95 % bounds; what is outside its bounds is marked."""
-    counted = next((each.exposures for each in by_name.values()), 0)
+    counted = max((each.exposures for each in by_name.values()), default=0)
     title = f"Estimates of {counted} exposures against the truth" if counted else "No truth in this recording: NIS only"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, caption_justify="left", pad_edge=False)
     table.add_column("estimator", no_wrap=True)

@@ -10,7 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from aolink.recording import schemas_pb2 as pb
-from aolink.session import Report
+from aolink.session import EstimatorReport, Report
 from aolink.tables.json import without_nan
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ def session_as_json(report: Report) -> dict[str, Any]:
     """What `session` says, for scripts."""
     facts = asdict(replace(report, latencies=[]))
     del facts["latencies"]
+    for each in facts["estimation"].values():
+        took_ms = each.pop("took_ms")
+        each["ms"] = dict(zip(("p50", "p99"), np.percentile(took_ms, [50, 99]), strict=True)) if took_ms else {}
     facts["latency_ms"] = {
         name: dict(zip(("p50", "p99"), values, strict=True))
         for name, since, until in _LATENCY_STEPS
@@ -70,11 +73,25 @@ def session(report: Report) -> Table:
         f"device minus host {report.clock_offset_ns / 1e9:.6f} s, {report.clock_frequency_ppm:+.2f} ppm,"
         f" standard deviation {report.clock_sigma_ns / 1e3:.0f} us",
     )
+    for name, each in report.estimation.items():
+        table.add_row("estimates", f"{name}: {_estimation(each)}")
+    if report.unwatched:
+        table.add_row("view", f"no time to show {report.unwatched} exposures")
     if report.virtual_time:
         table.add_row("latency", "n/a on virtual time")
     for name, since, until in () if report.virtual_time else _LATENCY_STEPS:
         table.add_row("latency", f"{name}: {_percentiles(report.latencies, since, until)}")
     return table
+
+
+def _estimation(report: EstimatorReport) -> str:
+    text = f"{report.estimated} of {report.estimated + report.skipped} exposures"
+    if report.skipped:
+        text += f", {report.skipped} skipped" + (": it failed" if report.failed else " for want of time")
+    if report.took_ms:
+        p50, p99 = np.percentile(report.took_ms, [50, 99])
+        text += f"; one takes p50 {p50:.2f} ms, p99 {p99:.2f} ms"
+    return text
 
 
 def _percentiles(latencies: Sequence[pb.Latency], since: str, until: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 import rerun as rr
 
-from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
+from aolink.viewing.palette import APPLIED, COMMANDED, estimator_colour, series_colour
 from aolink.viewing.series import Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
@@ -76,6 +76,24 @@ def log_latency(stream: rr.RecordingStream, timebase: Timebase, latencies: Seque
             send_line(
                 stream, f"latency/{field.removesuffix('_ns')}", times, milliseconds, Style(name, series_colour(i))
             )
+
+
+def log_estimation(stream: rr.RecordingStream, timebase: Timebase, name: str, accounts: Sequence[Any]) -> None:
+    """What an estimator had time for: ``/latency/estimation/NAME``, ms for each estimate; ``/status/NAME`` where it
+    skipped an exposure.
+    """
+    if not accounts:
+        return
+    frames = np.array([m.frame_id for m in accounts], dtype=np.int64)
+    starts = timebase.first_step + (frames - timebase.frame_id) * timebase.frame_period_steps
+    made = np.array([not m.skipped for m in accounts])
+    if made.any():
+        took_ms = [m.took_ns / 1e6 for m in accounts if not m.skipped]
+        style = Style(f"{name} takes", estimator_colour(name))
+        send_line(stream, f"latency/estimation/{name}", timebase.at_steps(starts[made], frames[made]), took_ms, style)
+    if not made.all():
+        times = timebase.at_steps(starts[~made], frames[~made])
+        send_states(stream, f"status/{name}", times, ["SKIPPED"] * int(np.count_nonzero(~made)))
 
 
 def log_drops(stream: rr.RecordingStream, timebase: Timebase, infos: Sequence[Any]) -> None:

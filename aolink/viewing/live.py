@@ -26,9 +26,15 @@ from aolink.viewing.save import APPLICATION, send_camera
 from aolink.viewing.timebase import Timebase
 from aolink.viewing.viewer import HOST, free_port, running_rerun, wait_for_server
 
+_FLUSH_S = 5.0
+"""For what the viewer has not taken yet at the end."""
+
 
 class LiveView:
-    """Sends exposures with their estimates to a viewer, one after the other."""
+    """Sends exposures with their estimates to a viewer, one after the other.
+
+    An estimate may come with a later exposure than its own, where it took long.
+    """
 
     def __init__(
         self,
@@ -45,6 +51,8 @@ class LiveView:
         self._top: float | None = None
         self._scenes: list[str] = []
         """What is shown of the scene."""
+        self._measuring: set[str] = set()
+        """Estimators that have an innovation."""
         self._true_scene = true_scene
 
     def show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
@@ -65,9 +73,11 @@ class LiveView:
             motion.log_estimates(stream, timebase, [each])
             motion.log_errors(stream, timebase, [each], truths)
         shown = self._show_scene(exposure, estimates)
-        if first or shown != self._scenes:
+        measuring = {each.estimator for each in estimates if each.innovation.shape[1]} - self._measuring
+        if first or measuring or shown != self._scenes:
             self._scenes = shown
-            self._lay_out(exposure, estimates)
+            self._measuring |= measuring
+            self._lay_out(exposure)
 
     def _show_scene(self, exposure: Exposure, estimates: Sequence[Estimate]) -> list[str]:
         """The scene as it came and restored with the last estimator's path; gives all that was shown of it by now."""
@@ -77,7 +87,7 @@ class LiveView:
             return self._scenes
         scene.log_scenes(self._stream, sensor, timebase, [exposure])
         shown.add(scene.SCENE)
-        focus = [each for each in estimates if self._names and each.estimator == self._names[-1]]
+        focus = [each for each in estimates if each.estimator == self._names[-1] and each.frame_id == exposure.frame_id]
         if focus:
             done = deblur(self._rig, exposure, focus[0])
             if scene.log_restored(self._stream, timebase, [exposure], [done]):
@@ -87,11 +97,11 @@ class LiveView:
             shown.add(scene.TRUE_SCENE)
         return [path for path in (scene.SCENE, scene.RESTORED_SCENE, scene.TRUE_SCENE) if path in shown]
 
-    def _lay_out(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
+    def _lay_out(self, exposure: Exposure) -> None:
         contents = Contents(
             rig=self._rig,
             estimators=self._names,
-            measuring=[each.estimator for each in estimates if each.innovation.shape[1]],
+            measuring=[name for name in self._names if name in self._measuring],
             density_top=self._top or 1.0,
             truth=exposure.truth is not None,
             scenes=self._scenes,
@@ -103,52 +113,6 @@ class LiveView:
             log=False,
         )
         self._stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
-
-
-class Decimating:
-    """Shows on a thread of its own what it has time for; whoever hands over never waits.
-
-    Of what comes while it is busy it shows the newest, and counts the rest.
-    """
-
-    def __init__(self, view: LiveView) -> None:
-        self.skipped = 0
-        """Exposures that were not shown."""
-        self._view = view
-        self._next: tuple[Exposure, Sequence[Estimate]] | None = None
-        self._changed = threading.Condition()
-        self._closed = False
-        self._failed: Exception | None = None
-        self._thread = threading.Thread(target=self._run, name="aolink-viewer", daemon=True)
-        self._thread.start()
-
-    def show(self, exposure: Exposure, estimates: Sequence[Estimate]) -> None:
-        """Hand over the next exposure."""
-        with self._changed:
-            self.skipped += self._next is not None
-            self._next = (exposure, estimates)
-            self._changed.notify()
-
-    def close(self) -> None:
-        """Show what is waiting, and end. Raises what went wrong while showing."""
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-        self._thread.join()
-        if self._failed is not None:
-            raise ViewerError(f"the live view ended: {self._failed}") from self._failed
-
-    def _run(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._next is not None or self._closed)
-                waiting, self._next = self._next, None
-            if waiting is None:
-                return
-            try:
-                self._view.show(*waiting)
-            except Exception as error:  # a session must not end for its picture
-                self._failed = self._failed or error
 
 
 @contextmanager
@@ -171,7 +135,13 @@ def live_viewer(
         stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
         try:
             yield LiveView(stream, rig, estimators, true_scene)
-            stream.flush()
+            # Without a bound for it, a viewer that takes nothing would be waited for without end, and no signal heard.
+            flushing = threading.Thread(target=stream.flush, daemon=True)
+            flushing.start()
+            flushing.join(_FLUSH_S)
+            if flushing.is_alive():
+                process.kill()
+                raise ViewerError(f"the viewer has taken nothing for {_FLUSH_S:g} s, and was ended")
             process.wait()
         finally:
             stream.disconnect()

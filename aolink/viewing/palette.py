@@ -44,6 +44,7 @@ STATUS_COLOURS: dict[str, Colour] = {
     "DIVERGED": (190, 50, 50),
     "REINITIALISED": (150, 80, 170),
     "INPUT_INVALID": (120, 60, 60),
+    "SKIPPED": (70, 70, 70),
     "COMMAND": (45, 110, 75),
     "PARKED": (80, 80, 100),
     "CLIPPED": (190, 50, 50),

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 APPLICATION = "aolink"
 """Rerun keeps a user's own layouts by this name."""
+_ESTIMATION = "/estimation/"
+"""Prefix of the topics of what estimators had time for."""
 
 
 def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -178,6 +180,9 @@ def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Ti
         ("/latency", devices.log_latency),
     ):
         log(stream, timebase, [r.message for r in by_topic.get(topic, [])])
+    for topic in [each for each in recording.counts if each.startswith(_ESTIMATION)]:
+        accounts = [r.message for r in recording.messages(topic)]
+        devices.log_estimation(stream, timebase, topic.removeprefix(_ESTIMATION), accounts)
     devices.log_link(stream, timebase, by_topic.get("/link", []))
     devices.log_clock(stream, timebase, by_topic.get("/clock", []))
     devices.log_log(stream, timebase, by_topic.get("/log", []))
@@ -205,4 +210,7 @@ def _summary(recording: Recording, exposures: list[Exposure], estimates: dict[st
         nis = result.nis
         shown = "" if np.isnan(nis.mean) else f"{nis.mean:.2f} ({nis.low:.2f} to {nis.high:.2f})"
         lines.append(f"| {name} | {path} | {end} | {shown} |")
+    skipped = {name: n for name in estimates if (n := len(recording.skipped(name)))}
+    if skipped:
+        lines += ["", "Exposures skipped for want of time: " + ", ".join(f"{name} {n}" for name, n in skipped.items())]
     return "\n".join([*lines, "", rig.summary])

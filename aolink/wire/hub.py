@@ -10,13 +10,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 from google.protobuf.message import Message
 
 from aolink.errors import DeviceError
 from aolink.wire.link import Link, Received
-from aolink.wire.port import Transport, wait_readable
+from aolink.wire.port import HasFileno, Transport, wait_readable
 
 ANSWER_S = 1.0
 """How long an answer may take before a request is sent again."""
@@ -29,6 +29,21 @@ _SLICE_S = 0.1
 AnyMessage = TypeVar("AnyMessage", bound=Message)
 
 
+class Served(HasFileno, Protocol):
+    """Somebody beside the lines whom the hub's wait serves as well."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether there is anything to wait for."""
+
+    @property
+    def has_to_send(self) -> bool:
+        """Whether something is to be sent as soon as it is taken."""
+
+    def serve(self) -> None:
+        """Send and receive what goes without waiting."""
+
+
 class Hub:
     """The host's clock and the links of one session.
 
@@ -39,6 +54,8 @@ class Hub:
         self._stop = stop
         self.links: list[Link] = []
         self.virtual = False
+        self.beside: Sequence[Served] = ()
+        """Served while the hub waits in real time."""
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._virtual_ns = 0
         self._pending: list[tuple[Link, Received]] = []
@@ -73,8 +90,12 @@ class Hub:
             # Time moves here and nowhere else: what a send sees must not depend on what has come by then.
             self._virtual_ns = max(self._virtual_ns, *(link.handed.host_ns for link in self.links if link.handed))
         elif not pending:
-            wait_readable([link.transport for link in self.links], min(timeout_s, _SLICE_S))
+            beside = [each for each in self.beside if each.alive]
+            lines = [link.transport for link in self.links]
+            wait_readable([*lines, *beside], min(timeout_s, _SLICE_S), [each for each in beside if each.has_to_send])
             pending = [(link, r) for link in self.links for r in link.receive()]
+            for each in beside:
+                each.serve()
         order = {link: i for i, link in enumerate(self.links)}
         pending.sort(key=lambda pair: (pair[1].receive_ns, order[pair[0]]))
         return pending

@@ -83,9 +83,15 @@ class SerialPort:
             self._serial.close()
 
 
-def wait_readable(transports: Sequence[Transport], timeout_s: float) -> None:
-    """Wait until one of the transports has something, or for ``timeout_s``."""
-    select.select([t.fileno() for t in transports], [], [], max(0.0, timeout_s))
+class HasFileno(Protocol):
+    """Anything that the operating system can wait for."""
+
+    def fileno(self) -> int: ...
+
+
+def wait_readable(some: Sequence[HasFileno], timeout_s: float, writable: Sequence[HasFileno] = ()) -> None:
+    """Wait until one of ``some`` has something or one of ``writable`` takes something, or for ``timeout_s``."""
+    select.select(some, writable, [], max(0.0, timeout_s))
 
 
 def _open_error(url: str, error: Exception) -> PortError:

@@ -223,15 +223,16 @@ def test_real_time_has_latencies_and_accounts_for_every_step(tmp_path: Path) -> 
 
 
 def stopped_host(path: Path, seconds: float) -> Report:
-    """A session in real time whose host is held up after its first exposure."""
-    held_up = []
+    """A session in real time whose host is held up in the middle of its second exposure."""
+    rig = load_rig("section-vi-lively")
 
-    def progress(exposures: int) -> None:
-        if exposures and not held_up:
-            held_up.append(time.sleep(seconds))  # the fault itself, not a wait for something
+    def inputs(first_step: int, n_steps: int) -> np.ndarray:
+        if first_step == 300:
+            time.sleep(seconds)  # the fault itself, not a wait for something
+        return rig.drive.inputs(first_step, n_steps, rig.timing.fast_step_s)
 
     with simulated_rig("section-vi-lively", "--real-time") as (camera, mirror):
-        return record(load_rig("section-vi-lively"), camera, mirror, path, exposures=8, progress=progress)
+        return record(rig, camera, mirror, path, exposures=8, inputs=inputs)
 
 
 @pytest.mark.parametrize("seconds", [0.3, 1.0])

@@ -56,6 +56,8 @@ class StandIn:
     lost: tuple[int, ...] = ()
     with_truth: bool = True
     with_latency: bool = True
+    without_time: tuple[int, ...] = ()
+    """Frames that o3 skipped in the session."""
     rig: Rig = field(default_factory=lambda: load_rig("section-vi-lively"))
     path: Path = Path("session.mcap")
     metadata: dict[str, str] = field(default_factory=dict)
@@ -95,6 +97,13 @@ class StandIn:
     @property
     def estimators(self) -> list[str]:
         return list(self.names)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {"/estimation/o3": self.n} if self.without_time else {}
+
+    def skipped(self, name: str) -> frozenset[int]:
+        return frozenset(self.without_time if name == "o3" else ())
 
     @property
     def true_scene(self) -> None:
@@ -161,6 +170,12 @@ class StandIn:
                 )
                 late.estimated_ns = end + 1_500_000 + 100_000 * (e.frame_id % 3)
                 yield Recorded("/latency", at, 0, late)
+            if self.without_time:
+                skipped = e.frame_id in self.without_time
+                done = schemas.Estimation(
+                    estimator="o3", frame_id=e.frame_id, skipped=skipped, took_ns=0 if skipped else 10**6
+                )
+                yield Recorded("/estimation/o3", at, 0, done)
 
     def _per_second(self) -> Iterator[Recorded]:
         for s in range(self.n // 5 + 1):

@@ -341,30 +341,30 @@ def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session
             assert ours
 
 
-def test_a_slow_viewer_skips_and_nobody_waits_for_it(recorded: Session) -> None:
-    import threading
+def test_a_live_view_takes_an_estimate_with_a_later_exposure(recorded: Session, tmp_path: Path) -> None:
+    """An estimator that takes long is late: what it says is shown where it belongs."""
+    from aolink.viewing import LiveView
 
-    from aolink.viewing import Decimating
+    recording = Recording(recorded.path)
+    exposures, late = list(recording.exposures())[:4], recording.estimates("o3")[:4]
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "live.rrd")
+    live = LiveView(stream, recording.rig, ["o3"])
+    for exposure, estimates in zip(exposures, ([], [], [late[0]], [late[1], late[3]]), strict=True):
+        live.show(exposure, estimates)
+    stream.disconnect()
+    entities = read_rrd(tmp_path / "live.rrd")
+    shown = scalars(entities["/path/o3/mean"])[:, 0]
+    np.testing.assert_array_equal(shown, np.concatenate([late[k].path[0] for k in (0, 1, 3)]))
+    steps = [step for step in entities["/path/o3/mean"]["fast_step"] if step is not None]
+    assert steps == [e.first_step + k for e in (late[0], late[1], late[3]) for k in range(e.n_steps)]
 
-    class Slow:
-        """Shows one exposure until it is let go on."""
 
-        def __init__(self) -> None:
-            self.shown: list[int] = []
-            self.began, self.go_on = threading.Event(), threading.Event()
-
-        def show(self, exposure, estimates) -> None:
-            self.began.set()
-            self.go_on.wait(10)
-            self.shown.append(exposure.frame_id)
-
-    exposures, slow = list(Recording(recorded.path).exposures()), Slow()
-    view = Decimating(slow)
-    view.show(exposures[0], [])
-    assert slow.began.wait(10)
-    for exposure in exposures[1:]:
-        view.show(exposure, [])  # the viewer is still at the first
-    slow.go_on.set()
-    view.close()
-    assert slow.shown == [exposures[0].frame_id, exposures[-1].frame_id]
-    assert view.skipped == len(exposures) - 2
+def test_what_an_estimator_had_no_time_for_is_shown(tmp_path: Path) -> None:
+    save_rrd(StandIn(n=12, without_time=(7, 8)), tmp_path / "a.rrd")
+    entities = read_rrd(tmp_path / "a.rrd")
+    assert len(scalars(entities["/latency/estimation/o3"])) == 10
+    states = [each for each in entities["/status/o3"]["StateChange:state"] if each is not None]
+    assert sum(each == ["SKIPPED"] or each == "SKIPPED" for each in states) == 2
+    (text,) = [each for each in entities["/session"]["TextDocument:text"] if each is not None]
+    assert "skipped for want of time: o3 2" in str(text)

@@ -1,0 +1,337 @@
+"""Who estimates the exposures of a session: its loop, on virtual time, or processes beside it, in real time.
+
+In real time nothing may stand between the wire and the file. Each estimator runs in a process of its own and gets
+exposures from a bounded queue (`aolink.session.waiting.Waiting`); those that it has no time for it skips, each
+estimator by itself. It predicts over what it has skipped with the inputs that the mirror applied, so that
+`aolink.estimation.Driver` gives the same bits when it is told which exposures these were.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+from aolink.errors import EstimatorError
+from aolink.estimation import Driver, Estimate, exposure_model
+from aolink.estimation.driver import SkippedInputs
+from aolink.exposure import Exposure
+from aolink.recording import convert
+from aolink.recording import schemas_pb2 as pb
+from aolink.rig import Rig
+from aolink.session.estimator_process import LENGTH, READY, packed
+from aolink.session.waiting import Waiting, most_waiting
+from aolink.workers import THREAD_VARIABLES
+
+_SLICE_S = 0.1
+"""Longest wait for processes that begin: a request to stop is seen that soon."""
+_READ_BYTES = 1 << 20
+_END_S = 1.0
+"""For a process that was told to end."""
+_REAP_S = 0.01
+"""For one whose end of the socket is closed: the loop waits for it."""
+NO_TIME = "no time: the estimator was busy with earlier exposures"
+_OVER = "no time: the session was over before its estimate was there"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """What became of an exposure with one estimator."""
+
+    estimator: str
+    exposure: Exposure
+    message: pb.Estimate | None
+    """The estimate as it is recorded; None if the exposure was skipped."""
+    reason: str = ""
+    """Why it was skipped."""
+    took_ns: int = 0
+    """How long the estimate took, ns; 0 on virtual time."""
+
+    def account(self) -> pb.Estimation:
+        """What is recorded of it, besides the estimate."""
+        return pb.Estimation(
+            estimator=self.estimator,
+            frame_id=self.exposure.frame_id,
+            skipped=self.message is None,
+            reason=self.reason,
+            took_ns=self.took_ns,
+        )
+
+    def estimate(self, rig: Rig) -> Estimate:
+        """The estimate. Only for an outcome that has one."""
+        assert self.message is not None
+        model = exposure_model(rig.plant, rig.timing.exposure_steps)
+        return convert.estimate_from_message(self.message, model, self.exposure)
+
+
+class Estimating(Protocol):
+    """Takes exposures in order and gives one outcome of each for each estimator, in any order of the estimators."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """The estimators."""
+
+    @property
+    def failures(self) -> Mapping[str, str]:
+        """Why an estimator has failed and skips all exposures from now on, by its name."""
+
+    def get_ready(self, stop: Callable[[], bool]) -> None:
+        """Have everything computed, compiled and loaded that a session must not wait for, or ``stop()``.
+
+        Raises EstimatorError where an estimator cannot do it.
+        """
+
+    def offer(self, exposure: Exposure) -> list[Outcome]:
+        """Take the next exposure, without waiting; gives what is known at once."""
+
+    def outcomes(self) -> list[Outcome]:
+        """What has become known since."""
+
+    def finish(self, patience_s: float) -> list[Outcome]:
+        """Wait up to ``patience_s`` for what is under way, give up the rest, and give the outcomes of both."""
+
+
+class InTheLoop:
+    """Estimates when an exposure is offered: for virtual time, which waits meanwhile."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self.names = [estimator.name for estimator in driver.estimators]
+        self.failures: dict[str, str] = {}
+
+    def get_ready(self, stop: Callable[[], bool]) -> None:
+        pass
+
+    def offer(self, exposure: Exposure) -> list[Outcome]:
+        return [
+            Outcome(estimator=each.estimator, exposure=exposure, message=convert.estimate_message(each))
+            for each in self._driver.step(exposure)
+        ]
+
+    def outcomes(self) -> list[Outcome]:
+        return []
+
+    def finish(self, patience_s: float) -> list[Outcome]:
+        return []
+
+
+class BesideTheLoop:
+    """One process for each estimator; they are made and get ready meanwhile."""
+
+    def __init__(self, rig: Rig, names: Sequence[str]) -> None:
+        self.names = names
+        self.processes: list[EstimatorProcess] = []
+        try:
+            for name in names:
+                self.processes.append(EstimatorProcess(rig, name))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.close()
+
+    @property
+    def failures(self) -> dict[str, str]:
+        return {each.name: each.failed for each in self.processes if each.failed}
+
+    def get_ready(self, stop: Callable[[], bool]) -> None:
+        while not stop() and not all(each.ready for each in self.processes):
+            self.serve(_SLICE_S)
+            for name, why in self.failures.items():
+                raise EstimatorError(f"the estimator {name} does not start: {why}")
+
+    def offer(self, exposure: Exposure) -> list[Outcome]:
+        for each in self.processes:
+            each.offer(exposure)
+        return self.outcomes()
+
+    def outcomes(self) -> list[Outcome]:
+        return [outcome for each in self.processes for outcome in each.take_outcomes()]
+
+    def finish(self, patience_s: float) -> list[Outcome]:
+        deadline = time.monotonic() + patience_s
+        while any(each.busy for each in self.processes) and (left_s := deadline - time.monotonic()) > 0:
+            self.serve(left_s)
+        for each in self.processes:
+            each.give_up(_OVER)
+        return self.outcomes()
+
+    def close(self) -> None:
+        """End the processes."""
+        for each in self.processes:
+            each.end()
+        for each in self.processes:
+            each.wait()
+
+    def serve(self, timeout_s: float) -> None:
+        """Wait up to ``timeout_s`` for something to send or to receive, and do that."""
+        alive = [each for each in self.processes if each.alive]
+        select.select(alive, [each for each in alive if each.has_to_send], [], timeout_s)
+        for each in alive:
+            each.serve()
+
+
+class EstimatorProcess:
+    """The process of one estimator, seen from the loop: nothing here waits for it."""
+
+    def __init__(self, rig: Rig, name: str) -> None:
+        self.name = name
+        self.ready = False
+        """Whether it has computed and loaded what it needs."""
+        self.failed = ""
+        """Why it will estimate no more."""
+        self._exposure: Exposure | None = None
+        """The one that it has."""
+        self._waiting = Waiting[Exposure](most_waiting(rig.timing))
+        self._skipped = SkippedInputs()
+        self._outcomes: list[Outcome] = []
+        self._to_send: deque[memoryview] = deque()
+        self._received = bytearray()
+        self._connection, theirs = socket.socketpair()
+        # It imports what this process has imported, wherever that was found. Its linear algebra has one thread, as
+        # in all processes of a pool: the cores are for the loop as well.
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        environment |= dict.fromkeys(THREAD_VARIABLES, "1")
+        main = f"from aolink.session.estimator_process import main; main({theirs.fileno()}, {os.getpid()})"
+        with theirs:
+            # A group of its own: Ctrl-C is for the session, which waits for what is under way.
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-c", main], pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL, start_new_session=True, env=environment,
+            )  # fmt: skip
+        self._connection.setblocking(False)
+        self._send((rig, name))
+
+    @property
+    def alive(self) -> bool:
+        return not self.failed
+
+    @property
+    def busy(self) -> bool:
+        """Whether an exposure of its waits for its outcome."""
+        return self._exposure is not None
+
+    @property
+    def has_to_send(self) -> bool:
+        return bool(self._to_send)
+
+    def fileno(self) -> int:
+        return self._connection.fileno()
+
+    def offer(self, exposure: Exposure) -> None:
+        """Take the next exposure, for the process or as one to skip."""
+        if self.failed:
+            self._skip([exposure], self._why_failed())
+            return
+        self._skip(self._waiting.put(exposure), NO_TIME)
+        self._go_on()
+
+    def take_outcomes(self) -> list[Outcome]:
+        """What has become known."""
+        outcomes, self._outcomes = self._outcomes, []
+        return outcomes
+
+    def serve(self) -> None:
+        """Send and receive as much as goes without waiting."""
+        self._flush()
+        ended = False
+        try:
+            while not ended:
+                data = self._connection.recv(_READ_BYTES)
+                self._received += data
+                ended = not data
+        except BlockingIOError:
+            pass
+        except OSError:
+            ended = True
+        while len(self._received) >= LENGTH.size and self.alive:
+            (size,) = LENGTH.unpack_from(self._received)
+            if len(self._received) < LENGTH.size + size:
+                break
+            message = pickle.loads(memoryview(self._received)[LENGTH.size : LENGTH.size + size])
+            del self._received[: LENGTH.size + size]
+            self._take(message)
+        if ended and self.alive:
+            self._fail(f"its process ended{_how(self._process)}")
+
+    def give_up(self, reason: str) -> None:
+        """Skip what it has and what waits for it."""
+        had = [] if self._exposure is None else [self._exposure]
+        self._exposure = None
+        self._skip([*had, *self._waiting.clear()], reason)
+
+    def end(self) -> None:
+        """Have the process end, whatever it does."""
+        self._connection.close()
+        self._process.kill()
+
+    def wait(self) -> None:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_END_S)
+
+    def _take(self, message: Any) -> None:
+        if message is READY:
+            self.ready = True
+        elif isinstance(message, str):
+            self._fail(message)
+        elif self._exposure is not None:
+            data, took_ns = message
+            estimate, exposure = pb.Estimate.FromString(data), self._exposure
+            self._outcomes.append(Outcome(estimator=self.name, exposure=exposure, message=estimate, took_ns=took_ns))
+            self._exposure = None
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Hand over the next exposure if the process has none."""
+        if self.ready and not self.busy and (exposure := self._waiting.take()) is not None:
+            self._exposure = exposure
+            self._send(self._skipped.leading(exposure))
+
+    def _send(self, message: object) -> None:
+        self._to_send.append(memoryview(packed(message)))
+        self._flush()
+
+    def _flush(self) -> None:
+        try:
+            while self._to_send:
+                sent = self._connection.send(self._to_send[0])
+                self._to_send[0] = self._to_send[0][sent:]
+                if not self._to_send[0]:
+                    self._to_send.popleft()
+        except BlockingIOError:
+            pass
+        except OSError:  # the process is gone; `serve` reads what it has said until then, and the end
+            self._to_send.clear()
+
+    def _fail(self, why: str) -> None:
+        self.failed = why
+        self.give_up(self._why_failed())
+
+    def _why_failed(self) -> str:
+        return f"the estimator failed: {self.failed}"
+
+    def _skip(self, exposures: Sequence[Exposure], reason: str) -> None:
+        for exposure in exposures:
+            self._skipped.skip(exposure)
+            self._outcomes.append(Outcome(estimator=self.name, exposure=exposure, message=None, reason=reason))
+
+
+def _how(process: subprocess.Popen[bytes]) -> str:
+    """How a process ended, in words; empty where that is not known."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        code = process.wait(_REAP_S)
+        return f" by signal {-code}" if code < 0 else f" with exit code {code}"
+    return ""

@@ -1,0 +1,103 @@
+"""The process of one estimator of a session in real time: exposures in, estimates out, over a socket.
+
+It is a process because estimators hold the interpreter's lock, and a loop that shares the lock with them waits for
+them. There is one for each estimator because a slow one must not hold up a fast one. `aolink.session.estimating` starts
+it and is at the other end of the socket.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import pickle
+import signal
+import socket
+import struct
+import sys
+import time
+from typing import Any
+
+import numpy as np
+
+from aolink.errors import AolinkError
+from aolink.estimation import make_estimator
+from aolink.exposure import Exposure
+from aolink.recording import convert
+from aolink.rig import Rig
+
+LENGTH = struct.Struct("<Q")
+"""Each message on the socket is a pickle behind its length."""
+_NICENESS = 5
+"""Where all cores are busy, the loop, the devices' drivers and the disk come first."""
+_PARENT_DEATH_SIGNAL = 1
+"""PR_SET_PDEATHSIG of Linux."""
+
+
+READY = None
+"""What comes first; then of each exposure the bytes of its estimate's message and the time that it took, ns. A text
+that comes in their place says why there will be no more."""
+
+
+def packed(message: object) -> bytes:
+    """A message as it goes over the socket."""
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    return LENGTH.pack(len(data)) + data
+
+
+def main(fileno: int, parent: int) -> None:
+    """Estimate what comes until the socket is closed."""
+    _end_with(parent)
+    os.nice(_NICENESS)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with socket.socket(fileno=fileno) as connection, connection.makefile("rb") as stream:
+        try:
+            _serve(connection, stream)
+        except (EOFError, ConnectionError):  # the session is over
+            return
+        except Exception as error:
+            with contextlib.suppress(ConnectionError):
+                connection.sendall(packed(str(error) if isinstance(error, AolinkError) else repr(error)))
+
+
+def _serve(connection: socket.socket, stream: Any) -> None:
+    rig, name = _received(stream)
+    # What an estimator of this rig computes or loads once, a session must not wait for.
+    make_estimator(rig, name).step(_dark(rig))
+    estimator = make_estimator(rig, name)
+    connection.sendall(packed(READY))
+    while True:
+        exposure: Exposure = _received(stream)
+        start_ns = time.monotonic_ns()
+        data = convert.estimate_message(estimator.step(exposure)).SerializeToString()
+        connection.sendall(packed((data, time.monotonic_ns() - start_ns)))
+
+
+def _received(stream: Any) -> Any:
+    """The next message. Raises EOFError when the socket is closed."""
+    header = stream.read(LENGTH.size)
+    if len(header) < LENGTH.size:
+        raise EOFError
+    return pickle.loads(stream.read(*LENGTH.unpack(header)))
+
+
+def _dark(rig: Rig) -> Exposure:
+    steps, shape = rig.timing.exposure_steps, rig.sensor.shape
+    return Exposure(
+        frame_id=0,
+        first_step=0,
+        n_steps=steps,
+        pixels=np.zeros(shape, dtype=np.uint16),
+        mask=np.ones(shape, dtype=bool),
+        inputs=np.zeros((steps, rig.n_inputs)),
+        lead_inputs=np.zeros((0, rig.n_inputs)),
+        start_offset=rig.timing.exposure_offset,
+    )
+
+
+def _end_with(parent: int) -> None:
+    """End with the parent, however that ends. Elsewhere than on Linux it ends when its exposure is done."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before this
+        os._exit(1)

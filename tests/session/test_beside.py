@@ -1,0 +1,439 @@
+"""Estimation beside the recording: nothing stands between the wire and the file."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.demo import simulated_rig
+from aolink.errors import EstimatorError
+from aolink.estimation import Driver, make_estimator
+from aolink.estimation.driver import SkippedInputs
+from aolink.exposure import Exposure
+from aolink.recording import schemas_pb2 as pb
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, recorded_estimates, reestimate
+from aolink.rig import load_rig, parse_rig
+from aolink.session import Report, record
+from aolink.session.estimating import BesideTheLoop, Outcome
+from aolink.session.report import LatencyBook
+from aolink.session.waiting import Aside, Waiting, most_waiting
+from aolink.wire import messages_pb2 as wire
+from tests.conftest import Session
+
+SLOW = "sampled"
+"""It takes some tenths of a second for an exposure, ..."""
+FAST = load_rig("section-vi-lively").toml.replace("exposure_steps = 200", "exposure_steps = 50")
+"""... of which this rig's camera has 20 a second."""
+EXPOSURES = 40
+
+
+@pytest.fixture(scope="module")
+def rig_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rig") / "fast.toml"
+    path.write_text(FAST)
+    return path
+
+
+@pytest.fixture(scope="module")
+def loaded(rig_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
+    """A session in real time with an estimator that is slower than the camera."""
+    path = tmp_path_factory.mktemp("loaded") / "session.mcap"
+    with simulated_rig(rig_file, "--real-time") as ports:
+        report = record(parse_rig(FAST), *ports, path, estimators=[SLOW, "o3"], exposures=EXPOSURES)
+    return Session(path, report)
+
+
+def test_a_slow_estimator_costs_no_frame_and_no_command(loaded: Session) -> None:
+    report, recording = loaded.report, Recording(loaded.path)
+    assert (report.ended, report.exposures, report.frames_received) == ("complete", EXPOSURES, EXPOSURES)
+    assert report.frames_lost == report.frames_incomplete == report.packets_missing == 0
+    assert report.steps_commanded == 50 * EXPOSURES
+    assert recording.complete
+    for topic in (topics.IMAGE, topics.EXPOSURE, topics.TRUTH, topics.LATENCY):
+        assert recording.counts[topic] == EXPOSURES
+
+
+def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> None:
+    recording, metadata = Recording(loaded.path), Recording(loaded.path).metadata
+    for name in (SLOW, "o3"):
+        counted = loaded.report.estimation[name]
+        accounts = [each.message for each in recording.messages(topics.estimation_topic(name))]
+        assert counted.estimated + counted.skipped == len(accounts) == EXPOSURES
+        assert sorted(each.frame_id for each in accounts) == list(range(1, EXPOSURES + 1))
+        estimated = [each.frame_id for each in recorded_estimates(recording, name)]
+        assert [each.frame_id for each in accounts if not each.skipped] == estimated
+        assert len(estimated) == counted.estimated == len(counted.took_ms) > 0
+        assert all((each.took_ns > 0) != each.skipped for each in accounts)
+        assert all(bool(each.reason) == each.skipped for each in accounts)
+        assert recording.skipped(name) == {each.frame_id for each in accounts if each.skipped}
+        assert metadata[f"skipped_{name}"] == str(counted.skipped)
+    assert loaded.report.estimation[SLOW].skipped > loaded.report.estimation["o3"].skipped
+    assert loaded.report.exposures_skipped[SLOW] == loaded.report.estimation[SLOW].skipped > 0
+
+
+def test_what_was_estimated_online_is_the_same_offline_with_the_same_exposures_skipped(loaded: Session) -> None:
+    recording = Recording(loaded.path)
+    again = reestimate(recording, [SLOW, "o3"], as_recorded=True)
+    for name in (SLOW, "o3"):
+        assert first_difference(recording.estimates(name), again[name]) is None
+
+
+def test_compare_replay_and_estimate_know_of_the_skipped(
+    loaded: Session, aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    skipped = loaded.report.estimation[SLOW].skipped
+    compared = aolink("compare", loaded.path)
+    assert (compared.returncode, compared.stderr) == (0, "")
+    assert compared.stdout.endswith("the same\n")
+    replayed = aolink("replay", loaded.path, "-e", "o3", "--json")
+    assert replayed.returncode == 0, replayed.stderr
+    done = aolink("estimate", loaded.path, "-e", SLOW, "-o", "whole.mcap")
+    assert done.returncode == 0, done.stderr
+    assert f"no time for {skipped} exposures, all are estimated here" in " ".join(done.stdout.split())
+    whole = Recording(tmp_path / "whole.mcap")
+    assert len(whole.estimates(SLOW)) == EXPOSURES
+    # The exposures that were skipped tell it more: it is not the same.
+    last = Recording(loaded.path).estimates(SLOW)[-1]
+    assert not np.array_equal(whole.estimates(SLOW)[last.frame_id - 1].end_state, last.end_state)
+    assert whole.skipped(SLOW) == frozenset()
+    facts = json.loads(aolink("info", loaded.path, "--json").stdout)
+    assert facts["losses"][f"skipped_{SLOW}"] == skipped
+
+
+def test_latencies_stay_in_order_beside_a_slow_estimator(loaded: Session) -> None:
+    """A frame is estimated when the last estimator that has time for it is done, and then a command knows it."""
+    skipped = Recording(loaded.path).skipped(SLOW) & Recording(loaded.path).skipped("o3")
+    assert len(loaded.report.latencies) == EXPOSURES
+    for each in loaded.report.latencies:
+        assert 0 < each.first_byte_ns <= each.complete_ns
+        assert (each.estimated_ns == 0) == (each.frame_id in skipped)
+        assert each.estimated_ns == 0 or each.complete_ns <= each.estimated_ns
+        if each.command_sent_ns and each.estimated_ns:
+            assert each.estimated_ns <= each.command_sent_ns
+
+
+def exposures_of(recording: Session) -> list[Exposure]:
+    return list(Recording(recording.path).exposures())
+
+
+def outcome_of(beside: BesideTheLoop, name: str, frame_id: int) -> Outcome:
+    """Serve the processes until this estimator is through with a frame."""
+    for _ in range(6000):
+        beside.serve(0.01)
+        for outcome in beside.outcomes():
+            if (outcome.estimator, outcome.exposure.frame_id) == (name, frame_id):
+                return outcome
+    return pytest.fail(f"{name} is not through with frame {frame_id} within a minute")
+
+
+def test_a_slow_estimator_makes_no_fast_one_skip(recorded: Session) -> None:
+    rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
+    with BesideTheLoop(rig, [SLOW, "o3"]) as beside:
+        beside.get_ready(lambda: False)
+        for exposure in exposures:
+            beside.offer(exposure)
+            assert outcome_of(beside, "o3", exposure.frame_id).message is not None
+        rest = beside.finish(0.0)
+    assert {each.estimator for each in rest} <= {SLOW}
+    assert all(each.message is None and "the session was over" in each.reason for each in rest)
+
+
+def test_an_estimate_from_beside_is_that_of_the_driver(recorded: Session) -> None:
+    rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
+    ours = []
+    with BesideTheLoop(rig, ["o3"]) as beside:
+        beside.get_ready(lambda: False)
+        for exposure in exposures:
+            beside.offer(exposure)
+            outcome = outcome_of(beside, "o3", exposure.frame_id)
+            assert outcome.took_ns > 0
+            ours.append(outcome.estimate(rig))
+    assert first_difference(ours, Recording(recorded.path).estimates("o3")) is None
+
+
+def test_an_estimator_that_cannot_work_ends_the_session_before_it_begins() -> None:
+    why = "the estimator o9 does not start: there is no estimator 'o9'"
+    with BesideTheLoop(load_rig("section-vi"), ["o9"]) as beside, pytest.raises(EstimatorError, match=why):
+        beside.get_ready(lambda: False)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it reads /proc")
+def test_the_recording_goes_on_without_an_estimator_that_was_killed(rig_file: Path, tmp_path: Path) -> None:
+    rig, path = parse_rig(FAST), tmp_path / "a.mcap"
+
+    def inputs(first_step: int, n_steps: int) -> np.ndarray:
+        if first_step == 1000:
+            (process,) = children(os.getpid(), "estimator_process")
+            os.kill(process, signal.SIGKILL)
+        return rig.drive.inputs(first_step, n_steps, rig.timing.fast_step_s)
+
+    with simulated_rig(rig_file, "--real-time") as ports:
+        report = record(rig, *ports, path, estimators=["o3"], exposures=40, inputs=inputs)
+    assert (report.ended, report.frames_received, report.frames_lost) == ("complete", 40, 0)
+    counted = report.estimation["o3"]
+    assert "its process ended" in counted.failed
+    assert counted.estimated + counted.skipped == 40
+    assert counted.skipped >= 20
+    assert [each for each in report.warnings if each.startswith("the estimator o3 failed, the recording goes on")]
+    recording = Recording(path)
+    assert recording.complete
+    again = reestimate(recording, ["o3"], as_recorded=True)["o3"]
+    assert first_difference(list(recorded_estimates(recording, "o3")), again) is None
+
+
+def children(parent: int, what: str) -> list[int]:
+    """Children of a process with this in their command line."""
+    found = []
+    for each in Path("/proc").glob("[0-9]*"):
+        try:
+            status, command = (each / "stat").read_text(), (each / "cmdline").read_text()
+        except OSError:  # it has ended meanwhile
+            continue
+        if int(status.rpartition(")")[2].split()[1]) == parent and what in command:
+            found.append(int(each.name))
+    return found
+
+
+@contextmanager
+def recording_process(rig_file: Path, path: Path, *more: str, **options: object) -> Iterator[subprocess.Popen[bytes]]:
+    """`aolink record` in real time with a slow estimator."""
+    with simulated_rig(rig_file, "--real-time") as (camera, mirror):
+        command = [
+            sys.executable, "-m", "aolink", "record", "--camera", camera, "--mirror", mirror, "--rig", str(rig_file),
+            "-o", str(path), *more,
+        ]  # fmt: skip
+        with subprocess.Popen(command, **options) as process:  # type: ignore[call-overload] # options of Popen
+            try:
+                yield process
+            finally:
+                process.kill()
+
+
+def until(true: Callable[[], bool]) -> None:
+    for _ in range(6000):
+        if true():
+            return
+        time.sleep(0.01)
+    pytest.fail("it does not become true within a minute")
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it reads /proc")
+def test_a_killed_session_takes_its_estimators_along(rig_file: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with recording_process(rig_file, path, "-e", SLOW, "-e", "o3", stderr=subprocess.DEVNULL) as process:
+        until(lambda: path.exists() and path.stat().st_size > 20_000)
+        estimators = children(process.pid, "estimator_process")
+        assert len(estimators) == 2
+        process.kill()
+        until(lambda: not any(is_running(each) for each in estimators))
+
+
+def is_running(process: int) -> bool:
+    try:
+        status = Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return False
+    return status.rpartition(")")[2].split()[0] != "Z"
+
+
+def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_file: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with recording_process(
+        rig_file, path, "-e", SLOW, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    ) as process:  # fmt: skip
+        until(lambda: path.exists() and path.stat().st_size > 20_000)
+        os.killpg(process.pid, signal.SIGINT)
+        output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (130, b"")
+    recording = Recording(path)
+    assert recording.complete
+    exposures = {each.frame_id for each in recording.exposures()}
+    estimated = {each.frame_id for each in recorded_estimates(recording, SLOW)}
+    assert estimated | recording.skipped(SLOW) == exposures
+    assert not estimated & recording.skipped(SLOW)
+    assert f"{SLOW}: {len(estimated)} of {len(exposures)} exposures".encode() in output
+
+
+def test_a_terminal_that_takes_nothing_holds_up_no_session(rig_file: Path, tmp_path: Path) -> None:
+    """As after Ctrl-S: the progress bar cannot be drawn."""
+    path = tmp_path / "a.mcap"
+    terminal, theirs = pty.openpty()
+    os.set_blocking(theirs, False)
+    with contextlib.suppress(BlockingIOError):
+        while os.write(theirs, b"x" * 256):
+            pass
+    os.set_blocking(theirs, True)
+    with recording_process(rig_file, path, "--exposures", str(EXPOSURES), stdout=subprocess.DEVNULL, stderr=theirs):
+        until(lambda: path.exists() and Recording(path).end_metadata.get("ended") is not None)
+        report = Recording(path).end_metadata
+    os.close(terminal)
+    os.close(theirs)
+    assert (report["ended"], report["frames_received"]) == ("complete", str(EXPOSURES))
+
+
+def test_who_watches_or_is_told_and_never_comes_back_holds_up_no_session(rig_file: Path, tmp_path: Path) -> None:
+    go_on = threading.Event()
+    watched: list[int] = []
+
+    def watch(exposure: Exposure, estimates: object) -> None:
+        watched.append(exposure.frame_id)
+        go_on.wait(60)
+
+    with simulated_rig(rig_file, "--real-time") as ports:
+        report = record(
+            parse_rig(FAST), *ports, tmp_path / "a.mcap", estimators=["o3"], exposures=EXPOSURES, watch=watch,
+            progress=lambda exposures: bool(go_on.wait(60)) and None,
+        )  # fmt: skip
+    go_on.set()
+    assert (report.ended, report.frames_received, report.frames_lost) == ("complete", EXPOSURES, 0)
+    assert watched == [1]
+    assert report.unwatched >= EXPOSURES - 1 - most_waiting(parse_rig(FAST).timing)
+    assert any("is not done with an exposure" in each for each in report.warnings)
+
+
+def test_who_watches_gets_each_exposure_once_and_each_estimate_once(rig_file: Path, tmp_path: Path) -> None:
+    seen: list[int] = []
+    estimates: list[tuple[str, int]] = []
+
+    def watch(exposure: Exposure, some: list) -> None:
+        seen.append(exposure.frame_id)
+        estimates.extend((each.estimator, each.frame_id) for each in some)
+
+    report = Report()
+    with simulated_rig(rig_file, "--real-time") as ports:
+        given = record(
+            parse_rig(FAST), *ports, tmp_path / "a.mcap", estimators=["o3"], exposures=20, watch=watch, report=report
+        )
+    assert given is report
+    assert seen == sorted(set(seen))
+    assert len(seen) + report.unwatched == 20
+    assert len(set(estimates)) == len(estimates) <= report.estimation["o3"].estimated
+    assert report.unwatched or len(estimates) == report.estimation["o3"].estimated
+
+
+def test_a_watcher_that_fails_is_a_warning(rig_file: Path, tmp_path: Path) -> None:
+    def watch(exposure: Exposure, estimates: object) -> None:
+        raise ValueError("no more paper")
+
+    with simulated_rig(rig_file, "--real-time") as ports:
+        report = record(parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, watch=watch)
+    assert (report.ended, report.unwatched) == ("complete", 2)
+    assert report.warnings == ["who watches this session failed: no more paper"]
+
+
+def test_a_queue_keeps_order_and_when_it_is_full_goes_on_with_the_newest() -> None:
+    waiting = Waiting[int](3)
+    assert [waiting.put(k) for k in range(3)] == [[], [], []]
+    assert waiting.take() == 0
+    assert [waiting.put(k) for k in (3, 4, 5)] == [[], [1, 2, 3], []]
+    assert [waiting.take() for _ in range(3)] == [4, 5, None]
+
+
+def test_who_is_slow_misses_some_and_nobody_waits_for_him() -> None:
+    began, go_on, shown = threading.Event(), threading.Event(), list[int]()
+
+    def show(item: int) -> None:
+        began.set()
+        go_on.wait(60)
+        shown.append(item)
+
+    aside = Aside[int](show, 2)
+    aside.give(0)
+    assert began.wait(60)
+    for item in range(1, 8):
+        aside.give(item)
+    assert not aside.close(0.01)
+    go_on.set()
+    assert aside.close(60)
+    assert shown == [0, 7]
+    assert aside.skipped == 6
+
+
+def test_half_a_second_may_wait() -> None:
+    assert most_waiting(parse_rig(FAST).timing) == 10
+    assert most_waiting(load_rig("section-vi").timing) == 3
+    slow = FAST.replace("exposure_steps = 50", "exposure_steps = 5000")
+    assert most_waiting(parse_rig(slow).timing) == 2
+
+
+@pytest.mark.parametrize("name", ["o1", "o3", "moments", "profile"])
+def test_a_skipped_exposure_is_like_a_frame_that_was_lost(recorded: Session, name: str) -> None:
+    """Its inputs lead the next one: that is what the assembler makes of a lost frame."""
+    rig, exposures = load_rig("section-vi-lively"), exposures_of(recorded)
+    driver = Driver(rig, [name, "o2"], skipped={name: {1, 4, 5, 12}})
+    estimates = [each for _, some in driver.steps(exposures) for each in some]
+    ours, others = ([e for e in estimates if (e.estimator == name) == own] for own in (True, False))
+    assert [each.frame_id for each in ours] == [2, 3, 6, 7, 8, 9, 10, 11]
+    assert [each.frame_id for each in others] == list(range(1, 13))
+    theirs = with_frames_lost(Recording(recorded.path), {1, 4, 5, 12})
+    estimator = make_estimator(rig, name)
+    # Before the first exposure that it gets nobody knows when the session began.
+    first = SkippedInputs()
+    first.skip(exposures[0])
+    expected = [estimator.step(first.leading(each) if each.frame_id == 2 else each) for each in theirs]
+    assert first_difference(ours, expected) is None
+    one_by_one = Driver(rig, [name], skipped={name: {1, 4, 5, 12}})
+    assert first_difference(ours, [each for e in exposures for each in one_by_one.step(e)]) is None
+
+
+def with_frames_lost(recording: Recording, lost: set[int]) -> list[Exposure]:
+    """The exposures of a recording whose camera has lost some frames."""
+    from aolink.recording.exposures import ExposureAssembly
+
+    assembly, exposures, is_lost = ExposureAssembly(recording.rig), [], False
+    for each in recording.messages():
+        if each.topic == topics.EXPOSURE:
+            is_lost = each.message.frame_id in lost  # type: ignore[attr-defined]
+        if each.topic in (topics.EXPOSURE, topics.IMAGE) and is_lost:
+            continue
+        exposures += assembly.take(each.topic, each.message)
+    return exposures + assembly.flush()
+
+
+def test_over_a_long_gap_the_first_inputs_are_forgotten() -> None:
+    def exposure(k: int) -> Exposure:
+        return Exposure(
+            frame_id=k, first_step=1000 * k, n_steps=1000, pixels=np.zeros((1, 4), np.uint16),
+            mask=np.ones((1, 4), bool), inputs=np.full((1000, 2), float(k)), lead_inputs=np.zeros((0, 2)),
+        )  # fmt: skip
+
+    skipped = SkippedInputs()
+    for k in range(150):
+        skipped.skip(exposure(k))
+    lead = skipped.leading(exposure(150)).lead_inputs
+    assert lead.shape == (100_000, 2)
+    assert (lead[0, 0], lead[-1, 0]) == (50.0, 149.0)
+    assert skipped.leading(exposure(151)).lead_inputs.shape == (0, 2)
+
+
+def test_a_command_knows_a_frame_when_all_estimators_are_through_with_it() -> None:
+    recorded: list[pb.Latency] = []
+    book = LatencyBook(Report(), lambda latency, now: recorded.append(latency))
+    for frame in (1, 2, 3):
+        book.frame(pb.Latency(frame_id=frame, complete_ns=10 * frame))
+    book.estimated(2, 25)
+    book.sent(wire.CommandBlock(block_id=1, cause_frame_id=2), 26)
+    book.estimated(1, 40)  # a slow estimator had it
+    book.estimated(3, 0)  # all skipped it
+    book.sent(wire.CommandBlock(block_id=2, cause_frame_id=3), 41)
+    for block in (1, 2):
+        book.acknowledged(block, 50)
+        book.applied(block, 60, 61)
+    facts = {e.frame_id: (e.estimated_ns, e.command_sent_ns, e.command_applied_ns) for e in recorded}
+    assert facts == {2: (25, 26, 60), 1: (40, 41, 60), 3: (0, 41, 60)}
