@@ -203,6 +203,8 @@ def _unfinished(target: Path, error: type[AolinkError]) -> Iterator[tuple[Path, 
         if attempt:
             time.sleep(random.uniform(0, _STEP_BACK_S))
         partial = target.with_name(f"{_prefix_of(target)}{secrets.token_hex(8)}.partial")
+        if os.path.lexists(partial):
+            continue
         descriptor = -1
         try:
             descriptor = _open_new(partial, target)

@@ -53,6 +53,9 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     """
     environment = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
+    # A helper process of the standard library's, which the pool would start where the terminal reaches it.
+    with _unheard_by_children():
+        resource_tracker.ensure_running()
     try:
         with _Pool(count, mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
             try:
@@ -97,12 +100,18 @@ class _Pool(ProcessPoolExecutor):
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
         """Submit a call, which may start a process: that inherits which signals are blocked."""
-        resource_tracker.ensure_running()  # the first process would start it, and it unblocks some
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
-        try:
+        with _unheard_by_children():
             return super().submit(_until_ended, function, *arguments, **options)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _unheard_by_children() -> Iterator[None]:
+    """Block what a terminal sends; a process that is started meanwhile never hears it, and this one a moment later."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _until_ended(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
