@@ -163,8 +163,9 @@ def test_an_existing_target_is_kept(aolink: Run, tmp_path: Path) -> None:
         assert (tmp_path / "a.mcap").read_text() == "precious"
         assert aolink(*arguments, "--overwrite").returncode == 0
     assert Recording(tmp_path / "a.mcap").counts["/camera/image"] == 2
-    (tmp_path / "b.mcap").write_text("precious")
-    for command in (["estimate", "a.mcap", "-o", "b.mcap"], ["view", "a.mcap", "--save", "b.mcap"]):
+    for name in ("b.mcap", "b.rrd"):
+        (tmp_path / name).write_text("precious")
+    for command in (["estimate", "a.mcap", "-o", "b.mcap"], ["view", "a.mcap", "--save", "b.rrd"]):
         assert "exists and is not overwritten" in aolink(*command).stderr
 
 
