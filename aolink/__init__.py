@@ -9,20 +9,35 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError
-from aolink.rig import Rig, load_rig
 
 if TYPE_CHECKING:
     from aolink.estimation import Estimate
     from aolink.exposure import Exposures
     from aolink.recording.reader import Recording
+    from aolink.rig import Rig, load_rig
 
-__version__ = version("aolink")
+    __version__: str
+
 __all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate", "smooth"]
+
+
+if not TYPE_CHECKING:  # the type checker would believe in any name
+
+    def __getattr__(name: str) -> Any:
+        """What takes time to load, when it is asked for: a command has to hear signals before."""
+        if name in ("Rig", "load_rig"):
+            import aolink.rig
+
+            return getattr(aolink.rig, name)
+        if name == "__version__":
+            from importlib.metadata import version
+
+            return version("aolink")
+        raise AttributeError(f"module 'aolink' has no attribute {name!r}")
 
 
 def read(path: str | Path) -> Recording:
@@ -56,6 +71,7 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
         The rig file cannot be read or cannot work.
     """
     from aolink.exposure import Exposures
+    from aolink.rig import Rig, load_rig
     from aolink.simulation.model import simulate as simulate_exposures
 
     rig = rig if isinstance(rig, Rig) else load_rig(rig)

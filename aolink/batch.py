@@ -22,8 +22,9 @@ from tomlkit.exceptions import TOMLKitError
 
 from aolink.errors import AolinkError, RecordingError, RigError
 from aolink.estimation import Engine, Scorer
+from aolink.files import remove_unfinished, writing
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import recorded_estimates, write_reestimated
+from aolink.recording.reestimate import fill_reestimated, recorded_estimates
 from aolink.rig import parse_rig
 from aolink.workers import processes
 
@@ -67,11 +68,6 @@ class Job:
     engine: Engine = "aolink"
     overwrite: bool = False
     """Do it even if it was done before."""
-
-    @property
-    def partial(self) -> Path:
-        """What the output is called while it is written."""
-        return self.output.with_suffix(".mcap.partial")
 
     @property
     def record(self) -> Path:
@@ -205,7 +201,7 @@ def _in_parallel(todo: Sequence[Job], workers: int, stop: Callable[[], bool]) ->
     queue = deque(todo)
     while queue and not stop():  # again, if a process was lost and its pool with it
         running: dict[Future[Done], Job] = {}
-        lost = False
+        lost, broken = False, list[Job]()
         try:
             with processes(workers) as pool:
                 while running or (queue and not lost and not stop()):
@@ -224,12 +220,12 @@ def _in_parallel(todo: Sequence[Job], workers: int, stop: Callable[[], bool]) ->
                             done = future.result()
                         except BrokenProcessPool:
                             lost = True
+                            broken.append(job)
                             done = Done(job, [], "its process was ended from outside: too little memory, or a signal")
                         yield done
         finally:
-            for job in running.values():
-                for path in (job.partial, job.partial.with_name(f".{job.partial.name}.partial")):
-                    path.unlink(missing_ok=True)
+            for job in [*running.values(), *broken]:
+                remove_unfinished(job.output)
 
 
 def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -240,8 +236,7 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     AolinkError
         It cannot be written, or pyarrow is missing for Parquet.
     """
-    partial = path.with_name(f".{path.name}.new")
-    try:
+    with writing(path, overwrite=True) as partial:
         if path.suffix == ".parquet":
             try:
                 import pyarrow as pa
@@ -254,11 +249,6 @@ def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
                 writer = csv.DictWriter(file, COLUMNS)
                 writer.writeheader()
                 writer.writerows(rows)
-        partial.replace(path)
-    except OSError as error:
-        raise AolinkError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def table_rows(done: Sequence[Done], folder: Path) -> list[dict[str, Any]]:
@@ -291,21 +281,17 @@ def _record(path: Path) -> dict[str, Any] | None:
 
 def _do(job: Job) -> Done:
     """Estimate a recording again; whatever goes wrong is the result."""
-    record = job.record.with_suffix(".json.partial")
     try:
-        rows = _estimated(job, job.partial)
-        record.write_text(json.dumps({"digest": job.digest(), "rows": rows}))
-        # A result is never there without the record that says whose it is and what it depends on.
-        job.output.unlink(missing_ok=True)
-        record.replace(job.record)
-        job.partial.replace(job.output)
+        with writing(job.output, overwrite=True, sources=[job.source], error=RecordingError) as partial:
+            rows = _estimated(job, partial)
+            # A result is never there without the record that says whose it is and what it depends on.
+            job.output.unlink(missing_ok=True)
+            with writing(job.record, overwrite=True) as record:
+                record.write_text(json.dumps({"digest": job.digest(), "rows": rows}))
     except (AolinkError, OSError) as error:
         return Done(job, [], f"{error}")
     except Exception as error:  # a value that nobody thought of stops no other job
         return Done(job, [], f"it cannot be estimated with this model: {error!r}")
-    finally:
-        job.partial.unlink(missing_ok=True)
-        record.unlink(missing_ok=True)
     return Done(job, rows)
 
 
@@ -316,7 +302,7 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     if text != recording.rig.toml:
         recording = Recording(job.source, rig=parse_rig(text))
     names = list(job.estimators or recording.estimators or ["o3"])
-    write_reestimated(recording, names, target, overwrite=True, engine=job.engine)
+    fill_reestimated(recording, names, target, engine=job.engine)
     seconds = time.perf_counter() - begin
     written = Recording(target)
     scorers, not_ok = {name: Scorer() for name in names}, dict.fromkeys(names, 0)

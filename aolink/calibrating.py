@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
 from aolink.calibration.measure import LEAST_FRAMES, line_sensor
 from aolink.errors import AolinkError, CalibrationError, RigError
+from aolink.files import check_target
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
@@ -96,6 +96,7 @@ def record_frames(
     frames: int,
     overwrite: bool,
     ask: Callable[[str], str],
+    stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
     progress: Callable[[], AbstractContextManager[Callable[[str, int], None]]],
 ) -> list[Path]:
     """Ask for each kind of light in turn and record it.
@@ -106,6 +107,8 @@ def record_frames(
         Where the recordings go.
     ask:
         Puts a question; gives the answer: nothing to go on, "s" to skip. EOFError if nobody is there.
+    stoppable:
+        For each recording, what says whether it is to be stopped; leaving it raises what ends the job, if so.
     progress:
         For each recording, takes its name and the number of frames so far.
 
@@ -140,9 +143,9 @@ def record_frames(
             skipped = kind
             continue
         path = folder / f"{name}.mcap"
-        with progress() as tell:  # not while it asks
+        with stoppable() as stop, progress() as tell:  # not while it asks
             record(
-                rig, camera, mirror, path, exposures=frames, calibration=kind, overwrite=overwrite,
+                rig, camera, mirror, path, exposures=frames, calibration=kind, overwrite=overwrite, stop=stop,
                 progress=partial(tell, name),
             )  # fmt: skip
         paths.append(path)
@@ -159,27 +162,6 @@ def rig_text(path_or_name: str, rig: Rig) -> str:
             return file.read()
     except OSError as error:
         raise RigError(f"cannot read the rig file {path}: {error.strerror}") from None
-
-
-def check_target(path: Path, *, overwrite: bool) -> None:
-    """Refuse a target that must not be replaced or cannot be, before any work. Raises AolinkError."""
-    if not path.parent.is_dir():
-        raise AolinkError(f"cannot write {path}: there is no folder {path.parent}; make it, or give another name")
-    if path.exists() and not overwrite:
-        raise AolinkError(f"{path} exists and is not overwritten: give another name, or --overwrite to replace it")
-
-
-def write_text(path: Path, text: str, *, overwrite: bool) -> None:
-    """Write a rig file whole or not at all. Raises AolinkError."""
-    check_target(path, overwrite=overwrite)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("w", newline="") as file:
-            file.write(text)
-        os.replace(part, path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise AolinkError(f"cannot write {path}: {(error.strerror or str(error)).lower()}; give another -o") from None
 
 
 def _digest(path: Path) -> str:

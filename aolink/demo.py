@@ -10,11 +10,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 from aolink.errors import AolinkError, DeviceError, EstimatorError, ViewerError
 from aolink.estimation import make_estimator
+from aolink.files import writing
 from aolink.recording.deblur import Summary, write_deblurred
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, recorded_estimates, reestimate
@@ -115,16 +117,18 @@ def run_demo(
     exposures: int,
     seed: int | None,
     real_time: bool,
-    stop: Callable[[], bool],
+    stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
     progress: Callable[[str, int], None],
 ) -> DemoResult:
     """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays.
 
-    The rig runs from its ``source``, file or name: what that names is relative to it.
+    The rig runs from its ``source``, file or name: what that names is relative to it. ``stoppable`` is entered for
+    the session alone, which ends in good order when what it gives says so; nothing else is made then.
     """
     from aolink import viewing
 
-    (folder / "rig.toml").write_text(rig.toml)
+    with writing(folder / "rig.toml") as partial:
+        partial.write_text(rig.toml)
     path, rrd, picture = folder / "session.mcap", folder / "session.rrd", folder / "session.png"
     seconds: dict[str, float] = {}
     estimators = possible_estimators(rig)
@@ -138,7 +142,7 @@ def run_demo(
 
     options = ["--real-time"] if real_time else []
     options += ["--seed", str(seed)] if seed is not None else []
-    with part("record") as tell, simulated_rig(source, *options) as (camera, mirror):
+    with part("record") as tell, stoppable() as stop, simulated_rig(source, *options) as (camera, mirror):
         report = record(
             rig, camera, mirror, path, estimators=estimators, exposures=exposures, note="aolink demo", stop=stop,
             progress=tell,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RestorationError
+from aolink.files import writing
 
 
 def read_picture(path: Path) -> NDArray[Any]:
@@ -46,26 +49,38 @@ def finite_pixels(picture: NDArray[Any]) -> NDArray[np.bool_] | None:
     return finite if not finite.all() and finite.any() else None
 
 
-def write_picture(path: Path, picture: NDArray[Any]) -> None:
-    """Write what `read_picture` reads back.
+def write_picture(path: Path, picture: NDArray[Any], *, overwrite: bool = False, sources: Iterable[Path] = ()) -> None:
+    """Write what `read_picture` reads back; ``sources`` are files that it never replaces.
 
     Raises
     ------
     RestorationError
-        It cannot be written, or not in this format.
+        It exists and not ``overwrite``, or cannot be written, or not in this format.
     """
     from PIL import Image
 
+    data = io.BytesIO()
     try:
         if path.suffix == ".npy":
-            np.save(path, picture)
+            np.save(data, picture)
         else:
-            Image.fromarray(picture).save(path)
+            Image.fromarray(picture).save(data, format=_format(path))
     except (ValueError, TypeError, KeyError, OSError) as error:
-        cure = f"a picture of type {picture.dtype} fits in a .npy file"
-        if isinstance(error, OSError) and error.errno is not None:
-            cure = "give a folder that exists and can be written"
-        raise RestorationError(f"{path} cannot be written ({error}): {cure}") from error
+        raise RestorationError(
+            f"{path} cannot be written ({error}): a picture of type {picture.dtype} fits in a .npy file"
+        ) from error
+    with writing(path, overwrite=overwrite, sources=sources, error=RestorationError) as partial:
+        partial.write_bytes(data.getbuffer())
+
+
+def _format(path: Path) -> str:
+    """Pillow's word for the kind of file that a name asks for. Raises ValueError."""
+    from PIL import Image
+
+    kind = Image.registered_extensions().get(path.suffix.lower())
+    if kind is None:
+        raise ValueError(f"unknown file extension: {path.suffix}")
+    return kind
 
 
 def read_psf(path: Path) -> NDArray[np.float64]:

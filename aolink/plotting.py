@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from aolink.errors import AolinkError
+from aolink.files import writing
 
 _MOST_LABELS = 24
 
@@ -53,10 +54,8 @@ def batch_picture(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         axes[-1].set_xticks(range(len(labels)), labels, rotation=30, ha="right", fontsize="small")
     else:
         axes[-1].set_xlabel(f"{len(labels)} recordings and models, in the order of the table")
-    try:
-        figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise AolinkError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
+    with writing(path, overwrite=True) as partial:
+        figure.savefig(partial, dpi=120, format="png")
 
 
 def _label(row: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import FrameError
+from aolink.files import writing
 from aolink.frame_file import read_frame
 from aolink.optics.lattice import Lattice, find_lattice, match
 from aolink.optics.wavefront import ZonalReconstructor, residual_rms
@@ -99,12 +100,11 @@ def measure_files(
     return measure_slopes(read_frame(frame), read_frame(reference), pitch_m=pitch_m, focal_m=focal_m)
 
 
-def save(result: FrameSlopes, path: Path) -> None:
+def save(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> None:
     """Write slopes, wavefront and the spots' places as .npz. Raises `FrameError`."""
-    try:
+    target = writing(path, overwrite=overwrite, suffix=".npz", error=FrameError)
+    with target as partial, partial.open("wb") as file:
         np.savez(
-            path, slopes=result.slopes, wavefront=result.wavefront, displacements_px=result.displacements_px,
+            file, slopes=result.slopes, wavefront=result.wavefront, displacements_px=result.displacements_px,
             spots_px=result.lattice.spots, nodes=result.lattice.nodes, shift_px=result.shift_px,
         )  # fmt: skip
-    except OSError as error:
-        raise FrameError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None

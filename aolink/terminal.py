@@ -1,48 +1,15 @@
-"""What a command does with the terminal and with signals: a stop in good order, progress bars."""
+"""What a command does with the terminal: questions, progress bars."""
 
 from __future__ import annotations
 
 import os
 import select
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 from typing import Any, Protocol
 
-import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-
-class StopRequest:
-    """Ctrl-C, SIGTERM and SIGHUP end a session in good order; a second one ends it at once."""
-
-    def __init__(self) -> None:
-        self.signal = 0
-
-    def __call__(self) -> bool:
-        return self.signal != 0
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.signal:
-            raise KeyboardInterrupt
-        self.signal = number
-
-    @contextmanager
-    def installed(self) -> Iterator[StopRequest]:
-        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        before = {number: signal.signal(number, self._handle) for number in signals}
-        try:
-            yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def exit_if_asked(self) -> None:
-        """Exit as a command does that a signal ended."""
-        if self.signal:
-            raise typer.Exit(128 + self.signal)
 
 
 class Tell(Protocol):

@@ -1,6 +1,7 @@
 """Processes and threads that share the cores.
 
 A process of a pool has one thread for its linear algebra, so that numbers do not depend on how many cores there are.
+It ends with the process that made it, in whatever way that ends.
 """
 
 from __future__ import annotations
@@ -8,11 +9,14 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
-from typing import TypeVar
+from multiprocessing import get_context, resource_tracker
+from types import FrameType
+from typing import Any, TypeVar
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -20,7 +24,9 @@ Result = TypeVar("Result")
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """What tells the libraries of linear algebra how many threads to have."""
 _PATIENCE_S = 3.0
-"""For a process that was told to end."""
+"""How long a process may take to end in good order when it has been asked to."""
+_FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
+"""A terminal sends these to every process of a command. The parent decides what they mean for its workers."""
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
@@ -43,14 +49,16 @@ def thread_count() -> int:
 def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of ``count`` processes, whose linear algebra has one thread. Ctrl-C is for this process alone.
 
-    Whatever is raised in the block ends the processes at once.
+    Whatever is raised in the block ends the processes at once. They also end when this process does, even if it is
+    killed; what they are doing is given up in good order, so that nothing half written stays.
     """
     environment = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    # A helper process of the standard library's, which the pool would start where the terminal reaches it.
+    with _unheard_by_children():
+        resource_tracker.ensure_running()
     try:
-        with ProcessPoolExecutor(
-            count, mp_context=get_context("spawn"), initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)
-        ) as pool:
+        with _Pool(count, mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
             try:
                 yield pool
             except BaseException:
@@ -66,12 +74,62 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ[name] = value
 
 
+def end_with_parent() -> None:
+    """In a process that multiprocessing has started: end it on SIGTERM or when its parent is gone, in good order.
+
+    The standard library gives each child one end of a pipe that closes when the parent ends, however that comes about.
+    """
+    signal.signal(signal.SIGTERM, _exit)
+    threading.Thread(target=_watch_parent, name="aolink-parent", daemon=True).start()
+
+
+def _exit(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+def _watch_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)  # heard by the main thread, which gives up what it is doing
+    time.sleep(_PATIENCE_S)
+    os._exit(128 + signal.SIGTERM)
+
+
+class _Pool(ProcessPoolExecutor):
+    """A pool whose processes hear nothing that a terminal sends, from their first instant on."""
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Future[Any]:
+        """Submit a call, which may start a process: that inherits which signals are blocked."""
+        with _unheard_by_children():
+            return super().submit(_until_ended, function, *arguments, **options)
+
+
+@contextmanager
+def _unheard_by_children() -> Iterator[None]:
+    """Block what a terminal sends; a process that is started meanwhile never hears it, and this one a moment later."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _FOR_THE_PARENT)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _until_ended(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
+    """Call a function in a worker, which ends if it is told to meanwhile; the pool itself would only note an error."""
+    try:
+        return function(*arguments, **options)
+    except SystemExit as end:
+        os._exit(end.code if isinstance(end.code, int) else 1)
+
+
 def _end(pool: ProcessPoolExecutor) -> None:
     running = list((pool._processes or {}).values())
     for process in running:
         process.terminate()
     pool.shutdown(wait=False, cancel_futures=True)
+    deadline = time.monotonic() + _PATIENCE_S
     for process in running:
-        process.join(_PATIENCE_S)
+        process.join(max(0.0, deadline - time.monotonic()))
         process.kill()
         process.join(_PATIENCE_S)

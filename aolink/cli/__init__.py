@@ -12,6 +12,7 @@ from rich.markup import escape
 from aolink.cli import look, recordings, restore, rigs  # noqa: F401  their commands
 from aolink.cli.common import app, stderr
 from aolink.errors import AolinkError
+from aolink.signals import ending_the_command
 
 
 def _print_version(wanted: bool) -> None:
@@ -29,12 +30,14 @@ def _options(
 
 
 def main() -> None:
-    """Entry point of the command ``aolink``."""
+    """Run the command that the arguments name; what goes wrong is one line and an exit code."""
     try:
-        app()
+        with ending_the_command():
+            app()
     except AolinkError as error:
         stderr.print(f"aolink: {escape(str(error))}")
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        stderr.print("aolink: interrupted")
-        sys.exit(130)
+    except OSError as error:  # a file or a folder that no message of ours thought of, as the one for temporary files
+        what = f"{error.filename}: " if error.filename else ""
+        stderr.print(f"aolink: {what}{(error.strerror or str(error)).lower()}", markup=False)
+        sys.exit(AolinkError.exit_code)

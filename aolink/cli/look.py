@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from aolink.cli.common import FileArgument, JsonOption, OverwriteOption, app, open_recording, stdout
-from aolink.errors import AolinkError
+from aolink.errors import FrameError, ViewerError
+from aolink.files import check_target
 
 
 @app.command(epilog="Example: aolink view session.mcap --screenshot session.png")
@@ -31,11 +32,9 @@ def view(
 
     from aolink import viewing
 
-    for target in (save, screenshot):
-        if target is not None and target.exists() and not overwrite:
-            raise AolinkError(
-                f"{target} exists and is not overwritten: give another name, or --overwrite to replace it"
-            )
+    for target, suffix in ((save, ".rrd"), (screenshot, ".png")):
+        if target is not None:
+            check_target(target, overwrite=overwrite, sources=[file], suffix=suffix)
     recording = open_recording(file)
     with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
         rrd = save or Path(folder) / f"{file.stem}.rrd"
@@ -59,6 +58,7 @@ def slopes(
     rrd: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write a picture of it for Rerun.")] = None,
     pitch_m: Annotated[float | None, typer.Option(min=1e-9, help="Side of a lenslet, m.")] = None,
     focal_m: Annotated[float | None, typer.Option(min=1e-9, help="Focal length of a lenslet, m.")] = None,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Find the lenslets' spots on a frame and on its reference: slopes and wavefront between them.
@@ -70,13 +70,18 @@ def slopes(
 
     if (pitch_m is None) != (focal_m is None):
         raise typer.BadParameter("give --pitch-m and --focal-m, or neither")
+    inputs = [frame, reference]
+    if output is not None:
+        check_target(output, overwrite=overwrite, sources=inputs, suffix=".npz", error=FrameError)
+    if rrd is not None:
+        check_target(rrd, overwrite=overwrite, sources=inputs, suffix=".rrd", error=ViewerError)
     result = job.measure_files(frame, reference, pitch_m=pitch_m, focal_m=focal_m)
     if output is not None:
-        job.save(result, output)
+        job.save(result, output, overwrite=overwrite)
     if rrd is not None:
         from aolink.viewing.slopes import save_slopes
 
-        save_slopes(result, rrd)
+        save_slopes(result, rrd, overwrite=overwrite)
     if as_json:
         print(json.dumps(tables.slopes_as_json(result)))
     else:

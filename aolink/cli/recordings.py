@@ -24,7 +24,9 @@ from aolink.cli.common import (
     stdout,
 )
 from aolink.errors import AolinkError, RecordingError
-from aolink.terminal import StopRequest, progress_bar
+from aolink.files import writing
+from aolink.signals import StopRequest
+from aolink.terminal import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -130,7 +132,7 @@ def estimate(
         failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
         text = f"{len(done)} of {len(todo)} done, {skipped} of them before, {failed} failed; table: {table}"
         stdout.print(text, markup=False)
-    stop.exit_if_asked()
+    stop.raise_if_asked()
     if any(each.error for each in done):
         raise typer.Exit(1)
 
@@ -214,7 +216,6 @@ def compare(
 
     from aolink import tables
     from aolink.recording.compare import compare as compare_recordings
-    from aolink.recording.mcap_file import replacing
     from aolink.recording.reestimate import write_reestimated
 
     one = open_recording(first)
@@ -247,7 +248,7 @@ def compare(
         if accept and not same:
             if damage:
                 raise RecordingError(f"{damage[0]}: a damaged recording is not accepted; `aolink recover` it first")
-            with replacing(first, [second], overwrite=True) as partial:
+            with writing(first, overwrite=True, sources=[second], error=RecordingError) as partial:
                 shutil.copyfile(second, partial)
             stdout.print(f"accepted: {first} is replaced", markup=False)
             return

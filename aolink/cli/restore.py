@@ -12,6 +12,7 @@ import typer
 
 from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, stderr, stdout
 from aolink.errors import RestorationError
+from aolink.files import check_target
 from aolink.terminal import progress_bar
 
 
@@ -94,15 +95,15 @@ def _deblur_picture(
     from aolink.pictures import finite_pixels, read_picture, read_psf, write_picture
     from aolink.restoration import checked_method, restore
 
-    if out.exists() and not overwrite:
-        raise RestorationError(f"{out} exists: give --overwrite to replace it")
+    check_target(out, overwrite=overwrite, sources=[image, psf], error=RestorationError)
     whole = read_picture(image)
     # Transparency is no light: it stays as it is.
     picture = whole[..., :3] if whole.ndim == 3 and whole.shape[2] == 4 else whole
     seen = finite_pixels(picture)
     missing = 0 if seen is None else int((~seen).sum())
     restored = restore(picture, read_psf(psf), method=checked_method(method), noise_sd=noise_sd, mask=seen)
-    write_picture(out, restored.image if picture is whole else np.dstack([restored.image, whole[..., 3]]))
+    made = restored.image if picture is whole else np.dstack([restored.image, whole[..., 3]])
+    write_picture(out, made, overwrite=overwrite, sources=[image, psf])
     if as_json:
         found = None if math.isnan(restored.noise_sd) else restored.noise_sd
         told = {"method": method, "noise_sd": found, "direction": restored.direction, "pixels_filled": missing}

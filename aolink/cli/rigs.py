@@ -29,8 +29,10 @@ from aolink.cli.common import (
     stdout,
 )
 from aolink.errors import AolinkError, EstimatorError, RigError
+from aolink.files import check_target, writing
 from aolink.rig import Rig, load_rig, parse_light
-from aolink.terminal import StopRequest, ask, input_ended, progress_bar
+from aolink.signals import Interrupted, StopRequest, stop_after
+from aolink.terminal import ask, input_ended, progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -108,6 +110,7 @@ def rig(
         server.run(lambda: stop() or (tied and input_ended()))
         for stream in streams.values():
             stream.close()
+    stop.raise_if_asked()
 
 
 def _print_scan(loaded: Rig, as_json: bool) -> None:
@@ -243,7 +246,7 @@ def record(
                 progress=progress, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
-    stop.exit_if_asked()
+    stop.raise_if_asked()
     if any(each.failed for each in report.estimation.values()):
         raise typer.Exit(EstimatorError.exit_code)
 
@@ -335,7 +338,7 @@ def replay(
             print(json.dumps(tables.scores_as_json(scores), allow_nan=False), flush=True)
         else:
             stdout.print(tables.scores(scores))
-    stop.exit_if_asked()
+    stop.raise_if_asked()
 
 
 def _replay_to_rig(
@@ -370,7 +373,7 @@ def _replay_to_rig(
         stdout.print(tables.session(report))
         stdout.print(tables.comparison(found))
         stdout.print(f"{output}: {report.exposures} exposures, {report.ended}", markup=False)
-    stop.exit_if_asked()
+    stop.raise_if_asked()
 
 
 @app.command(epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml")
@@ -399,15 +402,16 @@ def calibrate(
     loaded = load_rig(rig)
     if bool(files) == bool(camera) or bool(camera) != bool(mirror):
         raise typer.BadParameter("give recordings, or --camera and --mirror")
-    calibrating.check_target(output, overwrite=overwrite)
+    check_target(output, overwrite=overwrite, sources=files or [])
     with TemporaryDirectory(prefix="aolink-") as temporary:
         if camera and mirror:
             files = calibrating.record_frames(
                 loaded, camera, mirror, keep or Path(temporary), frames=frames, overwrite=overwrite,
-                ask=partial(ask, stderr), progress=partial(progress_bar, stderr, frames),
+                ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
             )  # fmt: skip
         result = calibrating.calibrate_recordings(loaded, calibrating.rig_text(rig, loaded), files or [])
-    calibrating.write_text(output, result.text, overwrite=overwrite)
+    with writing(output, overwrite=overwrite, sources=files or []) as unfinished:
+        unfinished.write_text(result.text, newline="")  # with the line ends that the rig file had
     if as_json:
         print(json.dumps(tables.calibration_as_json(result)))
         return
@@ -433,10 +437,15 @@ def demo(
     loaded = load_checked(rig)
     get_ready(loaded, possible_estimators(loaded))
     folder = new_folder(out)
-    with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
-        result = run_demo(
-            loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stop=stop, progress=tell
-        )  # fmt: skip
+    stop = StopRequest()
+    try:
+        with progress_bar(stderr, exposures) as tell:
+            result = run_demo(
+                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stoppable=stop.installed,
+                progress=tell,
+            )  # fmt: skip
+    except Interrupted as interrupted:
+        raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None
     if not stop():
         recording = Recording(result.recording)
         estimates = {name: recording.estimates(name) for name in recording.estimators}
@@ -444,6 +453,6 @@ def demo(
     stdout.print(tables.session(result.report))
     for line in tables.demo_summary(result, program()):
         stdout.print(line, markup=False)
-    stop.exit_if_asked()
+    stop.raise_if_asked()
     if result.differences:
         raise typer.Exit(1)

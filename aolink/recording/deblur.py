@@ -17,14 +17,14 @@ import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from aolink.errors import RestorationError
+from aolink.errors import RecordingError, RestorationError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure, step_shares
+from aolink.files import writing
 from aolink.optics.camera import is_saturated, to_density
 from aolink.plant import psd_root
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
-from aolink.recording.mcap_file import replacing
 from aolink.recording.reader import RawMessage, Recording, RestoredPictures
 from aolink.recording.reestimate import recorded_estimates, reestimated
 from aolink.restoration import Method, Psf, Restored, motion_psf_by_root, restore
@@ -214,7 +214,7 @@ def write_deblurred(
         "deblurred_with": f"{estimator} {method}",
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
-    with replacing(path, [recording.path], overwrite=overwrite) as partial:
+    with writing(path, overwrite=overwrite, sources=[recording.path], error=RecordingError) as partial:
         return _written(recording, partial, made, held, estimator, notes, progress)
 
 

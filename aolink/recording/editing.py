@@ -13,9 +13,10 @@ from mcap.records import Schema
 from mcap.well_known import MessageEncoding
 
 from aolink.errors import RecordingError
+from aolink.files import open_unfinished, writing
 from aolink.recording import topics
 from aolink.recording.lead import Lead
-from aolink.recording.mcap_file import McapFile, WriteOptions, replacing, schema_of
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import RawMessage, Recording
 from aolink.recording.scan import Loss
 from aolink.recording.writer import begin_recording
@@ -42,6 +43,8 @@ class RecordingCopy:
 
     Parameters
     ----------
+    path:
+        An empty file that is there already, as `aolink.files.writing` gives one.
     notes:
         Facts about the session in the place of those that the source has.
     """
@@ -50,7 +53,7 @@ class RecordingCopy:
         self.result = Edited(path)
         self._foreign, self._encodings = source.schemas, source.encodings
         self._schemas: dict[str, Schema] = {}
-        self._file = McapFile(path, WriteOptions(), overwrite=True)
+        self._file = McapFile(path, WriteOptions(), descriptor=open_unfinished(path))
         begin_recording(self._file, source.rig, notes, source.start_ns, source.attachments)
 
     def add(self, message: RawMessage) -> None:
@@ -73,7 +76,7 @@ class RecordingCopy:
         damage = {"damage": "; ".join(loss.what for loss in losses[:20])} if losses else {}
         if end or damage:
             self._file.add_metadata(topics.END_METADATA, (end or {}) | damage)
-        self._file.finish(sync=True)
+        self._file.finish()
         return self.result
 
     def give_up(self) -> None:
@@ -96,7 +99,7 @@ def recover(
     if not recording.counts:
         raise RecordingError(f"{source} holds no whole message: there is nothing to recover")
     notes = recording.metadata | {"recovered_from": source.name}
-    with replacing(target, [source], overwrite=overwrite) as partial:
+    with writing(target, overwrite=overwrite, sources=[source], error=RecordingError) as partial:
         result = _copied(recording, partial, recording.raw_messages(), notes, None, progress)
     result.path = target
     return result
@@ -125,7 +128,7 @@ def cut(
     recording = Recording(source)
     low, high = (recording.start_ns + round(t * 1e9) for t in (min(start_s, 1e9), min(end_s, 1e9)))
     notes = _begun(recording) | {"cut_from": source.name, "cut": f"{start_s:g} s to {end_s:g} s"}
-    with replacing(target, [source], overwrite=overwrite) as partial:
+    with writing(target, overwrite=overwrite, sources=[source], error=RecordingError) as partial:
         result = _copied(recording, partial, _between(recording, low, high), notes, None, progress)
         if not result.exposures:
             duration_s = (recording.end_ns - recording.start_ns) / 1e9
@@ -163,7 +166,7 @@ def merge(
                 f"{other.path} is not of the same session as {first.path}: only parts of one session can be merged"
             )
     notes = _begun(first) | {"merged_from": " ".join(each.path.name for each in recordings)}
-    with replacing(target, sources, overwrite=overwrite) as partial:
+    with writing(target, overwrite=overwrite, sources=sources, error=RecordingError) as partial:
         result = _copied(first, partial, _joined(recordings), notes, recordings[-1].end_metadata, progress)
     result.losses = [loss for each in recordings for loss in each.losses]
     result.path = target

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from aolink import files
 from aolink.errors import RecordingError
 from aolink.recording import topics
 
@@ -57,20 +56,10 @@ class WriteOptions:
 
 
 class _File:
-    """A file that writes all or raises."""
+    """An open file that writes all or raises."""
 
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
-        if path.is_dir():
-            raise RecordingError(f"{path} is a folder: give the name of a file in it")
-        flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL)
-        try:
-            self.descriptor = os.open(path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
-        except FileExistsError:
-            raise RecordingError(
-                f"{path} exists and is not overwritten: give another name, or --overwrite to replace it"
-            ) from None
-        except OSError as error:
-            raise RecordingError(f"cannot create {path}: {os.strerror(error.errno or 0).lower()}") from None
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
         self._position = 0
 
     def write(self, data: bytes) -> int:
@@ -91,57 +80,27 @@ class _File:
         os.close(self.descriptor)
 
 
-@contextlib.contextmanager
-def replacing(target: Path, sources: Iterable[Path], *, overwrite: bool) -> Iterator[Path]:
-    """A file beside ``target`` to write, which takes its place when the block ends well, and goes when it does not.
-
-    Raises
-    ------
-    RecordingError
-        ``target`` is one of the ``sources``, by whatever name; it exists and not ``overwrite``; it cannot be written.
-    """
-    if any(target.exists() and source.exists() and target.samefile(source) for source in sources):
-        raise RecordingError(f"{target} is the recording itself: give another name for the new one")
-    if target.is_dir():
-        raise RecordingError(f"{target} is a folder: give the name of a file in it")
-    if target.exists() and not overwrite:
-        raise RecordingError(f"{target} exists and is not overwritten: give another name, or --overwrite to replace it")
-    partial = target.with_name(f".{target.name}.partial")
-    try:
-        yield partial
-        partial.replace(target)
-    except RecordingError as error:  # whoever wrote knew of the partial file only
-        text = str(error).replace(str(partial), str(target)).removesuffix(_KEPT)
-        raise RecordingError(text) from None
-    except OSError as error:
-        raise RecordingError(f"cannot write {target}: {why_not(error)}") from None
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def why_not(error: OSError) -> str:
-    """Why a file cannot be written, in words."""
-    if error.errno == errno.EFBIG:
-        return "it would be larger than the disk or a limit (ulimit -f) lets a file be"
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return "the disk is full" if full else os.strerror(error.errno or 0).lower()
-
-
-_KEPT = "; what was recorded until then is in it and can be read"
-
-
 class McapFile:
     """Writes messages that are bytes already. Not thread-safe; what the disk says is raised as OSError.
 
+    Parameters
+    ----------
+    descriptor:
+        Of ``path``, where that is open for writing and empty already; otherwise the file is created.
+
     Raises
     ------
     RecordingError
-        The file exists and not ``overwrite``, or cannot be created.
+        The file exists and not ``overwrite``, another command is writing it, or it cannot be created.
     """
 
-    def __init__(self, path: Path, options: WriteOptions, *, overwrite: bool = False) -> None:
+    def __init__(
+        self, path: Path, options: WriteOptions, *, overwrite: bool = False, descriptor: int | None = None
+    ) -> None:
         self.path = path
-        self._file = _File(path, overwrite=overwrite)
+        if descriptor is None:
+            descriptor = files.create(path, overwrite=overwrite, error=RecordingError)
+        self._file = _File(descriptor)
         self._flush_ns = round(options.flush_s * 1e9)
         self._writer = Writer(
             self._file,  # type: ignore[arg-type]

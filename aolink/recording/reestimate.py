@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from aolink.errors import RecordingError
 from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
 from aolink.exposure import Exposure
+from aolink.files import writing
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.exposures import ExposureAssembly
-from aolink.recording.mcap_file import replacing
 from aolink.recording.reader import RawMessage, Recording
 
 _AT_ONCE = 512
@@ -138,6 +139,21 @@ def write_reestimated(
     RecordingError
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
+    path = Path(path)
+    with writing(path, overwrite=overwrite, sources=[recording.path], error=RecordingError) as partial:
+        fill_reestimated(recording, names, partial, progress=progress, engine=engine, as_recorded=as_recorded)
+
+
+def fill_reestimated(
+    recording: Recording,
+    names: Sequence[str],
+    path: Path,
+    *,
+    progress: Callable[[int], None] = lambda exposures: None,
+    engine: Engine = "aolink",
+    as_recorded: bool = False,
+) -> None:
+    """What `write_reestimated` writes, into an empty file that is there already. Raises OSError as the disk does."""
     notes = recording.metadata | {
         "aolink_version": version("aolink"),
         "estimators": " ".join(names),
@@ -146,19 +162,18 @@ def write_reestimated(
     }
     if engine != "aolink":
         notes["engine"] = engine
-    with replacing(Path(path), [recording.path], overwrite=overwrite) as partial:
-        copy = RecordingCopy(recording, partial, notes)
-        try:
-            done = 0
-            skipped = skipped_by(recording, names) if as_recorded else None
-            for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), as_recorded):
-                copy.add(some)
-                if done < copy.result.exposures:
-                    progress(done := copy.result.exposures)
-            copy.finish(recording.losses)
-        except BaseException:
-            copy.give_up()
-            raise
+    copy = RecordingCopy(recording, path, notes)
+    try:
+        done = 0
+        skipped = skipped_by(recording, names) if as_recorded else None
+        for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), as_recorded):
+            copy.add(some)
+            if done < copy.result.exposures:
+                progress(done := copy.result.exposures)
+        copy.finish(recording.losses)
+    except BaseException:
+        copy.give_up()
+        raise
 
 
 def _with_estimates(recording: Recording, driver: Driver, as_recorded: bool) -> Iterator[RawMessage]:

@@ -12,7 +12,7 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -20,11 +20,12 @@ import numpy as np
 from google.protobuf.message import Message
 from mcap.records import Schema
 
+from aolink import files
 from aolink.errors import RecordingError
 from aolink.estimation import exposure_model
 from aolink.recording import topics
 from aolink.recording.lead import Lead
-from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of, why_not
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.rig import Rig
 
 _QUEUE_BYTES = 256 << 20
@@ -126,9 +127,9 @@ class RecordingWriter:
         self._put_bytes = self._taken_bytes = 0
         self._busy_since: float | None = None
         """When the thread began what it is doing with the file."""
+        if self._lead is not None:
+            self._clear_parts()
         try:
-            if self._lead is not None:
-                self._clear_parts()
             self._begin(start_ns)
         except OSError as error:
             self._give_up(error)
@@ -191,12 +192,21 @@ class RecordingWriter:
         """Parts of another session with the same name would be taken for some of this one."""
         name = re.compile(re.escape(self.path.stem) + r"-\d{3,}" + re.escape(self.path.suffix))
         folder = self.path.parent
-        known = sorted(each for each in folder.iterdir() if name.fullmatch(each.name)) if folder.is_dir() else []
+        try:
+            known = sorted(each for each in folder.iterdir() if name.fullmatch(each.name)) if folder.is_dir() else []
+            self._remove(known)
+        except OSError as error:
+            raise RecordingError(f"cannot write {self.path}: {files.why_not(error)}") from None
+
+    def _remove(self, known: Sequence[Path]) -> None:
         if known and not self._overwrite:
             raise RecordingError(
                 f"{known[0]} exists and is not overwritten: give another name, or --overwrite to remove"
                 f" {'it' if len(known) == 1 else f'all {len(known)} parts'}"
             )
+        for each in known:
+            if files.is_being_written(each):
+                raise RecordingError(f"{each} is being written by another command: give another name")
         for each in known:
             each.unlink()
 
@@ -286,7 +296,7 @@ class RecordingWriter:
         if isinstance(error, RecordingError):
             self._error = error
             return
-        what = why_not(error) if isinstance(error, OSError) else repr(error)
+        what = files.why_not(error) if isinstance(error, OSError) else repr(error)
         self._error = RecordingError(
             f"cannot write {self.paths[-1]}: {what}; what was recorded until then is in it and can be read"
         )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import warnings
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -11,10 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
-from rerun.chunk import RrdReader
-from rerun.error_utils import RerunWarning
 
-from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
 from aolink.exposure import Exposure
@@ -22,6 +17,7 @@ from aolink.rig import Rig, SpotSensor
 from aolink.viewing import camera, devices, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.palette import by_rank
+from aolink.viewing.rrd_file import new_rrd
 from aolink.viewing.timebase import Timebase
 
 if TYPE_CHECKING:
@@ -51,27 +47,11 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
         The file exists already or cannot be written, or the recording has nothing to show.
     """
     path = Path(path)
-    if path.exists() and not overwrite:
-        raise ViewerError(f"{path} exists already: give another name, or say that it may be overwritten")
-    partial = path.with_name(path.name + ".partial")
-    stream = rr.RecordingStream(APPLICATION)
-    try:
-        try:
-            partial.touch()
-            stream.save(partial)
-            contents = send_recording(stream, recording)
-            # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
-            stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
-            stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
-        finally:
-            stream.disconnect()
-        if not _whole(partial):
-            raise ViewerError(f"cannot write {path}: Rerun could not finish the file; is the disk full?")
-        os.replace(partial, path)
-    except OSError as error:
-        raise ViewerError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
-    finally:
-        partial.unlink(missing_ok=True)
+    with new_rrd(APPLICATION, path, overwrite=overwrite, sources=[recording.path]) as stream:
+        contents = send_recording(stream, recording)
+        # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
+        stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
+        stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
     return path
 
 
@@ -121,16 +101,6 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
         latency="/latency" in found,
         log="/log" in found,
     )
-
-
-def _whole(path: Path) -> bool:
-    """Whether a file holds a layout and its footer, which come last: Rerun only logs it when a write fails."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RerunWarning)
-        try:
-            return bool(RrdReader(path).blueprints())
-        except (RuntimeError, RerunWarning):
-            return False
 
 
 def send_camera(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from aolink.errors import ViewerError
 from aolink.slopes import FrameSlopes
+from aolink.viewing.rrd_file import new_rrd
 
 _ARROW = 5.0
 """How much longer than the displacements the arrows are."""
@@ -19,19 +18,15 @@ _DARK = (40, 40, 40)
 """Of a lenslet without a spot."""
 
 
-def save_slopes(result: FrameSlopes, path: Path) -> Path:
-    """Write the picture of a frame's slopes, replacing an older one. Raises `ViewerError`."""
+def save_slopes(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> None:
+    """Write the picture of a frame's slopes as .rrd. Raises `ViewerError`."""
     low, high = np.percentile(result.frame, [1, 99.7])
     grey = (np.clip((result.frame - low) / max(high - low, 1e-12), 0, 1) ** 0.7 * 255).astype(np.uint8)
     lattice = result.lattice
     column, row = lattice.nodes.T
     arrows = _ARROW * result.displacements_px[row, column]
     middle = 0.5  # Rerun counts a picture from its first pixel's corner
-    partial = path.with_name(path.name + ".partial")
-    stream = rr.RecordingStream("aolink_slopes")
-    try:
-        partial.touch()
-        stream.save(partial)
+    with new_rrd("aolink_slopes", path, overwrite=overwrite) as stream:
         stream.log("frame", rr.Image(grey), static=True)
         for name, places, colour, size in (
             ("reference", result.reference.spots, (90, 130, 255), 1.5),
@@ -48,14 +43,6 @@ def save_slopes(result: FrameSlopes, path: Path) -> Path:
         ]
         panels = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
         stream.send_blueprint(rrb.Blueprint(rrb.Horizontal(contents=views), *panels, rrb.TimePanel(state="hidden")))
-        stream.disconnect()
-        os.replace(partial, path)
-    except OSError as error:
-        raise ViewerError(f"cannot write {path}: {(error.strerror or str(error)).lower()}") from None
-    finally:
-        stream.disconnect()
-        partial.unlink(missing_ok=True)
-    return path
 
 
 def _coloured(wavefront: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -28,6 +28,7 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from aolink.errors import ViewerError
+from aolink.files import check_target, writing
 from aolink.viewing.timebase import FAST_STEP
 
 HOST = "127.0.0.1"
@@ -76,15 +77,14 @@ def screenshot(
         The machine cannot render (the message names the packages it lacks), or nothing was shown.
     """
     png_path = Path(png_path)
+    check_target(png_path, overwrite=True, suffix=".png", error=ViewerError)
     with headless_viewer(rrd_path, step=step, size=size) as client:
         picture = settled_picture(client)
     # Headless too, the viewer keeps the place of its title bar free.
     inside = picture[:, _CORNER:-_CORNER]
     title_bar = int(np.argmax((inside != inside[:, :1]).any(axis=(1, 2))))
-    try:
-        Image.fromarray(picture[title_bar:]).save(png_path, format="PNG")
-    except OSError as error:
-        raise ViewerError(f"cannot write {png_path}: {(error.strerror or str(error)).lower()}") from None
+    with writing(png_path, overwrite=True, suffix=".png", error=ViewerError) as partial:
+        Image.fromarray(picture[title_bar:]).save(partial, format="PNG")
     return png_path
 
 
@@ -174,24 +174,26 @@ def free_port() -> int:
 @contextmanager
 def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
     """Rerun's program, ended with the block."""
-    process = subprocess.Popen(
-        [str(_program()), "--bind", HOST, *options],
-        stdin=subprocess.DEVNULL,
-        stdout=said,
-        stderr=said,
-        env={**os.environ, "NO_COLOR": "1"},
-        start_new_session=True,  # Ctrl-C comes to us alone, and we end it
-        preexec_fn=_end_with_parent,
-    )
-    try:
-        yield process
-    finally:
-        process.terminate()
+    # It leaves its own temporary files behind when it is ended.
+    with tempfile.TemporaryDirectory(prefix="aolink-", ignore_cleanup_errors=True) as temporary:
+        process = subprocess.Popen(
+            [str(_program()), "--bind", HOST, *options],
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            env={**os.environ, "NO_COLOR": "1", "TMPDIR": temporary},
+            start_new_session=True,  # Ctrl-C comes to us alone, and we end it
+            preexec_fn=_end_with_parent,
+        )
         try:
-            process.wait(_STOP_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def _program() -> Path:

@@ -105,7 +105,7 @@ def test_a_cut_without_an_exposure_is_refused(
 
 def test_the_source_is_never_the_target(recorded: Session) -> None:
     before = recorded.path.read_bytes()
-    with pytest.raises(RecordingError, match="is the recording itself"):
+    with pytest.raises(RecordingError, match="is what the new file is made from"):
         recover(recorded.path, recorded.path, overwrite=True)
     assert recorded.path.read_bytes() == before
 
@@ -142,7 +142,7 @@ def test_no_command_writes_over_what_it_reads(aolink: Run, recorded: Session, tm
         ("deblur", "a.mcap", "-e", "o1", "-o", "a.mcap"),
     ):
         result = aolink(*arguments, "--overwrite")
-        assert "is the recording itself" in result.stderr, arguments
+        assert "is what the new file is made from" in result.stderr, arguments
         assert result.returncode == 5
     assert {(tmp_path / name).read_bytes() for name in ("a.mcap", "b.mcap", "link.mcap")} == {data}
 

@@ -163,15 +163,16 @@ def test_an_existing_target_is_kept(aolink: Run, tmp_path: Path) -> None:
         assert (tmp_path / "a.mcap").read_text() == "precious"
         assert aolink(*arguments, "--overwrite").returncode == 0
     assert Recording(tmp_path / "a.mcap").counts["/camera/image"] == 2
-    (tmp_path / "b.mcap").write_text("precious")
-    for command in (["estimate", "a.mcap", "-o", "b.mcap"], ["view", "a.mcap", "--save", "b.mcap"]):
+    for name in ("b.mcap", "b.rrd"):
+        (tmp_path / name).write_text("precious")
+    for command in (["estimate", "a.mcap", "-o", "b.mcap"], ["view", "a.mcap", "--save", "b.rrd"]):
         assert "exists and is not overwritten" in aolink(*command).stderr
 
 
 def test_a_folder_that_does_not_exist(aolink: Run) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         result = aolink(*record_arguments(camera, mirror, output="no/such/a.mcap"))
-    assert_refused(result, 5, "cannot create no/such/a.mcap: no such file or directory")
+    assert_refused(result, 5, "cannot write no/such/a.mcap: there is no folder no/such; make it first")
 
 
 def test_an_unknown_estimator(aolink: Run) -> None:
@@ -203,9 +204,22 @@ def test_a_full_disk(aolink: Run, tmp_path: Path) -> None:
     assert "aolink: warning: a.mcap: it was cut off" in info.stderr
 
 
-def test_no_space_at_all() -> None:
-    with pytest.raises(RecordingError, match="cannot write /dev/full: the disk is full"):
-        RecordingWriter("/dev/full", load_rig("section-vi"), {}, 0, overwrite=True)
+def test_no_space_at_all(tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, before[1]))
+    try:
+        with pytest.raises(
+            RecordingError, match=r"cannot write .*a\.mcap: it would be larger than the disk or a limit"
+        ):
+            RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("name", ["/dev/full", "/dev/null"])
+def test_a_device_is_no_target(name: str) -> None:
+    with pytest.raises(RecordingError, match=f"{name} is a device, and only plain files are written"):
+        RecordingWriter(name, load_rig("section-vi"), {}, 0, overwrite=True)
 
 
 def wait_for_size(path: Path, size: int, process: subprocess.Popen[str]) -> None:
@@ -228,7 +242,7 @@ def test_ctrl_c_keeps_the_recording_whole_and_parks_the_mirror(
         output, errors = process.communicate(timeout=30)
         parked = aolink("devices", mirror).stdout
     assert process.returncode == 130
-    assert errors == ""
+    assert errors == "aolink: interrupted by SIGINT\n"
     assert "interrupted" in output
     if not how:  # in real time the mirror parks by itself as well, its queue runs empty: virtual time tells
         assert "parked" in parked

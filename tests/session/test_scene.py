@@ -389,7 +389,7 @@ def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None
     with pytest.raises(EstimatorError, match="nonsense"):
         write_deblurred(recording, tmp_path / "x.mcap", estimator="nonsense")
     assert not (tmp_path / "x.mcap").exists()
-    with pytest.raises(RecordingError, match="is the recording itself"):
+    with pytest.raises(RecordingError, match="is what the new file is made from"):
         write_deblurred(recording, session, estimator="o1", overwrite=True)
     broken = tmp_path / "broken.mcap"
     with RecordingWriter(

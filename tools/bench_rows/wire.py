@@ -27,6 +27,7 @@ def link_throughput() -> Row:
     from aolink.wire.link import Link
     from aolink.wire.packet import encode_message
     from aolink.wire.port import SerialPort, wait_readable
+    from aolink.workers import end_with_parent
 
     data = np.random.default_rng(1).integers(0, 256, 4096, dtype=np.uint8).tobytes()
     packets = [encode_message(pb.FrameChunk(frame_id=k, total=4096, data=data), k & 0xFFFF) for k in range(4000)]
@@ -46,6 +47,7 @@ def link_throughput() -> Row:
         return elapsed
 
     def write_all(descriptor: int, data: bytes) -> None:
+        end_with_parent()  # nobody reads from it any more when that is killed
         view = memoryview(data)
         while view:
             view = view[os.write(descriptor, view[:65536]) :]

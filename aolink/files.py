@@ -1,0 +1,318 @@
+"""Writing files: whole or not at all, never over what has to stay, never by two commands at once.
+
+Every file that aolink writes comes from here. `writing` makes it under a name of its own beside the target and
+puts it in the target's place when it is complete. `create` is for a recording that has to be readable while the
+session still goes on: it is written under its final name.
+
+A target is a plain file or a name that is still free. Folders, symbolic links, pipes, sockets and devices are
+refused before they are opened, so nothing is written through a link and nothing waits for a pipe.
+
+Whoever writes holds a lock (``flock``) on the unfinished file. A second command that wants the same target sees
+the lock and is refused. The operating system drops the lock when a process ends, however it ends, so what a killed
+command left is known to be dead, and the next command that writes the same target removes it. On a file system
+without such locks two commands still cannot damage the target: each puts a whole file there, or is refused.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import random
+import re
+import secrets
+import stat
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from aolink.errors import AolinkError
+
+_ATTEMPTS = 6
+"""Two commands that begin in the same instant see each other, and both step back: how often they try again."""
+_STEP_BACK_S = 0.05
+"""The longest of the random waits in between."""
+_LONGEST_NAME = 200
+"""Bytes of the target's name that the unfinished file has in its own; file systems allow 255 for the whole."""
+_NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
+"""What a file system says that has no hard links."""
+_KINDS = {
+    stat.S_IFDIR: "a folder: give the name of a file in it",
+    stat.S_IFIFO: "a named pipe, and only plain files are written: give another name",
+    stat.S_IFSOCK: "a socket, and only plain files are written: give another name",
+    stat.S_IFCHR: "a device, and only plain files are written: give another name",
+    stat.S_IFBLK: "a device, and only plain files are written: give another name",
+}
+
+
+def check_target(
+    target: Path,
+    *,
+    overwrite: bool = False,
+    sources: Iterable[Path] = (),
+    suffix: str = "",
+    error: type[AolinkError] = AolinkError,
+) -> None:
+    """Refuse a target that must not be written or cannot be, before any work is done for it.
+
+    Parameters
+    ----------
+    overwrite:
+        Whether a file of that name may be replaced.
+    sources:
+        Files that the new one is made from, which it may never replace.
+    suffix:
+        How the name has to end, as ``.png``; empty for any.
+    error:
+        The class of what is raised.
+    """
+    if suffix and target.suffix.lower() != suffix:
+        raise error(f"cannot write {target}: what is written is a {suffix} file; give a name that ends with {suffix}")
+    try:
+        if any(target.exists() and source.exists() and target.samefile(source) for source in sources):
+            raise error(f"{target} is what the new file is made from: give another name")
+        kind = stat.S_IFMT(target.lstat().st_mode)
+    except FileNotFoundError:
+        if not target.parent.is_dir():
+            raise error(f"cannot write {target}: there is no folder {target.parent}; make it first") from None
+        return
+    except OSError as problem:
+        raise error(f"cannot write {target}: {why_not(problem)}") from None
+    if kind == stat.S_IFLNK:
+        raise error(f"{target} is a symbolic link: give the name of the file that it points to")
+    if kind != stat.S_IFREG:
+        raise error(f"{target} is {_KINDS.get(kind, 'no plain file: give another name')}")
+    if not overwrite:
+        raise error(_exists(target))
+
+
+@contextmanager
+def writing(
+    target: Path,
+    *,
+    overwrite: bool = False,
+    sources: Iterable[Path] = (),
+    suffix: str = "",
+    error: type[AolinkError] = AolinkError,
+) -> Iterator[Path]:
+    """A new, empty file beside ``target``, to be written in the block; parameters as for `check_target`.
+
+    When the block ends well the file is brought to the disk and put in the place of ``target``, with the permissions
+    that ``target`` had; a target that is new gets those that the umask leaves. When the block raises, or a signal
+    ends the command, the unfinished file is removed and ``target`` stays as it was.
+
+    Raises
+    ------
+    AolinkError
+        Of the class ``error``: the target is refused (`check_target`), another command is writing it, or the file
+        cannot be written (any OSError in the block).
+    """
+    check_target(target, overwrite=overwrite, sources=sources, suffix=suffix, error=error)
+    try:
+        with _unfinished(target, error) as (partial, descriptor):
+            yield partial
+            os.fsync(descriptor)
+            if not _is_open_as(partial, descriptor):
+                raise error(f"cannot write {target}: another program has put a file in the place of {partial}")
+            if overwrite:
+                os.replace(partial, target)
+            else:
+                _put_where_nothing_is(partial, target)
+            _sync_folder(target.parent)
+    except FileExistsError:
+        raise error(_exists(target)) from None
+    except OSError as problem:
+        raise error(f"cannot write {target}: {why_not(problem)}") from None
+
+
+def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = AolinkError) -> int:
+    """Create a file that is written under its final name; gives its descriptor, locked until it is closed.
+
+    With ``overwrite`` an old file is emptied and keeps its permissions.
+
+    Raises
+    ------
+    AolinkError
+        Of the class ``error``: the target is refused (`check_target`), another command is writing it, or it cannot
+        be created.
+    """
+    check_target(target, overwrite=overwrite, error=error)
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    existed = target.exists()
+    try:
+        descriptor = os.open(target, flags | (0 if overwrite else os.O_EXCL), 0o666)
+    except FileExistsError:
+        raise error(_exists(target)) from None
+    except OSError as problem:
+        raise error(f"cannot create {target}: {why_not(problem)}") from None
+    try:
+        if not _lock(descriptor) or _others_write(target):
+            if not existed:
+                target.unlink()
+            raise error(_in_use(target))
+        os.ftruncate(descriptor, 0)
+        _sync_folder(target.parent)
+    except OSError as problem:
+        os.close(descriptor)
+        raise error(f"cannot create {target}: {why_not(problem)}") from None
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def open_unfinished(partial: Path) -> int:
+    """A descriptor to write the file that `writing` gave. Raises OSError."""
+    return os.open(partial, os.O_WRONLY | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC)
+
+
+def is_being_written(target: Path) -> bool:
+    """Whether another command is writing ``target`` at this moment."""
+    try:
+        return _locked_by_another(target) or _others_write(target)
+    except FileNotFoundError:
+        return _others_write(target)
+
+
+def remove_unfinished(target: Path) -> None:
+    """Remove what commands that were killed have left of ``target``."""
+    _others_write(target)
+
+
+def why_not(problem: OSError) -> str:
+    """Why a file cannot be written, in words."""
+    if problem.errno == errno.EFBIG:
+        return "it would be larger than the disk or a limit (ulimit -f) lets a file be"
+    full = problem.errno in (errno.ENOSPC, errno.EDQUOT)
+    return "the disk is full" if full else (problem.strerror or str(problem)).lower()
+
+
+def _exists(target: Path) -> str:
+    return f"{target} exists and is not overwritten: give another name, or --overwrite to replace it"
+
+
+def _in_use(target: Path) -> str:
+    return f"{target} is being written by another command: wait until that has ended, or give another name"
+
+
+@contextmanager
+def _unfinished(target: Path, error: type[AolinkError]) -> Iterator[tuple[Path, int]]:
+    """A file of our own beside ``target``, open and locked, which is gone after the block unless it was renamed."""
+    for attempt in range(_ATTEMPTS):
+        if attempt:
+            time.sleep(random.uniform(0, _STEP_BACK_S))
+        partial = target.with_name(f"{_prefix_of(target)}{secrets.token_hex(8)}.partial")
+        if os.path.lexists(partial):
+            continue
+        descriptor = -1
+        try:
+            descriptor = _open_new(partial, target)
+            # Another command that looks for dead files may take ours for one before it is locked.
+            if not (_lock(descriptor) and _is_open_as(partial, descriptor)):
+                continue
+            if _others_write(target, but=partial) or (target.exists() and _locked_by_another(target)):
+                continue
+            yield partial, descriptor
+            return
+        finally:
+            with suppress(OSError):
+                partial.unlink()
+            if descriptor >= 0:
+                os.close(descriptor)
+    raise error(_in_use(target))
+
+
+def _prefix_of(target: Path) -> str:
+    """What the names of unfinished files of a target begin with; 16 random hexadecimal digits and .partial follow."""
+    return f".{os.fsdecode(os.fsencode(target.name)[:_LONGEST_NAME])}."
+
+
+def _open_new(partial: Path, target: Path) -> int:
+    """Create the unfinished file, with the owner and permissions of ``target`` where there is one."""
+    try:
+        old = target.lstat()
+    except FileNotFoundError:
+        old = None
+    # A private file is not open to others for a moment either.
+    mode = 0o666 if old is None else 0o600
+    descriptor = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
+    if old is not None:
+        with suppress(PermissionError):  # only the superuser gives files away
+            os.fchown(descriptor, old.st_uid, old.st_gid)
+        os.fchmod(descriptor, old.st_mode & 0o777)
+    return descriptor
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock an open file; False if somebody else has. Without locks in the file system everything counts as locked."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
+def _is_open_as(path: Path, descriptor: int) -> bool:
+    """Whether a path still names the file that is open."""
+    try:
+        return os.path.samestat(path.lstat(), os.fstat(descriptor))
+    except OSError:
+        return False
+
+
+def _others_write(target: Path, but: Path | None = None) -> bool:
+    """Whether an unfinished file of ``target`` other than ``but`` is locked. Dead ones are removed."""
+    unfinished = re.compile(re.escape(_prefix_of(target)) + r"[0-9a-f]{16}\.partial")
+    try:
+        names = [name for name in os.listdir(target.parent) if unfinished.fullmatch(name)]
+    except OSError:  # a folder that may be written but not read
+        return False
+    found = False
+    for path in (target.with_name(name) for name in names):
+        if path == but:
+            continue
+        with suppress(OSError):  # it is of another user, or has just gone
+            if _locked_by_another(path, remove=True):
+                found = True
+    return found
+
+
+def _locked_by_another(path: Path, *, remove: bool = False) -> bool:
+    """Whether somebody holds the lock of a plain file; with ``remove`` the file goes if nobody does. Raises OSError."""
+    if not stat.S_ISREG(path.lstat().st_mode):
+        return False
+    descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if remove:
+            path.unlink()
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def _put_where_nothing_is(partial: Path, target: Path) -> None:
+    """Rename, unless the target has come into being meanwhile. Raises FileExistsError."""
+    try:
+        os.link(partial, target)  # a rename would replace it
+    except OSError as problem:
+        if problem.errno not in _NO_LINKS:
+            raise
+        if os.path.lexists(target):
+            raise FileExistsError from None
+        os.rename(partial, target)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring a new name to the disk. Some file systems do this by themselves and refuse to be asked."""
+    with suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,104 @@
+"""What ends a command from outside: Ctrl-C, SIGTERM and SIGHUP, for every command in the same way.
+
+Only the standard library is imported here, so that this works while the rest of a command is still being loaded.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+import termios
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ECHO_S = 0.5
+"""A terminal that closes sends a signal several times; what comes within this time is the same request."""
+
+
+class Interrupted(BaseException):
+    """A signal ends the command: whatever is open is closed or removed on the way to `ending_the_command`.
+
+    It is no Exception and no KeyboardInterrupt, so that no library takes it for something to be handled.
+    """
+
+    def __init__(self, number: int, what_stays: str = "") -> None:
+        super().__init__(f"interrupted by {signal.Signals(number).name}" + (what_stays and f"; {what_stays}"))
+        self.number = number
+        self.exit_code = 128 + number
+        """130 for SIGINT (Ctrl-C), 143 for SIGTERM, 129 for SIGHUP, as shells have them."""
+
+
+class StopRequest:
+    """What Ctrl-C, SIGTERM and SIGHUP do while this is installed.
+
+    With ``at_once`` the first of them raises `Interrupted`, wherever the program is. Without, it only makes the
+    request true, for what ends in good order by itself, as a session does; and the next one raises `Interrupted`.
+    """
+
+    def __init__(self, *, at_once: bool = False) -> None:
+        self.signal = 0
+        self._at_once = at_once
+        self._first_s = 0.0
+
+    def __call__(self) -> bool:
+        return self.signal != 0
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        first = not self.signal
+        if first:
+            self.signal, self._first_s = number, now
+            if number == signal.SIGHUP:
+                _leave_lost_terminal()
+        if self._at_once if first else now - self._first_s > _ECHO_S:
+            raise Interrupted(number)
+
+    @contextmanager
+    def installed(self) -> Iterator[StopRequest]:
+        # SIGHUP that is ignored already stays so: that is what `nohup` does, and a background job may rely on it.
+        heard = [n for n in _SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
+        before = {number: signal.signal(number, self._handle) for number in heard}
+        try:
+            yield self
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def raise_if_asked(self) -> None:
+        """End the command as one that a signal ended, once it has ended in good order what it was doing."""
+        if self.signal:
+            raise Interrupted(self.signal)
+
+
+@contextmanager
+def stop_after() -> Iterator[StopRequest]:
+    """A `StopRequest` for a block that ends by itself soon after it was asked to; raises `Interrupted` then."""
+    with StopRequest().installed() as stop:
+        yield stop
+    stop.raise_if_asked()
+
+
+@contextmanager
+def ending_the_command() -> Iterator[None]:
+    """A whole command: a signal raises `Interrupted` in it, which becomes one line and the exit code here."""
+    try:
+        with StopRequest(at_once=True).installed():
+            yield
+    except Interrupted as interrupted:
+        print(f"aolink: {interrupted}", file=sys.stderr)
+        sys.exit(interrupted.exit_code)
+
+
+def _leave_lost_terminal() -> None:
+    """Let output go nowhere if its terminal is gone: each line would fail, and hide how the command ended."""
+    for descriptor in (1, 2):
+        try:
+            termios.tcgetattr(descriptor)
+        except termios.error as error:
+            if error.args[0] == errno.EIO:  # a file or a pipe says that it is no terminal
+                os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)

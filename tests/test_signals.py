@@ -1,0 +1,218 @@
+"""Ctrl-C, SIGTERM and SIGHUP end every command alike: one line, an exit code that says which, nothing half left."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import pty
+import shlex
+import signal
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from aolink.cli import app
+from aolink.demo import simulated_rig
+from aolink.recording.editing import cut
+from aolink.recording.reader import Recording
+from tests.conftest import Session
+
+SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
+_PATIENCE_S = 120.0
+
+COMMANDS = {
+    "rig": "rig section-vi --real-time",
+    "devices": "devices {silent}",
+    "record": "record --camera {camera} --mirror {mirror} --rig section-vi -o a.mcap",
+    "replay": "replay {session} -e o1 --rate 0.01",
+    "calibrate": "calibrate --camera {camera} --mirror {mirror} --rig section-vi -o a.toml",
+    "demo": "demo --rig tip-tilt --exposures 5",
+    "info": "info {session} --check",
+    "estimate": "estimate {session} -e moments -o a.mcap",
+    "compare": "compare {session}",
+    "recover": "recover {session} -o a.mcap",
+    "cut": "cut {session} -o a.mcap",
+    "merge": "merge {first} {second} -o a.mcap",
+    "deblur": "deblur {session} -e o1 -o a.mcap",
+    "slopes": "slopes {frame} --reference {reference} -o a.npz",
+    "view": "view {session} --save a.rrd",
+}
+"""A call of every command, for the places of files and ports."""
+
+
+@pytest.fixture(scope="module")
+def places(recorded: Session, tmp_path_factory: pytest.TempPathFactory, mmirs: Path) -> Iterator[dict[str, str]]:
+    """What the commands are given: recordings, frames, a rig in real time, and a terminal where nobody answers."""
+    folder = tmp_path_factory.mktemp("places")
+    cut(recorded.path, folder / "first.mcap", 0.0, 1.0)
+    cut(recorded.path, folder / "second.mcap", 1.0, 2.0)
+    master, slave = pty.openpty()
+    with simulated_rig("section-vi", "--real-time") as (camera, mirror):
+        yield {
+            "session": str(recorded.path),
+            "first": str(folder / "first.mcap"),
+            "second": str(folder / "second.mcap"),
+            "frame": str(mmirs / "mmirs_wfs_0150.fits.gz"),
+            "reference": str(mmirs / "mmirs_camera2_ref.fits.gz"),
+            "camera": camera,
+            "mirror": mirror,
+            "silent": os.ttyname(slave),
+        }
+    os.close(master)
+    os.close(slave)
+
+
+def test_there_is_a_case_for_every_command() -> None:
+    names = {each.name or each.callback.__name__ for each in app.registered_commands if each.callback}
+    assert {name.replace("_", "-") for name in names} == {*COMMANDS}
+
+
+class Started:
+    """A command as a process, in a folder of its own with a folder of its own for temporary files."""
+
+    def __init__(self, folder: Path, words: str, **options: object) -> None:
+        self.temporary = folder / "temporary"
+        self.temporary.mkdir(exist_ok=True)
+        (folder / "work").mkdir(exist_ok=True)
+        self.folder = folder / "work"
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "aolink", *shlex.split(words)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True, cwd=self.folder,
+            env={**os.environ, "TMPDIR": str(self.temporary), "PYTHONUNBUFFERED": "1"}, **options,  # type: ignore[call-overload]
+        )  # fmt: skip
+
+    def wait_until(self, true: Callable[[], bool]) -> bool:
+        """Whether it came true before the process ended."""
+        deadline = time.monotonic() + _PATIENCE_S
+        while not true():
+            if self.process.poll() is not None:
+                return False
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        return True
+
+    def hears_signals(self) -> bool:
+        """Whether it has a handler for SIGHUP, the last of the three to get one."""
+        with contextlib.suppress(OSError):
+            status = Path(f"/proc/{self.process.pid}/status").read_text()
+            caught = int(status.partition("SigCgt:")[2].split()[0], 16)
+            return bool(caught >> (signal.SIGHUP - 1) & 1)
+        return False
+
+    def end(self, number: int) -> tuple[int, str]:
+        """Send a signal; the exit code and what was said on stderr."""
+        self.process.send_signal(number)
+        _, errors = self.process.communicate(timeout=_PATIENCE_S)
+        return self.process.returncode, errors
+
+    def unfinished(self) -> list[Path]:
+        return [*self.folder.rglob(".*.partial")]
+
+    def assert_nothing_half_is_left(self) -> None:
+        assert not [*self.temporary.iterdir()]
+        assert not self.unfinished()
+        for path in self.folder.rglob("*.mcap"):
+            assert Recording(path).complete
+
+
+@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_signal_ends_a_command_that_has_just_begun(
+    tmp_path: Path, places: dict[str, str], command: str, number: signal.Signals
+) -> None:
+    """From the instant on in which it hears them: most of it is not even loaded then."""
+    started = Started(tmp_path, COMMANDS[command].format(**places))
+    assert started.wait_until(started.hears_signals)
+    assert started.end(number) == (SIGNALS[number], f"aolink: interrupted by {number.name}\n")
+    started.assert_nothing_half_is_left()
+
+
+MIDST: dict[str, Callable[[Started], bool]] = {
+    "rig": lambda it: "camera" in it.process.stdout.readline(),  # type: ignore[union-attr]
+    "record": lambda it: (it.folder / "a.mcap").exists() and (it.folder / "a.mcap").stat().st_size > 30_000,
+    "calibrate": lambda it: "dark: cover the camera" in it.process.stderr.read(30),  # type: ignore[union-attr]
+    "demo": lambda it: bool(it.unfinished()) and any("session.rrd" in each.name for each in it.unfinished()),
+    "compare": lambda it: bool([*it.temporary.glob("aolink-*/.*.partial")]),
+    **dict.fromkeys(
+        ("estimate", "recover", "cut", "merge", "deblur", "slopes", "view"), lambda it: bool(it.unfinished())
+    ),
+}
+"""What shows that a command is in the midst of its work; that of the others shows nowhere."""
+
+
+@pytest.mark.parametrize("command", MIDST)
+def test_a_signal_in_the_midst_leaves_nothing_half(tmp_path: Path, places: dict[str, str], command: str) -> None:
+    for number in range(8):  # a short job may be done before the signal comes
+        started = Started(tmp_path / str(number), COMMANDS[command].format(**places))
+        begun = started.wait_until(lambda: MIDST[command](started))  # noqa: B023 (it is called here only)
+        code, errors = started.end(signal.SIGTERM)
+        started.assert_nothing_half_is_left()
+        if code == 0:
+            continue
+        assert begun
+        assert code == 143
+        assert errors.strip().splitlines()[-1].startswith("aolink: interrupted by SIGTERM")
+        assert errors.count("\n") == 1
+        return
+    pytest.fail("it was done before the signal each time")
+
+
+def test_a_demo_that_ends_after_recording_says_where_the_recording_is(tmp_path: Path, places: dict[str, str]) -> None:
+    started = Started(tmp_path, COMMANDS["demo"])
+    assert started.wait_until(lambda: MIDST["demo"](started))
+    code, errors = started.end(signal.SIGINT)
+    (folder,) = started.folder.iterdir()
+    assert code == 130
+    assert errors == f"aolink: interrupted by SIGINT; what was made until then is in {folder.name}\n"
+    assert sorted(each.name for each in folder.iterdir()) == ["rig.toml", "session.mcap"]
+    started.assert_nothing_half_is_left()
+
+
+def test_a_batch_ends_in_good_order_with_its_processes(tmp_path: Path, places: dict[str, str]) -> None:
+    models = ",".join(str(1 + k) for k in range(200))
+    started = Started(
+        tmp_path, f"estimate {places['session']} -e o1 --set plant.process_noise={models} --jobs 2 -o out"
+    )
+    assert started.wait_until(lambda: bool([*started.folder.glob("out/*.mcap")]))
+    code, errors = started.end(signal.SIGTERM)
+    assert (code, errors) == (143, "aolink: interrupted by SIGTERM\n")
+    started.assert_nothing_half_is_left()
+    results = [*started.folder.glob("out/*.mcap")]
+    assert 0 < len(results) < 200
+    assert {path.with_suffix(".json") for path in results} == {*started.folder.glob("out/*.json")}
+
+
+def test_a_terminal_that_closes_ends_a_command(tmp_path: Path) -> None:
+    """Its output fails from then on; the exit code tells all the same."""
+    master, slave = pty.openpty()
+
+    def take_terminal() -> None:
+        os.setsid()
+        fcntl.ioctl(slave, termios.TIOCSCTTY, 0)
+
+    with subprocess.Popen(
+        [sys.executable, "-m", "aolink", "rig", "section-vi", "--real-time"], stdin=slave, stdout=slave, stderr=slave,
+        cwd=tmp_path, preexec_fn=take_terminal,
+    ) as process:  # fmt: skip
+        os.close(slave)
+        said = b""
+        while b"Ctrl-C stops it" not in said:
+            said += os.read(master, 1024)
+        os.close(master)
+        assert process.wait(_PATIENCE_S) == 129
+
+
+def test_nohup_is_respected(tmp_path: Path, places: dict[str, str]) -> None:
+    ignore = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)}
+    started = Started(tmp_path, COMMANDS["record"].format(**places), **ignore)
+    assert started.wait_until(lambda: MIDST["record"](started))
+    started.process.send_signal(signal.SIGHUP)
+    size = (started.folder / "a.mcap").stat().st_size
+    assert started.wait_until(lambda: (started.folder / "a.mcap").stat().st_size > size + 30_000), "it goes on"
+    assert started.end(signal.SIGTERM) == (143, "aolink: interrupted by SIGTERM\n")
