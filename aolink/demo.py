@@ -37,8 +37,8 @@ class DemoResult:
     rrd: Path | None
     """None if the demo was interrupted before."""
     picture: Path | None
-    no_picture: str
-    """Why there is no picture; empty where there is one."""
+    not_of_viewer: str
+    """Why the picture is not one of the viewer, but of matplotlib or None; empty where it is the viewer's."""
     report: Report
     deblurred: Summary | None = None
     """What came of the pictures that a picture sensor took; None where the rig has none."""
@@ -149,7 +149,7 @@ def run_demo(
         )  # fmt: skip
     if stop():
         return DemoResult(
-            recording=path, rrd=None, picture=None, no_picture="interrupted", report=report, differences={},
+            recording=path, rrd=None, picture=None, not_of_viewer="interrupted", report=report, differences={},
             seconds=seconds,
         )  # fmt: skip
     with part("estimate again") as tell:
@@ -170,17 +170,22 @@ def run_demo(
         recording = Recording(deblurred_recording)
     with part("write .rrd"):
         viewing.save_rrd(recording, rrd)
-    no_picture = ""
+    drawn: Path | None = picture
+    not_of_viewer = ""
     with part("draw"):
         try:
             viewing.screenshot(rrd, picture)
         except ViewerError as error:
-            no_picture = str(error)
+            drawn, not_of_viewer = None, str(error)
+            try:
+                drawn = viewing.draw_session(recording, picture)
+            except ViewerError as also:
+                not_of_viewer += f"; {also}"
     return DemoResult(
         recording=path,
         rrd=rrd,
-        picture=None if no_picture else picture,
-        no_picture=no_picture,
+        picture=drawn,
+        not_of_viewer=not_of_viewer,
         report=report,
         deblurred=deblurred,
         deblurred_by=estimators[-1],

@@ -47,6 +47,10 @@ class ViewerError(AolinkError):
     exit_code = 7
 
 
+class RendererError(ViewerError):
+    """The machine has no graphics driver that the viewer can draw with: the message names the packages."""
+
+
 class CalibrationError(AolinkError):
     """Frames that are not what a calibration needs."""
 

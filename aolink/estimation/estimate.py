@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import field, fields
 from functools import cached_property
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.exposure_model import ExposureModel, path_from_coefficients
+from aolink.estimation.motion import coefficient_roots, motion
 from aolink.plain import plain_data
 
 FloatArray = NDArray[np.float64]
@@ -84,6 +86,27 @@ class Estimate:
     def path_sd(self) -> FloatArray:
         """Standard deviation of the path, slope units, (n_outputs, n_steps)."""
         return self._unfolded[1]
+
+    def path_covariance(self, outputs: Sequence[int] | None = None) -> FloatArray:
+        """Covariance of the path over its fast steps, slope units squared.
+
+        Parameters
+        ----------
+        outputs:
+            Numbers of the outputs wanted, such as those of one spot's x and y. All of them by default: with many
+            outputs that is a very large matrix.
+
+        Returns
+        -------
+        (k n_steps, k n_steps) for k outputs, all steps of the first one first: what `aolink.restoration.motion_psf`
+        takes. Its diagonal is ``path_sd`` squared. What the exposure's basis leaves out of the path stands on the
+        diagonal alone.
+        """
+        chosen = range(len(self.path)) if outputs is None else outputs
+        _, root = motion(self, np.eye(len(self.path))[list(chosen)], coefficient_roots(self))
+        covariance = root @ root.T
+        np.fill_diagonal(covariance, self.path_sd[list(chosen)].ravel() ** 2)
+        return np.asarray(covariance)
 
     @cached_property
     def _unfolded(self) -> tuple[FloatArray, FloatArray]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RestorationError
 from aolink.estimation import Estimate
+from aolink.estimation.motion import coefficient_roots, motion
 from aolink.exposure import Exposure, step_shares
 from aolink.files import writing
 from aolink.optics.camera import is_saturated, to_density
-from aolink.plant import psd_root
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.reader import RawMessage, Recording, RestoredPictures
@@ -51,52 +51,6 @@ class Summary:
     psnr_blurred: list[float] = field(default_factory=list)
     """Peak signal-to-noise ratio of each scene as it came, moved back by its mean displacement, dB."""
     psnr_restored: list[float] = field(default_factory=list)
-
-
-def coefficient_roots(estimate: Estimate) -> list[FloatArray]:
-    """Roots of the covariance of each axis's coefficients."""
-    return [psd_root(each) for each in estimate.coefficient_covariance]
-
-
-def motion(
-    estimate: Estimate, mix: FloatArray, roots: Sequence[FloatArray], *, after: bool = False
-) -> tuple[FloatArray, FloatArray]:
-    """A sum of an estimate's outputs at each fast step, and a root of its covariance.
-
-    Parameters
-    ----------
-    mix:
-        Weights of the outputs, (k, n_outputs).
-    roots:
-        The estimate's `coefficient_roots`.
-    after:
-        With the step after the last.
-
-    Returns
-    -------
-    (k, n_steps), and R of the covariance R R', (k n_steps, n), slope units; the covariance without the path's share
-    that the exposure's basis leaves out. With ``after`` n_steps is one more.
-    """
-    model, path = estimate.model, estimate.path
-    if after:
-        last = (model.plant.C @ estimate.end_state[..., None]).reshape(-1, 1)
-        path = np.concatenate([path, last], axis=1)
-    axes, count = estimate.coefficient_covariance.shape[:2]
-    weights = mix.reshape(len(mix), axes, -1)
-    outputs, paths = model.factors
-    each = [np.zeros((len(mix) * path.shape[1], 0))]
-    for axis in range(axes):
-        if weights[:, axis].any():
-            mixed = weights[:, axis] if outputs is None else weights[:, axis] @ outputs
-            if paths.ndim == 2:  # courses of the coefficients, the outputs their patterns
-                rows = mixed[:, None, :count] * paths[:, :count]
-            else:
-                rows = np.tensordot(mixed, paths[:, :, :count], axes=1)
-            if after:
-                end = weights[:, axis] @ model.plant.C @ model.end_rows[:, :count]
-                rows = np.concatenate([rows, end[:, None]], axis=1)
-            each.append(rows.reshape(-1, count) @ roots[axis])
-    return mix @ path, np.concatenate(each, axis=1)
 
 
 def estimated_psfs(

@@ -212,6 +212,10 @@ class Recording:
             yield recorded, assembly.take(recorded.topic, recorded.message)
         yield None, assembly.flush()
 
+    def __iter__(self) -> Iterator[Exposure]:
+        """Its exposures, from the first one on: a recording is used as `aolink.simulate`'s exposures are."""
+        return self.exposures()
+
     def exposures(self) -> Iterator[Exposure]:
         """The exposures in order, with their truth and their scene where the file has them."""
         assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)

@@ -152,7 +152,12 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
     if result.deblurred_recording is not None:
         lines.append(f"deblurred {result.deblurred_recording}")
     lines.append(f"rerun     {result.rrd}")
-    lines.append(f"picture   {result.picture}" if result.picture else f"picture   none: {result.no_picture}")
+    if not result.not_of_viewer:
+        lines.append(f"picture   {result.picture}")
+    elif result.picture is not None:
+        lines.append(f"picture   {result.picture}, drawn with matplotlib: {result.not_of_viewer}")
+    else:
+        lines.append(f"picture   none: {result.not_of_viewer}")
     lines.append(f"next      {command} view {result.deblurred_recording or result.recording}")
     lines.append(f"          {command} info {result.recording}")
     lines.append(f"          {command} estimate {result.recording} --estimator o3")

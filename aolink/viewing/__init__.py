@@ -4,12 +4,14 @@ Each topic has a function that turns a batch of plain data into Rerun entities o
 calls them with a whole recording, `LiveView` with one exposure after the other.
 """
 
+from aolink.viewing.figure import draw_session
 from aolink.viewing.live import LiveView, live_viewer
 from aolink.viewing.save import save_rrd, send_recording
 from aolink.viewing.viewer import open_viewer, screenshot, serve_web
 
 __all__ = [
     "LiveView",
+    "draw_session",
     "live_viewer",
     "open_viewer",
     "save_rrd",

@@ -27,9 +27,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-from aolink.errors import ViewerError
+from aolink.errors import RendererError, ViewerError
 from aolink.files import check_target, writing
 from aolink.viewing.timebase import FAST_STEP
+from aolink.viewing.vulkan import has_vulkan
 
 HOST = "127.0.0.1"
 PICTURE_SIZE = (1920, 1200)
@@ -49,9 +50,11 @@ _CORNER = 40
 _LEAST_COLOURS = 50
 """A picture with fewer is blank: an empty viewer has about a dozen."""
 
+_LAST_WORDS_S = 2.0
+"""How long a viewer that has failed may take to end."""
 _NO_DRIVER = (
-    "this machine cannot render: Rerun found no Vulkan driver;"
-    " on Debian: apt-get install mesa-vulkan-drivers libvulkan1 libegl1 libgl1-mesa-dri"
+    "this machine has no Vulkan driver, which the Rerun viewer needs to draw;"
+    " on Debian: apt-get install mesa-vulkan-drivers"
 )
 
 
@@ -74,7 +77,9 @@ def screenshot(
     Raises
     ------
     ViewerError
-        The machine cannot render (the message names the packages it lacks), or nothing was shown.
+        Nothing was shown, or the picture cannot be written.
+    RendererError
+        The machine has no driver to draw with; the message names the package.
     """
     png_path = Path(png_path)
     check_target(png_path, overwrite=True, suffix=".png", error=ViewerError)
@@ -92,20 +97,34 @@ def screenshot(
 def headless_viewer(
     rrd_path: str | Path, *, step: int | None = None, size: tuple[int, int] = PICTURE_SIZE
 ) -> Iterator[ViewerClient]:
-    """A viewer without a window that has a file open and stands at a fast step; it ends with the block."""
+    """A viewer without a window that has a file open and stands at a fast step; it ends with the block.
+
+    Raises
+    ------
+    ViewerError
+        The viewer cannot show the file, or ended while the block used it.
+    RendererError
+        It did so because the machine has no driver to draw with.
+    """
     path = _existing(rrd_path)
     port = free_port()
     options = ["--headless", "--port", str(port), "--window-size", f"{size[0]}x{size[1]}", "--hide-welcome-screen"]
     with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
-        client = _connected(process, port, said)
         try:
+            client = _connected(process, port, said)
             client.open(str(path))
             _until_loaded(client)
             client.run_command("ui.toggle_top_panel")
             client.set_time(FAST_STEP, sequence=_step_inside(client) if step is None else step, play_state="paused")
-        except (RuntimeError, ConnectionError) as error:
+            yield client
+        except (RuntimeError, ConnectionError, ViewerError) as error:
+            # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
+            # what the call says then ("transport error") is not the cause.
+            if _ended(process):
+                raise _why_it_ended(said) from None
+            if isinstance(error, ViewerError):
+                raise
             raise ViewerError(f"the viewer cannot show {path}: {_one_line(error)}") from None
-        yield client
 
 
 def settled_picture(client: ViewerClient, view_id: str | None = None) -> NDArray[np.uint8]:
@@ -137,7 +156,7 @@ def open_viewer(rrd_path: str | Path) -> None:
         raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
     with tempfile.TemporaryFile() as said, running_rerun([str(path), "--port", "auto"], said) as process:
         if process.wait() != 0:
-            raise ViewerError(_why_it_ended(said))
+            raise _why_it_ended(said)
 
 
 def serve_web(rrd_path: str | Path, port: int = 9090, *, on_ready: Callable[[str], None] | None = None) -> None:
@@ -161,7 +180,7 @@ def serve_web(rrd_path: str | Path, port: int = 9090, *, on_ready: Callable[[str
         if on_ready is not None:
             on_ready(f"http://{HOST}:{port}/?url={quote(f'rerun+http://{HOST}:{data_port}/proxy', safe='')}")
         if process.wait() != 0:
-            raise ViewerError(_why_it_ended(said))
+            raise _why_it_ended(said)
 
 
 def free_port() -> int:
@@ -239,7 +258,7 @@ def _wait_for(ready: Callable[[], bool], process: subprocess.Popen[bytes], said:
     deadline = time.monotonic() + _START_S
     while not ready():
         if process.poll() is not None:
-            raise ViewerError(_why_it_ended(said))
+            raise _why_it_ended(said)
         if time.monotonic() > deadline:
             raise ViewerError(f"Rerun did not answer within {_START_S:g} s")
         time.sleep(_POLL_S)
@@ -281,15 +300,23 @@ def _existing(path: str | Path) -> Path:
     return path.resolve()
 
 
-def _why_it_ended(said: IO[bytes]) -> str:
-    """One sentence from what Rerun said before it ended."""
+def _ended(process: subprocess.Popen[bytes]) -> bool:
+    """Whether a viewer has ended, or does so now: one that fails writes where it failed before it ends."""
+    try:
+        process.wait(_LAST_WORDS_S)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
+
+
+def _why_it_ended(said: IO[bytes]) -> ViewerError:
+    """Why a viewer ended that nobody stopped: the machine's lack of a driver, or else Rerun's own first words."""
+    if sys.platform == "linux" and not has_vulkan():
+        return RendererError(_NO_DRIVER)
     said.seek(0)
-    text = said.read().decode(errors="replace")
-    if any(sign in text for sign in ("No graphics adapter", "Failed to get render context", "create render state")):
-        return _NO_DRIVER
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    lines = [line.strip() for line in said.read().decode(errors="replace").splitlines() if line.strip()]
     causes = [line for line in lines if "panicked at" in line or "ERROR" in line or line.startswith("Error")]
-    return f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why"
+    return ViewerError(f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why")
 
 
 def _one_line(error: Exception) -> str:

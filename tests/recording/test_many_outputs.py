@@ -10,8 +10,8 @@ import pytest
 
 from aolink.demo import simulated_rig
 from aolink.estimation import run
+from aolink.estimation.motion import coefficient_roots, motion
 from aolink.recording import convert
-from aolink.recording.deblur import coefficient_roots, motion
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig

@@ -18,16 +18,15 @@ import aolink
 from aolink.cli import app
 from aolink.demo import simulated_rig
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
+from aolink.estimation.motion import coefficient_roots, motion
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.deblur import (
     blurred_psnr,
-    coefficient_roots,
     deblur,
     estimated_psfs,
-    motion,
     psnr,
     write_deblurred,
 )

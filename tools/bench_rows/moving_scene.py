@@ -9,30 +9,32 @@ from aolink.estimation import ESTIMATOR_NAMES
 from aolink.recording.deblur import blurred_psnr, psnr, scene_psf
 from aolink.restoration import Psf, motion_psf, restore
 from aolink.scene import framed, read_scene_picture
-from bench_rows.row import Row
+from bench_rows.row import Effort, Row
 
 EXPOSURES = 100
 # What the estimated path is to give more than the blurred picture has.
 _GOALS = {"moments": 1.5, "profile": 1.5}
 
 
-def moving_scene() -> list[Row]:
+def moving_scene(effort: Effort) -> list[Row]:
     """Mean PSNR over a session, by tv; the peer is the picture as it came, with its shift forgiven."""
-    exposures = aolink.simulate("moving-scene", EXPOSURES)
+    exposures = aolink.simulate("moving-scene", effort.of(EXPOSURES))
     rig, sensor = exposures.rig, exposures.rig.scene
     assert sensor is not None
     scene = framed(sensor, read_scene_picture(sensor, rig.folder))
-    shifts = [np.rint(e.truth.path.mean(axis=1) / sensor.pixel_scale).astype(np.intp) for e in exposures]
+    truths = [exposure.truth for exposure in exposures if exposure.truth is not None]
+    pictures = [exposure.scene.pixels for exposure in exposures if exposure.scene is not None]
+    shifts = [np.rint(truth.path.mean(axis=1) / sensor.pixel_scale).astype(np.intp) for truth in truths]
     blurred = np.mean([blurred_psnr(sensor, e, s, scene) for e, s in zip(exposures, shifts, strict=True)])
 
     def found(psfs: list[Psf]) -> np.ndarray:
         restored = [
-            restore(sensor.to_intensity(e.scene.pixels), psf, mask=~sensor.is_saturated(e.scene.pixels)).image
-            for e, psf in zip(exposures, psfs, strict=True)
+            restore(sensor.to_intensity(counts), psf, mask=~sensor.is_saturated(counts)).image
+            for counts, psf in zip(pictures, psfs, strict=True)
         ]
         return np.array([psnr(np.clip(each, 0, 1), scene) for each in restored])
 
-    true = found([motion_psf(e.truth.path, None, sensor.kernel, sensor.pixel_scale) for e in exposures])
+    true = found([motion_psf(truth.path, None, sensor.kernel, sensor.pixel_scale) for truth in truths])
     rows = []
     for name in ("o1", "o3", "moments", "profile"):
         if name not in ESTIMATOR_NAMES:

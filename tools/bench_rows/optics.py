@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from aolink.rig import load_rig, parse_rig
-from bench_rows.row import Row, median_s
+from bench_rows.row import Effort, Row, median_s
 
 
-def frame_synthesis() -> Row:
+def frame_synthesis(effort: Effort) -> Row:
     """Exposures of 30 x 30 spots on 16 x 16 pixels over 200 fast steps, against error functions at every step."""
     from aolink.optics.frame import spots_density
     from aolink.optics.kernel import pixel_mass
@@ -21,38 +21,39 @@ def frame_synthesis() -> Row:
         x, y = (pixel_mass(kernel, edges, path[:, direction]) for direction in (0, 1))
         np.matmul(y.swapaxes(1, 2), x)
 
-    ours, theirs = (1 / each for each in median_s(lambda: spots_density(kernel, edges, path), 15, plain))
+    ours, theirs = (1 / each for each in median_s(lambda: spots_density(kernel, edges, path), effort.of(15), plain))
     return Row("frames of 900 spots, 200 fast steps", f"{ours:.0f}/s", f"20/s; erf {theirs:.0f}/s", ours / 20, 1)
 
 
-def diffraction_synthesis() -> Row:
+def diffraction_synthesis(effort: Effort) -> Row:
     """Frames of 900 spots whose kernel is a lenslet's diffraction."""
     from aolink.optics.synthesis import Psi, spot_windows
 
     path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
     psi = Psi(shape="sinc2", zero_px=2.0)
     spot_windows(psi, 16, path)
-    ours = 1 / median_s(lambda: spot_windows(psi, 16, path), 5)[0]
+    ours = 1 / median_s(lambda: spot_windows(psi, 16, path), effort.of(5))[0]
     return Row("frames of 900 diffraction spots", f"{ours:.0f}/s", "20/s", ours / 20, 1)
 
 
-def picture_synthesis() -> Row:
+def picture_synthesis(effort: Effort) -> Row:
     """Frames of 900 spots whose kernel is a picture of 33 x 33 points, four of them a pixel."""
     from aolink.optics.synthesis import Psi, spot_windows
 
     path = 7.5 + np.cumsum(np.random.default_rng(0).normal(0, 0.05, (900, 2, 200)), axis=2)
     psi = Psi(shape="image", image=np.random.default_rng(1).random((33, 33)), finer=4)
-    ours = 1 / median_s(lambda: spot_windows(psi, 16, path), 5)[0]
+    ours = 1 / median_s(lambda: spot_windows(psi, 16, path), effort.of(5))[0]
     return Row("frames of 900 spots that are a picture", f"{ours:.0f}/s", "20/s", ours / 20, 1)
 
 
-def coupled_exposure() -> Row:
+def coupled_exposure(effort: Effort) -> Row:
     """An exposure of sh-30x30, one plant with 1800 slopes, with o1 and o3: measured, corrected, predicted."""
     from aolink.estimation import make_estimator
     from aolink.simulation.model import simulate
 
     rig = load_rig("sh-30x30")
-    exposures = iter(simulate(rig, 12))
+    runs = effort.of(11)
+    exposures = iter(simulate(rig, 1 + runs))
     estimators = [make_estimator(rig, name) for name in ("o1", "o3")]
 
     def step() -> None:
@@ -61,11 +62,11 @@ def coupled_exposure() -> Row:
             estimator.step(exposure)
 
     step()  # the exposure model is made once
-    ours = median_s(step, 11)[0]
+    ours = median_s(step, runs)[0]
     return Row("o1 and o3 of one plant with 1800 slopes", f"{ours * 1e3:.0f} ms", "5 Hz: 200 ms", 0.2 / ours, 1)
 
 
-def cost_against_lenslets() -> Row:
+def cost_against_lenslets(effort: Effort) -> Row:
     """Frames and o3 of 100 to 2500 spots: the cost of a spot among the fewest over that among the most."""
     from aolink.estimation import make_estimator
     from aolink.simulation.model import simulate
@@ -73,7 +74,8 @@ def cost_against_lenslets() -> Row:
     def cost(side: int) -> float:
         text = load_rig("sh-30x30").toml.replace("grid = [30, 30]", f"grid = [{side}, {side}]")
         rig = parse_rig(text)
-        series = iter(simulate(rig, 8))
+        runs = effort.of(7)
+        series = iter(simulate(rig, 1 + runs))
         estimator = make_estimator(rig, "o3")
 
         def step() -> None:
@@ -81,8 +83,8 @@ def cost_against_lenslets() -> Row:
             estimator.step(exposure)
 
         step()
-        simulated = median_s(lambda: simulate(rig, 1), 3)[0]
-        return (median_s(step, 7)[0] + simulated) / side**2
+        simulated = median_s(lambda: simulate(rig, 1), effort.of(3))[0]
+        return (median_s(step, runs)[0] + simulated) / side**2
 
     few, many = cost(10), cost(50)
     return Row(
@@ -94,7 +96,7 @@ def cost_against_lenslets() -> Row:
     )
 
 
-def turbulence() -> Row:
+def turbulence(effort: Effort) -> Row:
     """Slopes of 30 x 30 lenslets in frozen flow: faster than a mirror's fast steps go by."""
     from aolink.optics.lenslets import Lenslets
     from aolink.optics.turbulence import FrozenFlow, Layer
@@ -105,19 +107,19 @@ def turbulence() -> Row:
     both = np.concatenate([waves.real, -waves.imag], axis=1)
 
     def play() -> None:
-        blown = flow.blown(np.arange(64) * 1e-3)
+        blown = flow.blown(1e-3 * np.arange(64, dtype=np.float64))
         both @ np.concatenate([blown.real, blown.imag])
 
-    ours = 64 / median_s(play, 7)[0]
+    ours = 64 / median_s(play, effort.of(7))[0]
     return Row("turbulence, 1800 slopes", f"{ours / 1e3:.1f} k steps/s", "1 k steps/s", ours / 1e3, 1)
 
 
-def zonal_wavefront() -> Row:
+def zonal_wavefront(effort: Effort) -> Row:
     """The wavefront over 50 x 50 lenslets from their slopes, against the dense pseudo-inverse."""
     from aolink.optics.wavefront import ZonalReconstructor
 
     reconstruct = ZonalReconstructor(np.ones((50, 50), dtype=bool), 1.0)
     slopes = np.random.default_rng(0).standard_normal((50, 50, 2))
     dense = np.random.default_rng(1).standard_normal((2500, 5000))  # its values do not matter to the time
-    ours, theirs = median_s(lambda: reconstruct(slopes), 15, lambda: dense @ slopes.ravel())
+    ours, theirs = median_s(lambda: reconstruct(slopes), effort.of(15), lambda: dense @ slopes.ravel())
     return Row("wavefront of 50x50 lenslets", f"{ours * 1e3:.2f} ms", f"dense {theirs * 1e3:.2f} ms", theirs / ours, 1)

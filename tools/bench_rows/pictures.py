@@ -13,6 +13,7 @@ from skimage import color, data, transform
 from aolink.restoration import Psf, motion_psf
 from aolink.rig import load_rig
 from aolink.sensor import Kernel
+from bench_rows.row import Effort
 
 FloatArray = NDArray[np.float64]
 
@@ -83,11 +84,17 @@ def blurred(name: str, psf: Psf, size: int = 256, noise_sd: float = NOISE_SD) ->
     return Case(name=name, image=image, scene=scene[:, first : first + size], psf=psf)
 
 
-def cases(names: tuple[str, ...]) -> Iterator[Case]:
-    """Every picture with every PSF."""
-    for psf in psfs().values():
-        for name in names:
-            yield blurred(name, psf)
+def cases(names: tuple[str, ...], effort: Effort) -> Iterator[Case]:
+    """Every picture with every PSF; with less effort fewer and smaller ones."""
+    motions = list(psfs().values())
+    for psf in motions[: effort.of(len(motions))]:
+        for name in names[: effort.of(len(names))]:
+            yield blurred(name, psf, picture_size(effort))
+
+
+def picture_size(effort: Effort, whole: int = 256) -> int:
+    """Rows of a picture, enough for the widest motion."""
+    return effort.of(whole, 96)
 
 
 def psnr(found: FloatArray, scene: FloatArray) -> float:

@@ -23,7 +23,7 @@ from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as wire
-from bench_rows.row import Row, median_s, resident_mb
+from bench_rows.row import Effort, Row, median_s, resident_mb
 
 KILLS = 100
 _ROWS = 50_000
@@ -55,12 +55,12 @@ def _loop(seconds: float, write: Callable[[str, Message, int], object]) -> list[
     return spent
 
 
-def kill_at_any_moment() -> Row:
+def kill_at_any_moment(effort: Effort) -> Row:
     """SIGKILL at random moments of a session that records in real time: the age of the oldest message lost."""
     rng = np.random.default_rng(1)
     ages, unreadable = [], 0
     with tempfile.TemporaryDirectory() as folder:
-        for k in range(KILLS):
+        for k in range(effort.of(KILLS, 3)):
             path = Path(folder) / f"{k}.mcap"
             child = os.fork()
             if not child:
@@ -81,7 +81,13 @@ def kill_at_any_moment() -> Row:
                 unreadable += 1
     worst = max(ages) if not unreadable else float("inf")
     ours = f"{worst:.0f} ms lost at worst, median {statistics.median(ages):.0f}"
-    return Row(f"kill -9 at a random moment, {KILLS} times, all recovered", ours, "limit 200 ms", 200 / worst, 1.0)
+    return Row(
+        f"kill -9 at a random moment, {effort.of(KILLS, 3)} times, all recovered",
+        ours,
+        "limit 200 ms",
+        200 / worst,
+        1.0,
+    )
 
 
 def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
@@ -97,6 +103,7 @@ def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
     with path.open("rb") as opened:
         reader = make_reader(opened)
         summary = reader.get_summary()
+        assert summary is not None
         counts = [
             sum(1 for _ in reader.iter_messages(starting_at=each.message_start_time, ending_at=each.message_end_time))
             for each in summary.chunk_indexes
@@ -105,41 +112,47 @@ def _many_chunks(folder: Path) -> tuple[bytes, list[tuple[int, int, int]]]:
     return path.read_bytes(), [(*span, count) for span, count in zip(spans, counts, strict=True)]
 
 
-def truncation() -> Row:
+def truncation(effort: Effort) -> Row:
     """Cut off at 500 sampled bytes of the last megabyte: messages that come back of those in whole chunks."""
     with tempfile.TemporaryDirectory() as name:
         data, chunks = _many_chunks(Path(name))
         due = found = 0
-        for size in np.random.default_rng(3).integers(len(data) - (1 << 20), len(data), 500):
+        for size in np.random.default_rng(3).integers(len(data) - (1 << 20), len(data), effort.of(500)):
             (path := Path(name) / "cut.mcap").write_bytes(data[:size])
             due += sum(count for _, end, count in chunks if end <= size)
             found += sum(Recording(path).counts.values())
     return Row(
-        "cut off at 500 bytes of the last MB", f"{found} messages back", f"{due} in whole chunks", found / due, 1.0
+        f"cut off at {effort.of(500)} bytes of the last MB",
+        f"{found} messages back",
+        f"{due} in whole chunks",
+        found / due,
+        1.0,
     )
 
 
-def flipped_bits() -> Row:
+def flipped_bits(effort: Effort) -> Row:
     """20 random bits flipped, 200 times: messages that come back of those in chunks that were not hit."""
     rng = np.random.default_rng(4)
     with tempfile.TemporaryDirectory() as name:
         data, chunks = _many_chunks(Path(name))
         due = found = 0
-        for _ in range(200):
+        for _ in range(effort.of(200)):
             damaged, hits = bytearray(data), rng.integers(16, len(data), 20)
             for byte in hits:
                 damaged[byte] ^= 1 << int(rng.integers(8))
             (path := Path(name) / "flipped.mcap").write_bytes(damaged)
             due += sum(count for start, end, count in chunks if not ((start <= hits) & (hits < end)).any())
             found += sum(Recording(path, check=True).counts.values())
-    return Row("20 bits flipped, 200 times", f"{found} messages back", f"{due} in whole chunks", found / due, 1.0)
+    return Row(
+        f"20 bits flipped, {effort.of(200)} times", f"{found} messages back", f"{due} in whole chunks", found / due, 1.0
+    )
 
 
-def loop_stall() -> Row:
+def loop_stall(effort: Effort) -> Row:
     """The longest time that a 1 kHz loop waits for the recorder, in 20 s; and what the machine takes from it anyway."""
     with tempfile.TemporaryDirectory() as folder:
-        spent = np.array(_session(Path(folder) / "a.mcap", _LOOP_S)) * 1e3
-    alone = np.array(_loop(_LOOP_S, lambda topic, message, now: message.SerializeToString())) * 1e3
+        spent = np.array(_session(Path(folder) / "a.mcap", effort.share * _LOOP_S)) * 1e3
+    alone = np.array(_loop(effort.share * _LOOP_S, lambda topic, message, now: message.SerializeToString())) * 1e3
     (p999, worst), (alone_999, alone_worst) = (np.percentile(each, [99.9, 100]) for each in (spent, alone))
     return Row(
         "loop's wait for the recorder, 1 kHz", f"worst {worst:.2f} ms, 99.9 % {p999:.2f}",
@@ -147,7 +160,7 @@ def loop_stall() -> Row:
     )  # fmt: skip
 
 
-def recording_rate() -> Row:
+def recording_rate(effort: Effort) -> Row:
     """Messages a second into a file: small ones at 1 kHz's ratio to frames."""
     from mcap.writer import CompressionType
     from mcap_protobuf.writer import Writer
@@ -157,7 +170,7 @@ def recording_rate() -> Row:
     from aolink.wire import messages_pb2 as pb
 
     rig = load_rig("section-vi")
-    messages = [pb.Applied(block_id=k, first_step=k, n_steps=1, u=[0.1]) for k in range(60_000)]
+    messages = [pb.Applied(block_id=k, first_step=k, n_steps=1, u=[0.1]) for k in range(effort.of(60_000))]
 
     def ours() -> None:
         with tempfile.TemporaryDirectory() as folder, RecordingWriter(Path(folder) / "a", rig, {}, 0) as writer:
@@ -171,7 +184,7 @@ def recording_rate() -> Row:
                 writer.write_message(topics.APPLIED, message, k * 1_000_000, k * 1_000_000, k)
             writer.finish()
 
-    mine, theirs = (len(messages) / each / 1e3 for each in median_s(ours, 5, plain))
+    mine, theirs = (len(messages) / each / 1e3 for each in median_s(ours, effort.of(5), plain))
     return Row("recording small messages", f"{mine:.0f} k/s", f"mcap's writer {theirs:.0f} k/s", mine / theirs, 0.8)
 
 
@@ -199,13 +212,14 @@ def record_long(path: Path, exposures: int) -> None:
                 writer.write(topic, message, now)
 
 
-def reestimation_rate() -> Row:
+def reestimation_rate(effort: Effort) -> Row:
     """o3 over a recording, against reading the same file and decoding its frames, no more."""
     from aolink.recording import convert
     from aolink.recording.reestimate import reestimate
 
     with tempfile.TemporaryDirectory() as folder:
-        record_long(Path(folder) / "a.mcap", 1500)
+        count = effort.of(1500)
+        record_long(Path(folder) / "a.mcap", count)
         recording = Recording(Path(folder) / "a.mcap")
 
         def read() -> None:
@@ -216,30 +230,30 @@ def reestimation_rate() -> Row:
                 elif raw.topic == topics.IMAGE:
                     convert.frame_from_messages(info, cast(Any, recording.decoded(raw)))
 
-        estimating, reading = median_s(lambda: reestimate(recording, ["o3"]), 15, read)
-        skipping = median_s(lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)), 5)[0]
+        estimating, reading = median_s(lambda: reestimate(recording, ["o3"]), effort.of(15), read)
+        skipping = median_s(lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)), effort.of(5))[0]
     return Row(
         "re-estimation with o3",
-        f"{1500 / estimating:.0f} frames/s",
-        f"reading {1500 / reading:.0f}; past the mirror's reports {1500 / skipping:.0f}",
+        f"{count / estimating:.0f} frames/s",
+        f"reading {count / reading:.0f}; past the mirror's reports {count / skipping:.0f}",
         reading / estimating,
         0.5,
     )
 
 
-def memory_of_an_hour() -> Row:
+def memory_of_an_hour(effort: Effort) -> Row:
     """Growth while an hour at 5 Hz is estimated with o3, against the file's size."""
     from aolink.estimation import Driver
     from aolink.recording.reader import Recording
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
-        record_long(path, 18_000)
+        record_long(path, effort.of(18_000))
         size, recording = path.stat().st_size / 1e6, Recording(path)
         driver, marks = Driver(recording.rig, ["o3"]), []
         for number, exposure in enumerate(recording.exposures()):
             driver.step(exposure)
-            if number % 4000 == 1000:
+            if number % effort.of(4000) == effort.of(1000):
                 marks.append(resident_mb())
     growth = max(marks) - marks[0]
     return Row(
@@ -247,7 +261,7 @@ def memory_of_an_hour() -> Row:
     )
 
 
-def batch_workers() -> Row:
+def batch_workers(effort: Effort) -> Row:
     """Eight recordings estimated again with moments on two processes, against one."""
     from aolink import batch
 
@@ -255,7 +269,7 @@ def batch_workers() -> Row:
         folder = Path(name)
         sources = [folder / f"{k}.mcap" for k in range(8)]
         for source in sources:
-            record_long(source, 600)
+            record_long(source, effort.of(600))
 
         def work(jobs: int) -> float:
             target = folder / f"on-{jobs}-{time.monotonic_ns()}"
@@ -265,11 +279,11 @@ def batch_workers() -> Row:
             assert not any(each.error for each in batch.run(todo, jobs))
             return time.perf_counter() - start
 
-        one, two = (statistics.median(work(jobs) for _ in range(3)) for jobs in (1, 2))
+        one, two = (statistics.median(work(jobs) for _ in range(effort.of(3))) for jobs in (1, 2))
     return Row("8 recordings estimated again on 2 processes", f"{two:.1f} s", f"on one {one:.1f} s", one / two, 1.8)
 
 
-def rrd_of_ten_minutes() -> Row:
+def rrd_of_ten_minutes(effort: Effort) -> Row:
     """The .rrd of 3000 exposures with o3, against one call of rr.log for each row in it, of some of them."""
     import rerun as rr
     from rerun.chunk import RrdReader
@@ -281,18 +295,18 @@ def rrd_of_ten_minutes() -> Row:
         stream = rr.RecordingStream("bench")
         stream.save(path)
         start = time.perf_counter()
-        for row in range(_ROWS):
+        for row in range(effort.of(_ROWS)):
             stream.set_time("time", duration=row * 1e-3)
             stream.log("line", rr.Scalars(1e-3 * row))
         stream.disconnect()
-        return (time.perf_counter() - start) / _ROWS
+        return (time.perf_counter() - start) / effort.of(_ROWS)
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        record_long(folder / "bare.mcap", 3000)
+        record_long(folder / "bare.mcap", effort.of(3000))
         write_reestimated(Recording(folder / "bare.mcap"), ["o3"], folder / "a.mcap")
         recording = Recording(folder / "a.mcap")
-        ours, _ = median_s(lambda: save_rrd(recording, folder / "a.rrd", overwrite=True), 3)
+        ours, _ = median_s(lambda: save_rrd(recording, folder / "a.rrd", overwrite=True), effort.of(3))
         row = logged_row_by_row(folder / "b.rrd")
         rows = sum(chunk.num_rows for chunk in RrdReader(folder / "a.rrd").stream())
     theirs = rows * row

@@ -12,6 +12,22 @@ from typing import Any
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How much a row measures."""
+
+    share: float
+
+    def of(self, whole: int, least: int = 1) -> int:
+        """So many runs, exposures or seconds of ``whole``, which is what the row's figure needs."""
+        return max(least, round(self.share * whole))
+
+
+FULL = Effort(1.0)
+SHORT = Effort(0.02)
+"""Every line of a row is run, but its figure means nothing."""
+
+
+@dataclass(frozen=True)
 class Row:
     """One figure: ours, the peer's, and what the ratio should be."""
 
@@ -25,7 +41,8 @@ class Row:
 
 def median_s(work: Callable[[], Any], runs: int, peer: Callable[[], Any] | None = None) -> tuple[float, float]:
     """Median times of two pieces of work that take turns, s."""
-    ours, theirs = [], []
+    ours: list[float] = []
+    theirs: list[float] = []
     for _ in range(runs):
         for each, times in ((work, ours), (peer, theirs)):
             if each is not None:

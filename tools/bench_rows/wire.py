@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bench_rows.row import Row
+from bench_rows.row import Effort, Row
 
 _MINUTE_EXPOSURES = 300
 _LENSLET_FRAMES = 500
 
 
-def link_throughput() -> Row:
+def link_throughput(effort: Effort) -> Row:
     """Frames over a pseudo terminal, from bytes to messages, against plain reads of the same bytes."""
     from aolink.wire import messages_pb2 as pb
     from aolink.wire.link import Link
@@ -30,7 +30,8 @@ def link_throughput() -> Row:
     from aolink.workers import end_with_parent
 
     data = np.random.default_rng(1).integers(0, 256, 4096, dtype=np.uint8).tobytes()
-    packets = [encode_message(pb.FrameChunk(frame_id=k, total=4096, data=data), k & 0xFFFF) for k in range(4000)]
+    count = effort.of(4000)
+    packets = [encode_message(pb.FrameChunk(frame_id=k, total=4096, data=data), k & 0xFFFF) for k in range(count)]
     stream = b"".join(packets)
 
     def over_a_pty(receive: Callable[[str, Callable[[], None]], None]) -> float:
@@ -67,14 +68,14 @@ def link_throughput() -> Row:
             left -= len(os.read(descriptor, 65536))
         os.close(descriptor)
 
-    pairs = [(over_a_pty(with_link), over_a_pty(plain)) for _ in range(5)]
+    pairs = [(over_a_pty(with_link), over_a_pty(plain)) for _ in range(effort.of(5))]
     ours, theirs = (len(stream) / statistics.median(times) / 1e6 for times in zip(*pairs, strict=True))
     return Row(
         "link throughput over a pseudo terminal", f"{ours:.0f} MB/s", f"os.read {theirs:.0f} MB/s", ours / theirs, 0.5
     )
 
 
-def commands_at_1_khz() -> Row:
+def commands_at_1_khz(effort: Effort) -> Row:
     """A minute in real time with a simulated rig as a process of its own: steps that came late or not at all."""
     from aolink.demo import simulated_rig
     from aolink.rig import load_rig
@@ -82,7 +83,7 @@ def commands_at_1_khz() -> Row:
 
     rig = load_rig("single-lenslet")
     with tempfile.TemporaryDirectory() as folder, simulated_rig(rig.name, "--real-time") as ports:
-        report = record(rig, *ports, Path(folder) / "a.mcap", estimators=["o3"], exposures=_MINUTE_EXPOSURES)
+        report = record(rig, *ports, Path(folder) / "a.mcap", estimators=["o3"], exposures=effort.of(_MINUTE_EXPOSURES))
     lost = report.steps_commanded - report.steps_applied
     return Row(
         f"commands at 1 kHz, {report.steps_commanded / 1000:.0f} s, in blocks of {rig.mirror.block_steps}",
@@ -93,7 +94,7 @@ def commands_at_1_khz() -> Row:
     )
 
 
-def frame_to_command() -> Row:
+def frame_to_command(effort: Effort) -> Row:
     """One lenslet: from the last byte of a frame on one pseudo terminal to the command that follows on another."""
     from aolink.assembly import Assembler, FrameReassembly
     from aolink.estimation import Driver
@@ -106,8 +107,9 @@ def frame_to_command() -> Row:
 
     rig = load_rig("single-lenslet")
     devices = SimulatedDevices(rig, virtual_time=True, step_zero_ns=0)
-    devices.handle("camera", pb.CameraControl(run=True, exposures=_LENSLET_FRAMES), 0)
-    devices.advance_to(200 * _LENSLET_FRAMES)
+    count = effort.of(_LENSLET_FRAMES)
+    devices.handle("camera", pb.CameraControl(run=True, exposures=count), 0)
+    devices.advance_to(200 * count)
     chunks = [each.message for each in devices.outbox if isinstance(each.message, pb.FrameChunk)]
     terminals = [pty.openpty() for _ in range(2)]
     for _, slave in terminals:
@@ -116,7 +118,8 @@ def frame_to_command() -> Row:
                       for name, (_, slave) in zip(("camera", "mirror"), terminals, strict=True))  # fmt: skip
     assembler, driver = Assembler(rig), Driver(rig, ["o3"])
     frames = FrameReassembly(rig.sensor.shape, rig.timing.fast_step_ns)
-    gain, block, times = np.array([0.02, 0.5]), rig.mirror.block_steps, []
+    gain, block = np.array([0.02, 0.5]), rig.mirror.block_steps
+    times: list[float] = []
     for number, chunk in enumerate(chunks):
         first = 200 * number
         assembler.add_applied(pb.Applied(first_step=first, n_steps=200, u=np.zeros(400)))
@@ -126,6 +129,7 @@ def frame_to_command() -> Row:
             wait_readable([camera.transport], 1.0)
             start = time.perf_counter()
             for received in camera.receive():
+                assert isinstance(received.message, pb.FrameChunk)
                 for frame in frames.add(received.message, received.receive_ns):
                     (exposure,) = assembler.add_frame(frame)
                     (estimate,) = driver.step(exposure)

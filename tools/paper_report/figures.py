@@ -133,7 +133,7 @@ def _draw_centroids(ax: Axes, rig: Rig, series: Sequence[Exposure]) -> None:
     points = [
         ((e.first_step + half) * rig.timing.fast_step_s, m.value[0, 0])
         for e in series
-        if not isinstance(m := measure_moments(rig.sensor, e.pixels, (1,)), str)
+        if not isinstance(m := measure_moments(rig.sensor.profile, e.pixels, (1,)), str)
     ]
     ax.plot(*np.array(points).T, ".", color="0.65", markersize=4, label="$y_1$ as measured", zorder=1)
 
@@ -224,9 +224,10 @@ def figure_7(path: Path, chosen: Sequence[Scene], dpi: int, exposure: int = 32) 
 
 def _draw_frame(ax: Axes, rig: Rig, exposure: Exposure) -> None:
     """The frame as the camera read it, and the truth's own histogram as a range."""
-    density = to_density(rig.sensor, exposure.pixels)[0]
-    ax.stairs(density, rig.sensor.edges, color="0.35", fill=True, alpha=0.35, linewidth=0)
-    ax.stairs(density, rig.sensor.edges, color="0.35", linewidth=0.8)
+    sensor = rig.sensor.profile
+    density = to_density(sensor, exposure.pixels)[0]
+    ax.stairs(density, sensor.edges, color="0.35", fill=True, alpha=0.35, linewidth=0)
+    ax.stairs(density, sensor.edges, color="0.35", linewidth=0.8)
     path = _truth([exposure])
     ax.axvspan(path.min(), path.max(), color="black", alpha=0.12, linewidth=0)
     ax.axhline(0, color="0.5", linewidth=0.8)

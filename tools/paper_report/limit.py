@@ -7,7 +7,6 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from scipy import special
 
 from aolink.estimation import Estimate, make_estimator
 from aolink.exposure import Exposure
-from aolink.rig import Rig, load_rig
+from aolink.rig import Rig, SpotSensor, load_rig
 from aolink.simulation.model import simulate
 from paper_report.blocks import Block, Heading, Picture, Table, Text
 from paper_report.ensemble import Measured, measure_errors, ratio, side_by_side, variant, with_pixel_noise
@@ -75,6 +74,7 @@ def scenes(runs: int, count: int) -> Iterator[tuple[str, Rig, list[Exposure]]]:
     for name, u in (("commanded step", step), ("commanded chirp, 0.5 to 4 Hz", chirp)):
         yield f"{name}, V = 0.01", *_side_by_side(lively, runs, count, u, 720)
     plane = load_rig("single-lenslet")
+    assert isinstance(plane.sensor, SpotSensor)
     u = plane.drive.inputs(0, count * plane.timing.exposure_steps, plane.timing.fast_step_s)
     many = dataclasses.replace(
         plane,
@@ -94,9 +94,10 @@ def _side_by_side(rig: Rig, runs: int, count: int, u: FloatArray, seed: int) -> 
 def limit_table(effort: Effort) -> list[Scene]:
     """All estimators in all scenes, on the same frames."""
     table = []
-    every = islice(scenes(effort.limit_runs, effort.limit_exposures), 0, None, effort.limit_every)
-    for name, rig, exposures in every:
-        estimates, seconds, single = {}, {}, []
+    for name, rig, exposures in scenes(effort.limit_runs, effort.limit_exposures):
+        estimates: dict[str, list[Estimate]] = {}
+        seconds: dict[str, float] = {}
+        single: list[NDArray[np.bool_]] = []
         for each in (*NAMES, "again"):
             options = {"particles": effort.particles, "seed": int(each == "again")}
             estimator = make_estimator(rig, "sampled" if each == "again" else each, **options)
@@ -121,7 +122,7 @@ def limit_table(effort: Effort) -> list[Scene]:
 def against_o1(effort: Effort) -> list[tuple[str, dict[str, Measured]]]:
     """Ratio of the path's RMSE to o1's in each scene, in more runs than the sampler has time for."""
     table = []
-    for name, rig, exposures in islice(scenes(effort.o1_runs, effort.o1_exposures), 0, None, effort.limit_every):
+    for name, rig, exposures in scenes(effort.o1_runs, effort.o1_exposures):
         found = measure_errors(rig, exposures, ["o1", *BETTER_THAN_O1], effort.limit_skip)
         table.append((name, {each: ratio(found[each].path, found["o1"].path) for each in BETTER_THAN_O1}))
     return table

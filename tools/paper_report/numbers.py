@@ -41,13 +41,12 @@ class Effort:
     limit_runs: int = 6
     limit_exposures: int = 14
     limit_skip: int = 4
-    limit_every: int = 1
-    """Of the scenes of the table of the limit, every so many."""
     o1_runs: int = 60
     """Of each scene without the sampler."""
     o1_exposures: int = 24
     film_frames: tuple[int, ...] = (8, 12, 24)
-    film_estimators: tuple[str, ...] = ESTIMATOR_NAMES
+    film_exposures: int | None = None
+    """Of each length, so many; all that the film has if None."""
     particles: int = 1500
     """Of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -60,8 +59,7 @@ class Effort:
 FULL = Effort()
 QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
-    limit_runs=2, limit_exposures=4, limit_skip=1, limit_every=5, o1_runs=6, o1_exposures=6, particles=150,
-    film_frames=(24,), film_estimators=("o1", "moments", "profile", "mixture"),
+    limit_runs=2, limit_exposures=4, limit_skip=1, o1_runs=4, o1_exposures=4, particles=60, film_exposures=3,
     offsets=(0.0, 0.5), densities=(0.1, 0.01), process_noises=(0.1, 10.0), frequencies=100, dpi=70,
 )  # fmt: skip
 
@@ -95,7 +93,7 @@ class MomentNoise:
 
 def moment_noise(rig: Rig, frames: int, position: float = 0.2) -> MomentNoise:
     """Monte Carlo through the whole camera: pixels, integer counts, moments with the kernel taken out."""
-    sensor, rng = rig.sensor, np.random.default_rng(7)
+    sensor, rng = rig.sensor.profile, np.random.default_rng(7)
     density = exposure_density(sensor.kernel, sensor.edges, np.full(1, position))
     noise = pixel_noise_sd(sensor) * rng.standard_normal((frames, sensor.pixels))
     measured = measure_moments(sensor, to_counts(sensor, density + noise), (1, 2))

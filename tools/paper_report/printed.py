@@ -65,7 +65,7 @@ def end_states(rig: Rig, exposures: Sequence[Exposure], form: Form) -> FloatArra
     ends = []
     for j, exposure in enumerate(exposures):
         c, d = _input_response(model, exposures, j, form)
-        measured = measure_moments(rig.sensor, exposure.pixels, (1, 2))
+        measured = measure_moments(rig.sensor.profile, exposure.pixels, (1, 2))
         assert not isinstance(measured, str)
         if form.no_delay:
             x, P = _predict(x, P, model.transition, Q, d)

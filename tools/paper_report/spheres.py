@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from aolink.estimation import make_estimator
+from aolink.estimation import ESTIMATOR_NAMES, make_estimator
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_counts
 from aolink.optics.kernel import pixel_mass
@@ -55,7 +55,7 @@ def kernel_and_noise(dark: FloatArray, xy: FloatArray) -> tuple[FloatArray, floa
     track = (xy[:, ::6] + 0.5 - HALF) / HALF
 
     def left(sigma: float) -> FloatArray:
-        return density - pixel_mass(Kernel(shape="gaussian", sigma=float(sigma)), edges, track) * HALF
+        return np.asarray(density - pixel_mass(Kernel(shape="gaussian", sigma=float(sigma)), edges, track) * HALF)
 
     sigma = float(optimize.minimize_scalar(lambda s: (left(s) ** 2).mean(), bounds=(0.02, 0.5), method="bounded").x)
     seen = np.abs(density) > 0
@@ -75,7 +75,11 @@ def spheres(K: int) -> tuple[Rig, list[Exposure], FloatArray]:
         initial_mean=np.zeros(1), initial_covariance=np.eye(1) * 0.1, axes=axes,
     )  # fmt: skip
     line = dataclasses.replace(
-        rig.sensor, pixels=48, noise_density=V, counts_per_density=COUNTS, kernel=Kernel(shape="gaussian", sigma=sigma)
+        rig.sensor.profile,
+        pixels=48,
+        noise_density=V,
+        counts_per_density=COUNTS,
+        kernel=Kernel(shape="gaussian", sigma=sigma),
     )
     sensor = SensorRows(**{f.name: getattr(line, f.name) for f in dataclasses.fields(Sensor)}, rows=axes)
     timing = dataclasses.replace(rig.timing, exposure_steps=K, frame_period_steps=K)
@@ -117,11 +121,11 @@ def film(effort: Effort) -> list[Film]:
     for frames in effort.film_frames:
         rig, exposures, paths = spheres(frames)
         squares = {}
-        for name in effort.film_estimators:
+        for name in ESTIMATOR_NAMES:
             options = {"particles": effort.particles} if name == "sampled" else {}
             estimator = make_estimator(rig, name, **options)
-            estimates = [estimator.step(exposure) for exposure in exposures]
-            error = np.array([e.path - path for e, path in zip(estimates, paths, strict=True)])[1:]
+            estimates = [estimator.step(exposure) for exposure in exposures[: effort.film_exposures]]
+            error = np.array([e.path - path for e, path in zip(estimates, paths, strict=False)])[1:]
             squares[name] = HALF**2 * (error**2).mean(axis=2).T  # (axes, exposures)
         over = {name: ratio(each, squares["o1"]) for name, each in squares.items()}
         found.append(Film(frames, {name: rms(each) for name, each in squares.items()}, over))

@@ -1,0 +1,219 @@
+"""What the pages document works: every code block of every page is run, and every command in their text is a real one.
+
+A block is indented by four spaces or more, or fenced. Its commands are run one after the other, as they stand, in a
+folder that holds the files they speak of; `SHORTER` says what is changed about them, and why. A new block is run from
+the day it is written; one of a kind that nothing here knows how to run fails.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from PIL import Image
+
+from aolink.cli.common import app
+from aolink.demo import simulated_rig
+from aolink.recording.reader import Recording
+from aolink.rig import load_rig
+from aolink.session import record
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(
+    {
+        *ROOT.glob("*.md"),
+        *(each for top in ("aolink", "recordings", "tests", "tools") for each in (ROOT / top).rglob("*.md")),
+    }
+)
+PAGES.remove(ROOT / "CHANGELOG.md")  # it tells of commands as they were
+
+SHORTER = {
+    "--duration 60": "--duration 2",
+    "--start 10 --end 20": "--start 0.5 --end 1.5",
+    "aolink view session.mcap": "aolink view session.mcap --save view.rrd",  # a test has no screen
+    "[--view]": "",  # nor has it here
+}
+"""What is changed about a command before it is run: times, and what needs a screen."""
+EXIT_CODES = {"aolink recover broken.mcap": 1}
+"""Of commands that do not end with 0, as the page says beside them."""
+BY_CI = ("sh tools/demo", "sh tools/test")
+"""They set everything up, so that CI runs them and no test can."""
+LIGHTS = ("--light", "dark,flat:4,flat:8,still")
+"""What the simulated camera sees one after the other while `aolink calibrate` asks for it."""
+
+
+@dataclass(frozen=True)
+class CodeBlock:
+    """A code block of a page."""
+
+    page: Path
+    line: int
+    language: str
+    """Empty where it is indented and not fenced."""
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+
+def code_blocks(page: Path) -> Iterator[CodeBlock]:
+    """Fenced and indented blocks, in order. What is indented after a line of text goes on with its paragraph."""
+    fence, begun, kept, before = "", 0, list[str](), ""
+    for number, line in enumerate([*page.read_text().splitlines(), "."], 1):
+        if fence:
+            if line.startswith("```"):
+                yield CodeBlock(page, begun, fence[3:].strip() or "none", "\n".join(kept))
+                fence, kept = "", []
+            else:
+                kept.append(line)
+        elif line.startswith("```"):
+            fence, begun = line, number + 1
+        elif line.startswith("    ") and (kept or not before.strip()):
+            begun = begun if kept else number
+            kept.append(line.strip())
+        elif kept and line.strip():
+            yield CodeBlock(page, begun, "", "\n".join(kept))
+            kept = []
+        before = line
+
+
+BLOCKS = [block for page in PAGES for block in code_blocks(page)]
+NO_CODE = {
+    "estimator   RMSE start": "test_demo_figures.py runs the demo and compares",
+    "plain   ": "test_the_architecture_names_what_there_is",
+    "Copyright (c)": "a licence",
+}
+"""How indented blocks begin that are no commands, and what holds them."""
+SHELL = [block for block in BLOCKS if not block.language and not block.text.startswith(tuple(NO_CODE))]
+PYTHON = [block for block in BLOCKS if block.language == "python"]
+
+
+def commands(block: CodeBlock) -> Iterator[str]:
+    """Each command without its comment; where parts of it are in brackets, without them and with all of them."""
+    for line in block.text.splitlines():
+        command = re.sub(r"\s+#.*", "", line)
+        for whole, shorter in SHORTER.items():
+            command = command.replace(whole, shorter)
+        bare, full = re.sub(r"\[.*?\]", "", command), re.sub(r"[\[\]]", "", command)
+        yield from dict.fromkeys(" ".join(each.split()) for each in (bare, full))
+
+
+@pytest.fixture(scope="module")
+def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all the files that the pages' commands speak of."""
+    folder = tmp_path_factory.mktemp("laboratory")
+    rigs = Path(load_rig("section-vi").folder)
+    shutil.copytree(rigs, folder / "aolink" / "rigs")
+    shutil.copy(rigs / "section-vi.toml", folder / "my.toml")  # as README begins with
+    rig = load_rig(folder / "my.toml")
+    with simulated_rig(folder / "my.toml") as ports:
+        record(rig, *ports, folder / "session.mcap", estimators=["o3"], exposures=12)
+        shutil.copy(folder / "session.mcap", folder / "again.mcap")
+    for part in ("001", "002"):
+        with simulated_rig(folder / "my.toml") as ports:
+            record(rig, *ports, folder / f"session-{part}.mcap", exposures=4)
+    whole = (folder / "session.mcap").read_bytes()
+    (folder / "broken.mcap").write_bytes(whole[: len(whole) // 2])
+    mmirs = ROOT / "tests" / "data" / "mmirs"
+    for name, source in (("frame.fits", "mmirs_wfs_0150.fits.gz"), ("flat.fits", "mmirs_camera2_ref.fits.gz")):
+        (folder / name).write_bytes(gzip.decompress((mmirs / source).read_bytes()))
+    scene = np.asarray(Image.open(rigs / "moving-scene.png").convert("L").resize((96, 96)))
+    Image.fromarray(scene).save(folder / "moved.png")
+    np.savetxt(folder / "psf.csv", np.full((1, 9), 1 / 9), delimiter=",")
+    return folder
+
+
+def run(command: str, folder: Path, answers: str = "") -> subprocess.CompletedProcess[str]:
+    """Run a shell command in a folder, with this Python's own programs first on the path and without a screen."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment |= {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}",
+    }
+    return subprocess.run(
+        ["sh", "-c", command], cwd=folder, env=environment, input=answers, capture_output=True, text=True, timeout=600
+    )
+
+
+@pytest.mark.parametrize("block", SHELL, ids=str)
+def test_a_block_of_commands_works(block: CodeBlock, laboratory: Path, tmp_path: Path) -> None:
+    """Devices are simulated ones behind pseudo terminals; what a command writes is not there before it."""
+    folder = tmp_path / "here"
+    shutil.copytree(laboratory, folder)
+    for command in commands(block):
+        if command in BY_CI:
+            assert command in (ROOT / ".ci" / "run").read_text()
+            continue
+        assert command.startswith("aolink "), f"{block}: {command} is no command that this test knows how to run"
+        if target := re.search(r"(?:-o|--output) (\S+)", command):
+            (folder / target[1]).unlink(missing_ok=True)
+        with ExitStack() as stack:
+            if "/dev/ttyACM" in command:
+                options = LIGHTS if command.startswith("aolink calibrate") else ()
+                camera, mirror = stack.enter_context(simulated_rig(folder / "my.toml", *options))
+                command = command.replace("/dev/ttyACM0", camera).replace("/dev/ttyACM1", mirror)
+            done = run(command, folder, answers="\n" * 8)
+        expected = next((code for start, code in EXIT_CODES.items() if command.startswith(start)), 0)
+        assert done.returncode == expected, f"{block}: {command}\n{done.stdout}{done.stderr}"
+        assert "Traceback" not in done.stderr
+        if target:
+            assert (folder / target[1]).exists(), command
+
+
+@pytest.mark.parametrize("block", PYTHON, ids=str)
+def test_a_block_of_python_works(block: CodeBlock, laboratory: Path, tmp_path: Path) -> None:
+    """As a program of its own, in a folder that has a recording; a file that it writes is one that aolink takes."""
+    folder = tmp_path / "here"
+    shutil.copytree(laboratory, folder)
+    before = set(folder.iterdir())
+    (folder / "block.py").write_text(block.text)
+    done = run("python block.py", folder)
+    assert done.returncode == 0, f"{block}\n{done.stdout}{done.stderr}"
+    for made in {*folder.glob("*.mcap")} - before:
+        assert run(f"aolink info {made.name} --check", folder).returncode == 0
+        assert len(list(Recording(made))) > 0
+
+
+def test_every_block_is_of_a_kind_that_is_tried() -> None:
+    assert {block.language for block in BLOCKS} == {"", "python"}
+    assert SHELL
+    assert PYTHON
+    for start in NO_CODE:
+        assert any(block.text.startswith(start) for block in BLOCKS), f"no page has a block that begins with {start!r}"
+
+
+def test_the_architecture_names_what_there_is() -> None:
+    """README's list of the layers: each of its names is a module, and every module is in it."""
+    (block,) = [block for block in BLOCKS if block.text.startswith("plain   ")]
+    named = {name for line in block.text.splitlines() for name in re.split(r", ", re.split(r" {2,}", line)[0])}
+    there = {
+        path.stem for path in (ROOT / "aolink").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert named <= there
+    assert there - named == {"__init__", "__main__", "errors", "simulation", "terminal", "toml_table"}
+
+
+def test_commands_in_the_text_have_the_options_that_they_are_given() -> None:
+    """Commands inside sentences are not run, but neither may they name what there is not."""
+    known = typer.main.get_command(app).commands  # type: ignore[attr-defined] # it is a group
+    seen = 0
+    for page in PAGES:
+        for text in re.findall(r"`(aolink [a-z][^`]*)`", page.read_text()):
+            _, name, *arguments = text.split()
+            assert name in known, f"{page.name}: there is no command {name}"
+            options = {option for parameter in known[name].params for option in parameter.opts} | {"--help"}
+            for argument in arguments:
+                assert argument in options or argument[0] != "-", f"{page.name}: aolink {name} has no {argument}"
+            seen += 1
+    assert seen > 10

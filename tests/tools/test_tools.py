@@ -1,0 +1,115 @@
+"""Every program in tools/ does its work, short and beside the repository, whose files stay as they are."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.recording.reader import Recording
+
+Image = pytest.importorskip("PIL.Image")
+
+TOOLS = Path(__file__).parents[2] / "tools"
+ROOT = TOOLS.parent
+
+
+def run(*command: str | Path, environment: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+    arguments = [sys.executable, *map(str, command)]
+    return subprocess.run(arguments, capture_output=True, text=True, timeout=600, cwd=ROOT, env=environment)
+
+
+def test_every_program_is_run_somewhere() -> None:
+    """Whoever adds one decides here, or in .ci/run, where it is tried."""
+    programs = {each.name for each in TOOLS.iterdir() if each.is_file() and each.read_bytes()[:2] == b"#!"}
+    by_ci, here, by_paper_s_own_test = {"demo", "test", "bench"}, {"protocol", "recordings", "scene"}, {"paper"}
+    assert programs == by_ci | here | by_paper_s_own_test
+    ci = (ROOT / ".ci" / "run").read_text()
+    for name in by_ci:
+        assert f"tools/{name}" in ci
+
+
+def test_what_protocol_generates_is_what_is_there(tmp_path: Path) -> None:
+    pytest.importorskip("grpc_tools", reason="tools/protocol generates with it: install aolink[dev]")
+    done = run(TOOLS / "protocol", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    made = sorted(each.relative_to(tmp_path) for each in tmp_path.rglob("*") if each.is_file())
+    assert len(made) == 7
+    for each in made:
+        assert (tmp_path / each).read_bytes() == (ROOT / each).read_bytes(), f"run tools/protocol: {each} is old"
+
+
+def test_the_scene_is_the_one_that_is_drawn(tmp_path: Path) -> None:
+    done = run(TOOLS / "scene", tmp_path / "scene.png")
+    assert done.returncode == 0, done.stderr
+    made, there = (
+        np.asarray(Image.open(each)).astype(int)
+        for each in (tmp_path / "scene.png", ROOT / "aolink" / "rigs" / "moving-scene.png")
+    )
+    assert made.shape == there.shape
+    # Another release of Pillow may draw a stroke's edge a little otherwise.
+    assert np.abs(made - there).mean() < 0.5
+
+
+def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
+    done = run(TOOLS / "recordings", "--out", tmp_path, "--exposures", "2")
+    assert done.returncode == 0, done.stderr
+    assert {each.name for each in tmp_path.iterdir()} == {each.name for each in (ROOT / "recordings").glob("*.mcap")}
+    for each in tmp_path.iterdir():
+        recording, there = Recording(each), Recording(ROOT / "recordings" / each.name)
+        assert recording.complete
+        assert recording.counts["/camera/image"] == 2
+        assert recording.estimators == there.estimators
+
+
+# The benchmark
+
+
+def test_a_row_that_fails_says_so_and_the_others_go_on() -> None:
+    """Rows of restoration need scikit-image: without it they fail, and the row before and the one after do not."""
+    code = (
+        "import runpy, sys; sys.modules['skimage'] = None;"
+        " sys.argv = ['bench', '--short', 'turbulence', 'restoration_time', 'recording_rate'];"
+        f" runpy.run_path({str(TOOLS / 'bench')!r}, run_name='__main__')"
+    )
+    done = run("-c", code)
+    assert done.returncode == 2, done.stderr
+    lines = done.stdout.splitlines()
+    (failed,) = [line for line in lines if "restoration.restoration_time" in line]
+    assert "failed: ModuleNotFoundError" in failed
+    assert any("turbulence, 1800 slopes" in line for line in lines)
+    assert any("recording small messages" in line for line in lines)
+    assert "Traceback" in done.stderr
+
+
+def test_rows_that_work_end_well() -> None:
+    done = run(TOOLS / "bench", "--short", "turbulence", "recording_rate")
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_word_that_no_row_has_is_an_error() -> None:
+    done = run(TOOLS / "bench", "--short", "turbulense")
+    assert done.returncode == 2
+    assert "no figure has 'turbulense' in its name" in done.stderr
+
+
+@pytest.mark.parametrize("room", ["estimation", "optics", "wire", "recording", "restoration", "moving_scene"])
+def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOOLS))
+    if room == "restoration":
+        pytest.importorskip("skimage", reason="its rows need it: install aolink[bench]")
+    rooms = importlib.import_module("bench_rows.rooms").ROWS
+    module = importlib.import_module(f"bench_rows.{room}")
+    measuring = ("Row", "list[Row]")
+    written = {
+        name
+        for name, function in inspect.getmembers(module, inspect.isfunction)
+        if function.__module__ == module.__name__ and function.__annotations__.get("return") in measuring
+    }
+    written = {name for name in written if not name.startswith("_")}
+    assert written == set(rooms[room])

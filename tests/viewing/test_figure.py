@@ -1,0 +1,119 @@
+"""The picture of a session where the viewer cannot draw: what is in it, and when the demo makes it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from aolink.errors import ViewerError
+from aolink.rig import load_rig
+from aolink.viewing import draw_session
+from aolink.viewing.palette import estimator_colour
+from tests.viewing.stand_in import StandIn
+from tests.viewing.test_spots import Simulated
+
+pytest.importorskip("matplotlib", reason="the picture is drawn with it: install aolink[plot]")
+
+
+def pixels(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB")).astype(int)
+
+
+def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
+    """Where a colour is, (rows, columns)."""
+    return np.abs(picture - colour).max(axis=2) < 12
+
+
+def parts(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The session, the inside of exposures, and the errors: from the top a share of 0.28, 0.49 and the rest."""
+    rows = len(picture)
+    return picture[: int(0.28 * rows)], picture[int(0.28 * rows) : int(0.77 * rows)], picture[int(0.77 * rows) :]
+
+
+def test_every_part_shows_its_estimators(tmp_path: Path) -> None:
+    """The session has the best estimator's path, the exposures also that of o1, the errors have all."""
+    session, inside, errors = parts(pixels(draw_session(StandIn(n=60), tmp_path / "a.png")))  # type: ignore[arg-type] # it has what is asked of a recording
+    for part, names in ((session, ["o3"]), (inside, ["o1", "o3"]), (errors, ["open-loop", "o1", "o3"])):
+        for name in names:
+            assert coloured(part, estimator_colour(name)).sum() > 200, name
+    assert coloured(session, estimator_colour("o1")).sum() == 0
+    truth = coloured(inside, (0, 0, 0)).any(axis=0).mean()
+    assert truth > 0.7  # in three plots side by side
+
+
+def test_the_camera_s_picture_lies_under_the_path(tmp_path: Path) -> None:
+    """Of the session's picture, the pixels about the path are darker than the others."""
+    session, _, _ = parts(pixels(draw_session(StandIn(n=60), tmp_path / "a.png")))  # type: ignore[arg-type]
+    grey = (np.ptp(session, axis=2) < 6) & (session.mean(axis=2) > 40) & (session.mean(axis=2) < 200)
+    path = coloured(session, estimator_colour("o3"))
+    for column in np.flatnonzero(path.any(axis=0))[100:-100:50]:
+        where = np.flatnonzero(path[:, column]).mean()
+        near = grey[:, column - 3 : column + 4].any(axis=1)
+        assert np.abs(np.flatnonzero(near) - where).min() < 15
+
+
+def test_lost_frames_and_no_truth(tmp_path: Path) -> None:
+    bare = StandIn(n=60, lost=(20, 21, 22, 40), with_truth=False)
+    _, inside, errors = parts(pixels(draw_session(bare, tmp_path / "a.png")))  # type: ignore[arg-type]
+    assert coloured(inside, estimator_colour("o3")).sum() > 200
+    assert coloured(errors, estimator_colour("o3")).sum() == 0
+
+
+def test_spots_on_a_plane(tmp_path: Path) -> None:
+    simulated = Simulated(load_rig("sh-4x4"))
+    _, inside, _ = parts(pixels(draw_session(simulated, tmp_path / "a.png")))  # type: ignore[arg-type]
+    assert coloured(inside, estimator_colour("o1")).sum() > 200
+
+
+def test_a_recording_without_exposures_is_one_clear_error(tmp_path: Path) -> None:
+    empty = StandIn(n=5, lost=(0, 1, 2, 3, 4))
+    with pytest.raises(ViewerError, match="has no exposure"):
+        draw_session(empty, tmp_path / "a.png")  # type: ignore[arg-type]
+
+
+def test_where_it_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(ViewerError, match=r"cannot write .*a\.png: no such file"):
+        draw_session(StandIn(), tmp_path / "absent" / "a.png")  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("without_vulkan")
+def test_the_demo_draws_it_and_names_the_package(
+    aolink: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    result = aolink("demo", "--rig", "single-lenslet", "--exposures", "4", "--out", tmp_path)
+    assert result.returncode == 0, result.stderr
+    (folder,) = tmp_path.glob("demo-*")
+    (line,) = [each for each in result.stdout.splitlines() if each.startswith("picture")]
+    assert line == (
+        f"picture   {folder / 'session.png'}, drawn with matplotlib: this machine has no Vulkan driver, which the"
+        " Rerun viewer needs to draw; on Debian: apt-get install mesa-vulkan-drivers"
+    )
+    assert coloured(pixels(folder / "session.png"), estimator_colour("moments")).sum() > 200
+
+
+@pytest.mark.usefixtures("without_vulkan")
+def test_without_matplotlib_the_demo_says_what_to_install(tmp_path: Path) -> None:
+    code = "import sys; sys.modules['matplotlib'] = None; from aolink.cli import main; main()"
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "demo",
+        "--rig",
+        "single-lenslet",
+        "--exposures",
+        "4",
+        "--out",
+        str(tmp_path),
+    ]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert result.returncode == 0, result.stderr
+    (line,) = [each for each in result.stdout.splitlines() if each.startswith("picture")]
+    assert line.startswith("picture   none: this machine has no Vulkan driver")
+    assert line.endswith("a picture without the viewer needs matplotlib: pip install 'aolink[plot]'")

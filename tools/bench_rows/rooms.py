@@ -1,0 +1,20 @@
+"""Which rows there are."""
+
+ROWS = {
+    "estimation": (
+        "o3_step", "frame_moments_and_o3", "frame_from_last_byte", "profile_of_many_axes",
+        "mixture_of_many_axes", "membrane_in_real_time",
+    ),
+    "optics": (
+        "frame_synthesis", "diffraction_synthesis", "picture_synthesis", "coupled_exposure", "cost_against_lenslets",
+        "turbulence", "zonal_wavefront",
+    ),
+    "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz"),
+    "recording": (
+        "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
+        "flipped_bits", "batch_workers", "rrd_of_ten_minutes",
+    ),
+    "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
+    "moving_scene": ("moving_scene",),
+}  # fmt: skip
+"""Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
