@@ -25,6 +25,7 @@ from aolink.estimation import Engine, Scorer
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import recorded_estimates, write_reestimated
 from aolink.rig import parse_rig
+from aolink.toml_table import did_you_mean
 from aolink.workers import processes
 
 COLUMNS = (
@@ -378,9 +379,11 @@ def _with_value(text: str, key: str, value: Any) -> str:
         raise RigError(f"not valid TOML: {error}") from None
     table: Any = document
     *path, name = key.split(".")
-    for part in path:
-        table = table.get(part) if hasattr(table, "get") else None
-    if not hasattr(table, "get") or name not in table:
-        raise RigError(f"--set {key}: the rig file has no such key")
-    table[name] = value
+    for part in [*path, name]:
+        if not hasattr(table, "get") or part not in table:
+            known = list(table) if hasattr(table, "get") else []
+            why = did_you_mean([part], known) or f"known there: {', '.join(known) or 'none'}"
+            raise RigError(f"--set {key}: the rig file has no such key: {why}")
+        parent, table = table, table[part]
+    parent[name] = value
     return tomlkit.dumps(document)

@@ -70,9 +70,13 @@ def recorded_estimates(recording: Recording, name: str) -> Iterator[Estimate]:
 def scored_and_compared(
     recording: Recording, series: Iterable[tuple[Exposure, Sequence[Estimate]]], names: Sequence[str]
 ) -> tuple[dict[str, Score], dict[str, str | None]]:
-    """Scores by name, and where estimates first differ from those in the recording, for the names that it has."""
+    """Scores by name, and where estimates first differ from those in the recording, for the names that it has.
+
+    With another rig than the recording's own there is nothing to compare them with.
+    """
     scorers = {name: Scorer() for name in names}
-    recorded = {name: recorded_estimates(recording, name) for name in names if name in recording.estimators}
+    made_before = recording.estimators if recording.rig_is_recorded else []
+    recorded = {name: recorded_estimates(recording, name) for name in names if name in made_before}
     differences: dict[str, str | None] = dict.fromkeys(recorded)
     count = 0
     for count, (exposure, each) in enumerate(series, 1):
@@ -95,23 +99,26 @@ def write_reestimated(
     names: Sequence[str],
     path: str | Path,
     *,
+    only: bool = False,
     overwrite: bool = False,
     progress: Callable[[int], None] = lambda exposures: None,
     engine: Engine = "aolink",
 ) -> None:
-    """Copy a recording with new estimates in the place of those that it has.
+    """Copy a recording with new estimates.
 
-    Messages of other software come along as they are. The same recording and the same version of aolink give the
-    same bytes.
+    Estimates by other names, and pictures restored with them, stay in the copy, unless ``only``; those that were made
+    with another rig than ``recording.rig`` could not be read in it and are left out. Messages of other software come
+    along as they are. The same recording and the same version of aolink give the same bytes.
 
     Raises
     ------
     RecordingError
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
+    kept = kept_estimators(recording, names, only=only)
     notes = recording.metadata | {
         "aolink_version": version("aolink"),
-        "estimators": " ".join(names),
+        "estimators": " ".join([*kept, *names]),
         "estimated_from": recording.path.name,
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
@@ -121,7 +128,7 @@ def write_reestimated(
         copy = RecordingCopy(recording, partial, notes)
         try:
             done = 0
-            for some in _with_estimates(recording, Driver(recording.rig, names, engine)):
+            for some in _with_estimates(recording, Driver(recording.rig, names, engine), kept):
                 copy.add(some)
                 if done < copy.result.exposures:
                     progress(done := copy.result.exposures)
@@ -131,14 +138,33 @@ def write_reestimated(
             raise
 
 
-def _with_estimates(recording: Recording, driver: Driver) -> Iterator[RawMessage]:
-    """The messages of a recording, without estimates and restored pictures, and new estimates after their exposures."""
+def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -> list[str]:
+    """Whose estimates stay in a copy of a recording with new estimates by ``names``."""
+    if only or not recording.rig_is_recorded:
+        return []
+    return [name for name in recording.estimators if name not in names]
+
+
+def _without_old_estimates(recording: Recording, kept: Sequence[str]) -> Iterator[RawMessage]:
+    """The messages of a recording; of its estimates and of the pictures restored with them, those of ``kept``."""
+    restored_with = ""
+    for raw in recording.raw_messages():
+        if raw.topic == topics.RESTORATION:  # it comes before its pictures
+            message = recording.decoded(raw)
+            restored_with = message.estimator if isinstance(message, schemas_pb2.Restoration) else ""
+        if raw.topic.startswith(topics.RESTORED) and restored_with not in kept:
+            continue
+        if raw.topic.startswith(topics.ESTIMATE) and raw.topic.removeprefix(topics.ESTIMATE) not in kept:
+            continue
+        yield raw
+
+
+def _with_estimates(recording: Recording, driver: Driver, kept: Sequence[str]) -> Iterator[RawMessage]:
+    """The messages of a recording with new estimates after their exposures; of the old ones, those of ``kept``."""
     assembly = ExposureAssembly(recording.rig)
     waiting: list[tuple[RawMessage, list[Exposure]]] = []
     exposures = size = 0
-    for raw in recording.raw_messages():
-        if raw.topic.startswith((topics.ESTIMATE, topics.RESTORED)):
-            continue
+    for raw in _without_old_estimates(recording, kept):
         message = recording.decoded_run(raw) or recording.decoded(raw)
         if message is None and raw.schema in topics.SCHEMAS:
             continue  # it is among the losses
