@@ -64,7 +64,8 @@ def _plant_by_matrices(table: Table) -> Plant:
         if radius > 1 - 1e-9:
             raise table.missing(
                 "initial_covariance",
-                f"plant.A has an eigenvalue of modulus {radius:.6g}, so there is no stationary covariance; give a matrix",
+                f"plant.A has an eigenvalue of modulus {radius:.6g}, so there is no stationary covariance;"
+                " give a matrix",
             )
         covariance = stationary_covariance(A, B_w @ W @ B_w.T)
     else:
