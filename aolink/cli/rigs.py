@@ -22,6 +22,7 @@ from aolink.cli.common import (
     OverwriteOption,
     RigArgument,
     app,
+    check_measured,
     get_ready,
     load_checked,
     open_recording,
@@ -337,6 +338,7 @@ def replay(
         else:
             stdout.print(tables.scores(scores))
     stop.exit_if_asked()
+    check_measured(file, scores)
 
 
 def _replay_to_rig(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from aolink.errors import RecordingError
 from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
 from aolink.exposure import Exposure
@@ -92,6 +93,15 @@ def scored_and_compared(
         if differences[name] is None and (more := sum(1 for _ in rest)):
             differences[name] = f"{count + more} estimates against {count}"
     return {name: scorer.result() for name, scorer in scorers.items()}, differences
+
+
+def check_has_exposures(recording: Recording) -> None:
+    """Raise RecordingError if there is nothing to estimate."""
+    if not (recording.counts.get(topics.EXPOSURE) and recording.counts.get(topics.IMAGE)):
+        raise RecordingError(
+            f"{recording.path} holds no exposure, which is a message on {topics.EXPOSURE} and one on {topics.IMAGE}:"
+            " there is nothing to estimate; `aolink info` says what it holds"
+        )
 
 
 def write_reestimated(
