@@ -126,10 +126,11 @@ def estimate(
     with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
         for each in batch.run(todo, jobs, stop=stop, progress=lambda n: tell("estimate", n)):
             done.append(each)
+            of = f"{each.job.source} {each.job.model.name}".strip()
             if each.error:
-                stderr.print(f"aolink: {each.job.source} {each.job.model.name}: {each.error}", markup=False)
+                stderr.print(f"aolink: {of}: {each.error}", markup=False)
             for warning in each.warnings:
-                stderr.print(f"aolink: warning: {each.job.source} {each.job.model.name}: {warning}", markup=False)
+                stderr.print(f"aolink: warning: {of}: {warning}", markup=False)
     rows = batch.table_rows(done, output)
     batch.write_table(table, rows)
     if as_json:
