@@ -6,6 +6,7 @@ import csv
 import hashlib
 import itertools
 import json
+import re
 import time
 import tomllib
 from collections import deque
@@ -24,14 +25,15 @@ from aolink.errors import AolinkError, RecordingError, RigError
 from aolink.estimation import Engine, Scorer
 from aolink.files import remove_unfinished, writing
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import fill_reestimated, recorded_estimates
+from aolink.recording.reestimate import check_has_exposures, fill_reestimated, recorded_estimates
 from aolink.rig import parse_rig
+from aolink.toml_table import did_you_mean
 from aolink.workers import processes
 
 COLUMNS = (
     "recording", "model", "estimator", "exposures", "path_rmse", "start_rmse", "end_rmse",
-    "nis", "nis_low", "nis_high", "start_nees", "end_nees", "nees_low", "nees_high", "not_ok", "seconds", "output",
-    "damage", "error",
+    "nis", "nis_low", "nis_high", "start_nees", "end_nees", "nees_low", "nees_high", "not_ok", "nothing_measured",
+    "seconds", "output", "damage", "error",
 )  # fmt: skip
 """Of the table: one row for each recording, model and estimator; what is not known is empty."""
 _IN_EVERY_ROW = {"recording", "model", "estimator", "exposures", "output"}
@@ -55,6 +57,11 @@ class Model:
             text = _with_value(text, key, value)
         return text
 
+    def applied_to(self, recording: Recording) -> Recording:
+        """The same recording to be estimated with this model. Raises RigError where that cannot be."""
+        text = self.text_for(recording.rig.toml)
+        return recording if text == recording.rig.toml else Recording(recording.path, rig=parse_rig(text))
+
 
 @dataclass(frozen=True, slots=True)
 class Job:
@@ -68,6 +75,8 @@ class Job:
     engine: Engine = "aolink"
     overwrite: bool = False
     """Do it even if it was done before."""
+    only: bool = False
+    """Leave the estimates of other estimators out of the output."""
 
     @property
     def record(self) -> Path:
@@ -84,6 +93,7 @@ class Job:
             version("aolink"),
             self.estimators,
             self.engine,
+            self.only,
             self.model.rig_text,
             [[key, str(value)] for key, value in self.model.changes],
         ]
@@ -102,9 +112,16 @@ class Done:
     """It had been done before."""
 
     @property
-    def damage(self) -> str:
-        """What of the recording could not be read, in words; empty where all could."""
-        return str(self.rows[0].get("damage") or "") if self.rows else ""
+    def nothing_measured(self) -> list[str]:
+        """Estimators that could not use a single exposure, with the reason, in words."""
+        whole = [(row["estimator"], row.get("nothing_measured")) for row in self.rows]
+        return [f"{name} has predicted only: {why}" for name, why in whole if why]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is doubtful about the result, in words: what of the recording could not be read or estimated."""
+        damage = self.rows[0].get("damage") if self.rows else ""
+        return [*([str(damage)] if damage else []), *self.nothing_measured]
 
 
 def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") -> list[Model]:
@@ -139,9 +156,12 @@ def jobs(
     folder: Path,
     engine: Engine = "aolink",
     *,
+    only: bool = False,
     overwrite: bool = False,
 ) -> list[Job]:
     """Every recording with every model; with ``overwrite`` also those that were done before.
+
+    With ``only`` the outputs have no other estimates than the new ones.
 
     Raises
     ------
@@ -155,7 +175,8 @@ def jobs(
     for source, model in itertools.product(sources, each):
         suffix = "".join(c if c.isalnum() or c in "=.-_" else "-" for c in model.name.replace("plant.", ""))
         name = f"{source.stem}-{suffix}" if suffix else source.stem
-        made.append(Job(source, model, tuple(dict.fromkeys(estimators)), folder / f"{name}.mcap", engine, overwrite))
+        output = folder / f"{name}.mcap"
+        made.append(Job(source, model, tuple(dict.fromkeys(estimators)), output, engine, overwrite, only))
     names = [job.output for job in made]
     if doubled := {name for name in names if names.count(name) > 1}:
         raise RigError(f"two recordings would be written as {doubled.pop().name}: give them different names")
@@ -264,7 +285,17 @@ def table_rows(done: Sequence[Done], folder: Path) -> list[dict[str, Any]]:
     for path in folder.glob("*.json"):
         if path.resolve() not in known and path.with_suffix(".mcap").exists() and (record := _record(path)):
             rows += [dict.fromkeys(COLUMNS) | row for row in record["rows"]]
-    return sorted(rows, key=lambda row: (row["recording"], row["model"]))
+    return sorted(rows, key=lambda row: (_numerically(row["recording"]), _numerically(row["model"])))
+
+
+# A sign belongs to a number only where a value begins: "session-2" comes after "session-1".
+_NUMBERS = re.compile(r"((?:(?<=[=,\[])[-+])?\d+(?:\.\d+)?(?:e[-+]?\d+)?)")
+
+
+def _numerically(text: str) -> list[tuple[str, float]]:
+    """A key that sorts texts with numbers in them by the numbers: 5 before 10, and 1e-05 before both."""
+    parts = _NUMBERS.split(text)
+    return [(words, float(number)) for words, number in zip(parts[::2], [*parts[1::2], "-inf"], strict=True)]
 
 
 def _record(path: Path) -> dict[str, Any] | None:
@@ -297,12 +328,10 @@ def _do(job: Job) -> Done:
 
 def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     begin = time.perf_counter()
-    recording = Recording(job.source)
-    text = job.model.text_for(recording.rig.toml)
-    if text != recording.rig.toml:
-        recording = Recording(job.source, rig=parse_rig(text))
+    recording = job.model.applied_to(Recording(job.source))
+    check_has_exposures(recording)
     names = list(job.estimators or recording.estimators or ["o3"])
-    fill_reestimated(recording, names, target, engine=job.engine)
+    fill_reestimated(recording, names, target, only=job.only, engine=job.engine)
     seconds = time.perf_counter() - begin
     written = Recording(target)
     scorers, not_ok = {name: Scorer() for name in names}, dict.fromkeys(names, 0)
@@ -326,8 +355,8 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
         rows.append(
             {
                 "recording": str(job.source), "model": job.model.name, "estimator": name, "exposures": count,
-                **known, "not_ok": not_ok[name], "seconds": round(seconds, 3), "output": job.output.name,
-                "damage": recording.damage or None,
+                **known, "not_ok": not_ok[name], "nothing_measured": score.nothing_measured or None,
+                "seconds": round(seconds, 3), "output": job.output.name, "damage": recording.damage or None,
             }
         )  # fmt: skip
     return rows
@@ -364,9 +393,11 @@ def _with_value(text: str, key: str, value: Any) -> str:
         raise RigError(f"not valid TOML: {error}") from None
     table: Any = document
     *path, name = key.split(".")
-    for part in path:
-        table = table.get(part) if hasattr(table, "get") else None
-    if not hasattr(table, "get") or name not in table:
-        raise RigError(f"--set {key}: the rig file has no such key")
-    table[name] = value
+    for part in [*path, name]:
+        if not hasattr(table, "get") or part not in table:
+            known = list(table) if hasattr(table, "get") else []
+            why = did_you_mean([part], known) or f"known there: {', '.join(known) or 'none'}"
+            raise RigError(f"--set {key}: the rig file has no such key: {why}")
+        parent, table = table, table[part]
+    parent[name] = value
     return tomlkit.dumps(document)

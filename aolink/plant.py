@@ -6,9 +6,9 @@ Everything here follows from x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -327,75 +327,6 @@ def _o2_needs(stable: bool, observable: bool) -> str:
     return "; ".join(needs)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """Something that `check_rig` has to say."""
-
-    severity: Literal["error", "warning", "info"]
-    key: str
-    """The rig file's key that it is about."""
-    message: str
-
-
-def check_rig(rig: Rig) -> list[Finding]:
-    """What will not work, what may surprise, and what is worth knowing of a rig; errors first."""
-    findings = [*_check_observability(rig), *_check_field(rig), *_check_sensor(rig)]
-    order = ("error", "warning", "info")
-    return sorted(findings, key=lambda f: order.index(f.severity))
-
-
-def _check_observability(rig: Rig) -> list[Finding]:
-    report = observability(rig.plant, rig.timing.exposure_steps, rig.timing.fast_step_s)
-    findings = []
-    if not report.rank:
-        return [Finding(severity="error", key="plant.C", message="the camera sees no state of the plant")]
-    for mode in report.unseen:
-        harm = "it dies out by itself" if abs(mode.eigenvalue) < 1 - 1e-9 else "its estimate will never converge"
-        findings.append(
-            Finding(severity="warning", key="plant.C", message=f"the outputs do not see all of {mode}; {harm}")
-        )
-    for mode in report.lost_by_centroid:
-        message = (
-            f"the centroid over {rig.timing.exposure_steps} fast steps loses {mode}, wholly or in part;"
-            " the blur may still show it, another exposure time would"
-        )
-        findings.append(Finding(severity="warning", key="timing.exposure_steps", message=message))
-    message = f"rank {report.rank} of {report.n_states} at the fast rate, {report.centroid_rank} by centroids"
-    findings.append(Finding(severity="info", key="plant", message=f"{message}; o2 needs {report.o2_needs}"))
-    return findings
-
-
-def _check_field(rig: Rig) -> list[Finding]:
-    """Whether the spot stays on the sensor, as it should go and with three standard deviations around that."""
-    path, sd = nominal_path(_different_copies(rig))
-    low, high = rig.sensor.field
-    least, most = float(path.min()), float(path.max())
-    key = "drive.amplitude" if rig.drive.kind == "sine" else "drive.offset"
-    where = f"the spot goes from {least:.3g} to {most:.3g}"
-    if least < low or most > high:
-        message = (
-            f"{where} under the drive, beyond sensor.field = [{low:g}, {high:g}]: lower {key} or widen sensor.field"
-        )
-        return [Finding(severity="error", key=key, message=message)]
-    reach_low, reach_high = float((path - 3 * sd[:, None]).min()), float((path + 3 * sd[:, None]).max())
-    if reach_low < low or reach_high > high:
-        message = (
-            f"{where} under the drive, and process noise carries it from {reach_low:.3g} to {reach_high:.3g}"
-            f" (three sd), beyond the field [{low:g}, {high:g}]: moments will be biased there"
-        )
-        return [Finding(severity="warning", key="sensor.field", message=message)]
-    return []
-
-
-def _different_copies(rig: Rig) -> Rig:
-    """The rig with one of all copies of the plant that its drive moves alike: thousands of axes take no longer."""
-    plant, drive = rig.plant, rig.drive
-    each = np.stack([drive.amplitude, drive.offset]).reshape(2, plant.axes, plant.n_inputs).transpose(1, 0, 2)
-    different = np.unique(each, axis=0)
-    drive = replace(drive, amplitude=different[:, 0].ravel(), offset=different[:, 1].ravel())
-    return replace(rig, plant=replace(plant, axes=len(different)), drive=drive)
-
-
 def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Where the spot goes under the drive without noise, and how far noise takes it from there.
 
@@ -419,31 +350,3 @@ def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
     early = plant.C @ plant.initial_covariance @ plant.C.T
     sd = np.sqrt(np.maximum(np.diag(late), np.diag(early)))
     return path.reshape(rig.n_outputs, n_steps), np.tile(sd, plant.axes)
-
-
-def _check_sensor(rig: Rig) -> list[Finding]:
-    sensor = rig.sensor
-    findings = []
-    # Where it is narrowest.
-    sd = math.sqrt(float(np.linalg.eigvalsh(sensor.kernel.covariance)[0]))
-    if sd < sensor.pixel_width / 3:
-        message = (
-            f"the kernel's sd, {sd:.3g}, is under a third of a pixel ({sensor.pixel_width:.3g}):"
-            " moments depend on where in a pixel the spot rests"
-        )
-        findings.append(Finding(severity="warning", key="sensor.kernel.sigma", message=message))
-    noise = 5 * math.sqrt(sensor.noise_density / sensor.pixel_size) * sensor.counts_per_density
-    if sensor.black_level < noise:
-        message = (
-            f"five sd of pixel noise are {noise:.0f} counts, more than the black level, {sensor.black_level:g}:"
-            " clipped at zero, the noise biases every moment"
-        )
-        findings.append(Finding(severity="warning", key="sensor.black_level", message=message))
-    peak = sensor.peak_density * sensor.counts_per_density
-    if sensor.black_level + peak + noise > sensor.full_scale:
-        message = (
-            f"a resting spot and five sd of noise reach {sensor.black_level + peak + noise:.0f} counts,"
-            f" the full scale is {sensor.full_scale}: lower counts_per_density"
-        )
-        findings.append(Finding(severity="warning", key="sensor.counts_per_density", message=message))
-    return findings

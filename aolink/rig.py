@@ -33,6 +33,12 @@ from aolink.sensor import Sensor as Sensor
 from aolink.sensor import SpotSensor as SpotSensor
 from aolink.toml_table import Table
 
+_TABLES = (
+    "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
+    "lenslets", "disturbance", "scene", "calibration",
+)  # fmt: skip
+"""What a rig file may hold at its top."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Rig:
@@ -119,8 +125,9 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     """Validate the text of a rig file. Raises `RigError`, naming the key."""
     try:
         root = Table(tomllib.loads(text), "")
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number or nesting beyond what Python reads
         raise RigError(f"not valid TOML: {error}") from None
+    root.finish(*_TABLES)
     name, summary = root.text("name"), root.text("summary", "")
     timing = read_timing(root.table("timing"))
     optics = read_optics(root.table("lenslets"), read_grid(root.table("sensor"))) if root.has("lenslets") else None
@@ -136,7 +143,6 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     scene = read_scene(root.table("scene")) if root.has("scene") else None
     simulation = read_simulation(root.table("simulation", optional=True))
     calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
-    root.finish()
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
         mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,

@@ -62,9 +62,10 @@ def _plant_by_matrices(table: Table) -> Plant:
     mean = table.vector("initial_mean", n, "states", 0.0)
     if table.get("initial_covariance", "stationary") == "stationary":
         if radius > 1 - 1e-9:
-            raise RigError(
-                f"plant.initial_covariance is missing: plant.A has an eigenvalue of modulus {radius:.6g},"
-                " so there is no stationary covariance; give a matrix"
+            raise table.missing(
+                "initial_covariance",
+                f"plant.A has an eigenvalue of modulus {radius:.6g}, so there is no stationary covariance;"
+                " give a matrix",
             )
         covariance = stationary_covariance(A, B_w @ W @ B_w.T)
     else:

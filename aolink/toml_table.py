@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,33 @@ from numpy.typing import NDArray
 from aolink.errors import RigError
 
 FloatArray = NDArray[np.float64]
+
+_KEYS = """
+A B B_w C actuators amplitude axes bias_v bit_depth bit_flip_rate black_level black_level_sd block_steps calibration
+clock_drift_ppm clock_offset_s command_loss_rate counts_per_density counts_per_density_sd counts_per_intensity
+coupling dac_bits damping dark_frames disturbance drift_s drive duplicate_rate exposure_offset exposure_steps
+fast_step_s faults field flat_frames focal_length_m footprint_m frame_period_steps frequency_hz gain gamma grid
+initial_covariance initial_mean input_max input_min kernel kernel_sigma_sd kind latency_s layers least_light
+lenslets light max_v mirror name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m
+packet_loss_rate pad_radius_m park period_s photoelectrons photoelectrons_sd picture picture_pixels pitch_m
+pixel_scale pixels plant plant_noise process_noise pupil_m queue_steps r0_m radius_m recorded resonance_hz scene
+seed sensor shape sigma simulation slope_unit_rad sources still_frames summary tension_n_per_m timing turbulence
+vibration voltage watchdog_s wavelength_m wind_m_s window zernike_m
+"""
+KEYS = frozenset(_KEYS.split())
+"""Every key of every table of a rig file.
+
+Where a key is missing, a key of the file that is not among these is a misspelling of it if the two look alike.
+"""
+
+
+def did_you_mean(written: Iterable[str], known: Iterable[str]) -> str:
+    """``you wrote kernal; did you mean kernel?`` for the first of ``written`` that is like one of ``known``, or ''."""
+    by_lower = {each.lower(): each for each in known}
+    for each in written:
+        if found := get_close_matches(each.lower().replace("-", "_"), by_lower, 1, cutoff=0.7):
+            return f"you wrote {each}; did you mean {by_lower[found[0]]}?"
+    return ""
 
 
 class Table:
@@ -25,16 +55,21 @@ class Table:
         return f"{self._path}.{name}" if self._path else name
 
     def has(self, name: str) -> bool:
+        assert name in KEYS, f"{name} is not listed in KEYS"
         self._asked.add(name)
         return name in self._values
 
     def get(self, name: str, default: Any = None) -> Any:
-        self._asked.add(name)
-        if name not in self._values:
+        if not self.has(name):
             if default is None:
-                raise RigError(f"{self.key(name)} is missing: the rig file must give it")
+                raise self.missing(name, "the rig file must give it")
             return default
         return self._values[name]
+
+    def missing(self, name: str, why: str) -> RigError:
+        """The error for a key that is not there: with a misspelling of it, if there is one, or else with the reason."""
+        strange = [each for each in self._values if each not in KEYS]
+        return RigError(f"{self.key(name)} is missing: {did_you_mean(strange, [name]) or why}")
 
     def table(self, name: str, *, optional: bool = False) -> Table:
         return Table(self.get(name, {} if optional else None), self.key(name))
@@ -68,7 +103,7 @@ class Table:
         self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf
     ) -> float:
         value = self.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
             raise RigError(f"{self.key(name)}: expected a finite number, found {shown(value)}")
         if value < low or value <= above:
             bound = f"at least {low:g}" if value < low else f"above {above:g}"
@@ -131,7 +166,7 @@ class Table:
     def _array(self, name: str, value: Any) -> FloatArray:
         try:
             array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise RigError(
                 f"{self.key(name)}: expected numbers in rows of equal length, found {shown(value)}"
             ) from None
@@ -139,11 +174,15 @@ class Table:
             raise RigError(f"{self.key(name)} holds a number that is not finite")
         return array
 
-    def finish(self) -> None:
-        for name in self._values:
-            if name not in self._asked:
-                known = ", ".join(sorted(self._asked))
-                raise RigError(f"{self.key(name)} is not a key that aolink knows; known here: {known}")
+    def finish(self, *optional: str) -> None:
+        """Raise RigError if the table has a key that nobody asked for, and that is not one of ``optional`` either."""
+        self._asked.update(optional)
+        unknown = [name for name in self._values if name not in self._asked]
+        # Misspelt keys first: another key may only have no use because of them.
+        for name in sorted(unknown, key=lambda each: each in KEYS):
+            hint = did_you_mean([name], self._asked)
+            more = f": {hint}" if hint else f"; known here: {', '.join(sorted(self._asked))}"
+            raise RigError(f"{self.key(name)} is not a key that aolink knows{more}")
 
 
 def shape_text(array: FloatArray) -> str:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import multiprocessing
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from aolink import batch
@@ -99,8 +101,8 @@ def test_the_table_has_what_is_in_the_folder_from_before(recorded: Session, tmp_
     (tmp_path / "other.json").write_text('{"digest": "a", "rows": [{"recording": "x"}]}')
     (tmp_path / "other.mcap").touch()
     both = rows("10")
-    assert [name for name, _ in both] == ["plant.process_noise=10", "plant.process_noise=5"]
-    assert both[1] == first
+    assert [name for name, _ in both] == ["plant.process_noise=5", "plant.process_noise=10"], "by their numbers"
+    assert both[0] == first
     assert rows("5", "10") == both
     next(tmp_path.glob("*noise=10.mcap")).unlink()
     assert rows("5") == [first]
@@ -239,3 +241,43 @@ def test_the_command_on_two_processes(aolink: Run, recorded: Session, tmp_path: 
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
     again = aolink(*arguments, "--jobs", "2", "-o", "two")
     assert "6 of 6 done, 4 of them before, 2 failed" in again.stdout
+
+
+def test_rows_are_in_the_order_of_the_numbers_in_their_names() -> None:
+    """Not in that of their letters, where 10 comes before 5."""
+    names = ["x=1e-05", "x=5", "x=10", "x=20", "y=-3", "y=-2.5", "y=0.1", "y=[-1,2]", "y=[-1,10]"]
+    files = ["session-1.mcap", "session-2.mcap", "session-10.mcap"]
+    rows = [{"recording": file, "model": name} for file in files for name in names]
+    job = batch.jobs([Path("s.mcap")], batch.models(None, []), ["o1"], Path("out"))[0]
+    mixed = [rows[k] for k in np.random.default_rng(1).permutation(len(rows))]
+    found = batch.table_rows([batch.Done(job, mixed)], Path("nowhere"))
+    assert [(row["recording"], row["model"]) for row in found] == [(row["recording"], row["model"]) for row in rows]
+
+
+def test_values_are_drawn_in_the_order_of_the_table(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    shutil.copy(recorded.path, tmp_path / "s.mcap")
+    result = aolink("estimate", "s.mcap", "-e", "o1", "--set", "plant.process_noise=20,5,10", "-o", "out/")
+    assert result.returncode == 0, result.stderr
+    assert re.findall(r"process_noise=(\d+)", result.stdout) == ["5", "10", "20"]
+
+
+def test_one_file_and_one_model_need_no_folder(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+    """With --set or --rig as without: the table is printed, and is that of the batch."""
+    shutil.copy(recorded.path, tmp_path / "s.mcap")
+    (tmp_path / "other.toml").write_text(
+        Recording(recorded.path).rig.toml.replace("process_noise = 10", "process_noise = 3")
+    )
+    for arguments in (["--set", "plant.process_noise=3"], ["--rig", "other.toml"]):
+        shown = aolink("estimate", "s.mcap", "-e", "o3", *arguments)
+        assert shown.returncode == 0, shown.stderr
+        assert "RMSE path" in shown.stdout
+        score = json.loads(aolink("estimate", "s.mcap", "-e", "o3", *arguments, "--json").stdout)["o3"]
+        row = json.loads(aolink("estimate", "s.mcap", "-e", "o3", *arguments, "-o", "out/", "--json").stdout)[-1]
+        assert score["path_rmse"] == row["path_rmse"]
+    own = json.loads(aolink("estimate", "s.mcap", "-e", "o3", "--json").stdout)["o3"]
+    assert own["path_rmse"] != score["path_rmse"]
+    several = aolink("estimate", "s.mcap", "-e", "o3", "--set", "plant.process_noise=3,4")
+    assert several.returncode == 2
+    assert "need -o DIR" in several.stderr
+    for useless in (["--parquet"], ["--jobs", "2"], ["--only"]):
+        assert aolink("estimate", "s.mcap", "-e", "o3", *useless).returncode == 2

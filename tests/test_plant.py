@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy import linalg
 
 from aolink.blocks import components, stationary_covariance
-from aolink.plant import check_rig, input_response, lift, nominal_path, observability, output_rows, psd_root
+from aolink.plant import input_response, lift, nominal_path, observability, output_rows, psd_root
 from aolink.rig import Plant, Rig, load_rig
+from aolink.rig_check import check_rig
 
 RIG = load_rig("section-vi")
 

@@ -272,3 +272,59 @@ def test_a_row_of_inputs_and_their_limits_must_fit_into_a_message() -> None:
     text = text.replace("B = [[0.0], [1.0]]", "B = [[0.0, 0.0], [1.0, 1.0]]")
     with pytest.raises(RigError, match="the mirror has 12544 inputs"):
         parse_rig(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        (
+            "section-vi",
+            "[sensor.kernel]",
+            "[sensor.kernal]",
+            r"sensor.kernel is missing: you wrote kernal; .* kernel\?",
+        ),
+        ("section-vi", "sigma =", "sigam =", r"sensor.kernel.sigma is missing: you wrote sigam; did you mean sigma\?"),
+        ("section-vi", "field =", "feild =", r"sensor.field is missing: you wrote feild; did you mean field\?"),
+        ("section-vi", "fast_step_s", "fast-step-s", "timing.fast_step_s is missing: you wrote fast-step-s; did you"),
+        ("section-vi", "black_level", "blacklevel", r"blacklevel is not a key .*: you wrote .* mean black_level\?"),
+        (
+            "section-vi",
+            "input_min",
+            "input_mn",
+            "mirror.input_min is missing: you wrote input_mn; did you mean input",
+        ),
+        ("section-vi", "[sensor]", "[Sensor]", r"Sensor is not a key that aolink knows: .* did you mean sensor\?"),
+        ("section-vi", "[drive]", "[drvie]", r"drvie is not a key .*: you wrote drvie; did you mean drive\?"),
+        ("section-vi", "seed =", "sede =", r"simulation.sede is not a key .* did you mean seed\?"),
+        ("sh-8x8", "[lenslets]", "[lenslet]", r"lenslet is not a key that aolink knows: .* did you mean lenslets\?"),
+        ("sh-8x8", "pupil_m = 2.4e-3      # d", "pupl_m = 2.4e-3      # d", r"lenslets.pupl_m .* mean pupil_m\?"),
+        ("sh-8x8", "wind_m_s", "wind_ms", r"disturbance.turbulence.layers\[0\].wind_m_s is missing: you wrote wind_ms"),
+        (
+            "sh-8x8",
+            "tension_n_per_m",
+            "tension_n_m",
+            "plant.tension_n_per_m is missing: you wrote tension_n_m; did",
+        ),
+        ("sh-8x8", "bias_v", "bias_V2", r"mirror.voltage.bias_v is missing: you wrote bias_V2; did you mean bias_v\?"),
+        ("moving-scene", "pixel_scale", "pixel_scal", r"scene.pixel_scale is missing: .* did you mean pixel_scale\?"),
+        ("tip-tilt", "frequency_hz", "frequncy_hz", r"vibration\[0\].frequency_hz is missing: you wrote frequncy_hz"),
+    ],
+)
+def test_a_misspelt_key_is_named_with_the_one_that_was_meant(name: str, old: str, new: str, message: str) -> None:
+    text = load_rig(name).toml
+    assert old in text
+    with pytest.raises(RigError, match=message):
+        parse_rig(text.replace(old, new, 1))
+
+
+def test_a_key_that_is_missing_is_not_taken_for_one_that_is_there() -> None:
+    """input_max is like input_min, but no misspelling of it."""
+    with pytest.raises(RigError, match=r"mirror.input_min is missing: the rig file must give it$"):
+        parse_rig(changed("input_min = -0.05", ""))
+
+
+@pytest.mark.parametrize("value", ["1" * 400, "1" * 5000, "[" * 5000])
+def test_numbers_and_nesting_beyond_what_can_be_read(value: str) -> None:
+    for key in ("sigma = 0.05", "process_noise = 0.1 "):
+        with pytest.raises(RigError):
+            parse_rig(changed(key, f"{key.split()[0]} = {value} "))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,10 +12,11 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from aolink.errors import RigError
+from aolink.errors import EstimatorError, RigError
 from aolink.rig import Rig, load_rig
 
 if TYPE_CHECKING:
+    from aolink.estimation import Score
     from aolink.recording.reader import Recording
 
 app = typer.Typer(
@@ -39,7 +40,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 
 def load_checked(path_or_name: str) -> Rig:
     """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
-    from aolink.plant import check_rig
+    from aolink.rig_check import check_rig
 
     loaded = load_rig(path_or_name)
     for finding in check_rig(loaded):
@@ -58,6 +59,13 @@ def open_recording(file: Path, *, check: bool = False) -> Recording:
     if recording.damage:
         stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
     return recording
+
+
+def check_measured(file: Path, scores: Mapping[str, Score]) -> None:
+    """Raise EstimatorError if an estimator that looks at the camera could not use a single exposure."""
+    for name, score in scores.items():
+        if score.nothing_measured:
+            raise EstimatorError(f"{file}: {name} has predicted only: {score.nothing_measured}")
 
 
 def program() -> str:

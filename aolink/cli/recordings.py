@@ -18,12 +18,13 @@ from aolink.cli.common import (
     JsonOption,
     OverwriteOption,
     app,
+    check_measured,
     get_ready,
     open_recording,
     stderr,
     stdout,
 )
-from aolink.errors import AolinkError, RecordingError
+from aolink.errors import AolinkError, EstimatorError, RecordingError
 from aolink.files import writing
 from aolink.signals import StopRequest
 from aolink.terminal import progress_bar
@@ -31,6 +32,7 @@ from aolink.terminal import progress_bar
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from aolink.batch import Model
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
     from aolink.recording.editing import Edited
@@ -75,7 +77,8 @@ def estimate(
             "--output",
             "-o",
             metavar="FILE|DIR/",
-            help="A copy with the new estimates; of many files or models, a folder for the copies and their table.",
+            help="A copy with the new estimates beside those of other estimators; of many files or models, a folder for"
+            " the copies and their table.",
         ),
     ] = None,
     rig: Annotated[
@@ -88,6 +91,7 @@ def estimate(
     engine: Annotated[
         Engine, typer.Option(help="What the filters run on; filterpy: o1 to o3, a plant of one axis, slowly.")
     ] = Engine.AOLINK,
+    only: Annotated[bool, typer.Option("--only", help="Leave the estimates that were there out of the copy.")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="How many recordings at once.")] = 1,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write the table as Parquet, not as CSV.")] = False,
     overwrite: OverwriteOption = False,
@@ -96,19 +100,25 @@ def estimate(
     """Estimate the motion inside each exposure of recordings, again or for the first time.
 
     With many files or models, what was done before and has not changed is not done again, and a file that
-    fails does not stop the others (exit code 1 then).
+    fails does not stop the others (exit code 1 then). Exit code 6 if no exposure gave a measurement.
     """
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
-    if len(files) == 1 and not rig and not settings and not is_folder:
-        _estimate_one(files[0], estimator, output, engine, overwrite=overwrite, as_json=as_json)
-        return
+    if only and output is None:
+        raise typer.BadParameter("--only is about the copy that -o writes: give -o too")
     from aolink import batch, tables
     from aolink.rig import load_rig
 
+    models = batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
+    if len(files) == 1 and len(models) == 1 and not is_folder:
+        if parquet or jobs > 1:
+            raise typer.BadParameter("--parquet and --jobs are for many files or models, with -o DIR/")
+        _estimate_one(
+            files[0], models[0], estimator, output, engine, only=only, overwrite=overwrite, as_json=as_json
+        )  # fmt: skip
+        return
     if output is None or (output.suffix == ".mcap" and not is_folder):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
-    models = batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
-    todo = batch.jobs(files, models, estimator or [], output, engine.value, overwrite=overwrite)
+    todo = batch.jobs(files, models, estimator or [], output, engine.value, only=only, overwrite=overwrite)
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -118,10 +128,11 @@ def estimate(
     with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
         for each in batch.run(todo, jobs, stop=stop, progress=lambda n: tell("estimate", n)):
             done.append(each)
+            of = f"{each.job.source} {each.job.model.name}".strip()
             if each.error:
-                stderr.print(f"aolink: {each.job.source} {each.job.model.name}: {each.error}", markup=False)
-            if each.damage:
-                stderr.print(f"aolink: warning: {each.job.source}: {each.damage}", markup=False)
+                stderr.print(f"aolink: {of}: {each.error}", markup=False)
+            for warning in each.warnings:
+                stderr.print(f"aolink: warning: {of}: {warning}", markup=False)
     rows = batch.table_rows(done, output)
     batch.write_table(table, rows)
     if as_json:
@@ -135,6 +146,8 @@ def estimate(
     stop.raise_if_asked()
     if any(each.error for each in done):
         raise typer.Exit(1)
+    if any(each.nothing_measured for each in done):
+        raise typer.Exit(EstimatorError.exit_code)
 
 
 def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -149,18 +162,22 @@ def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _estimate_one(
-    file: Path, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *, overwrite: bool, as_json: bool
-) -> None:
+    file: Path, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
+    only: bool, overwrite: bool, as_json: bool,
+) -> None:  # fmt: skip
     from aolink import tables
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
+        check_has_exposures,
+        kept_estimators,
         recorded_estimates,
         reestimated,
         scored_and_compared,
         write_reestimated,
     )
 
-    recording = open_recording(file)
+    recording = model.applied_to(open_recording(file))
+    check_has_exposures(recording)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     total, known = recording.counts.get("/camera/image", 0), recording.damage
     get_ready(recording.rig, names)
@@ -168,7 +185,7 @@ def _estimate_one(
         if output is not None:
             write_reestimated(
                 recording, names, output,
-                overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
+                only=only, overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
             )  # fmt: skip
             written = Recording(output)
             each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
@@ -180,14 +197,20 @@ def _estimate_one(
         stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
     if as_json:
         print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
-        return
-    stdout.print(tables.scores(scores))
-    begun_late = "cut" in recording.metadata or recording.metadata.get("part", "1") != "1"
-    why = " (the recording begins in the middle of its session, where the estimators begin anew)" if begun_late else ""
-    for name, difference in differences.items():
-        stdout.print(f"{name}: {difference + why if difference else 'the same as recorded, bit for bit'}", markup=False)
-    if output is not None:
-        stdout.print(f"written: {output}", markup=False)
+    else:
+        stdout.print(tables.scores(scores))
+        begun_late = "cut" in recording.metadata or recording.metadata.get("part", "1") != "1"
+        why = " (the recording begins in the middle of its session, where estimators begin anew)" if begun_late else ""
+        for name, difference in differences.items():
+            text = difference + why if difference else "the same as recorded, bit for bit"
+            stdout.print(f"{name}: {text}", markup=False)
+        if output is not None:
+            there = ", ".join(kept_estimators(recording, names, only=only))
+            beside = f", beside the estimates of {there} that were there" if there else ""
+            if recording.estimators and not recording.rig_is_recorded:
+                beside = "; the estimates that were there are of another rig file, and left out"
+            stdout.print(f"written: {output}{beside}", markup=False)
+    check_measured(file, scores)
 
 
 CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from the recording's start.")]

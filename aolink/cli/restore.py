@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, stderr, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, stderr, stdout
 from aolink.errors import RestorationError
 from aolink.files import check_target
 from aolink.terminal import progress_bar
@@ -81,10 +81,11 @@ def _deblur_recording(
         )  # fmt: skip
     if as_json:
         print(json.dumps({"out": str(out), "estimator": estimator, "method": method, **tables.deblurred(summary)}))
-        return
-    for line in tables.deblurred_lines(summary, estimator, method):
-        stdout.print(line, markup=False)
-    stdout.print(f"written: {out}", markup=False)
+    else:
+        for line in tables.deblurred_lines(summary, estimator, method):
+            stdout.print(line, markup=False)
+        stdout.print(f"written: {out}", markup=False)
+    check_measured(file, {estimator: summary.motion.result()})
 
 
 def _deblur_picture(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
@@ -21,6 +22,7 @@ from aolink.cli.common import (
     OverwriteOption,
     RigArgument,
     app,
+    check_measured,
     get_ready,
     load_checked,
     open_recording,
@@ -127,7 +129,7 @@ def _print_scan(loaded: Rig, as_json: bool) -> None:
 
 
 def _print_findings(loaded: Rig, as_json: bool) -> None:
-    from aolink.plant import check_rig
+    from aolink.rig_check import check_rig
 
     findings = check_rig(loaded)
     if as_json:
@@ -135,8 +137,9 @@ def _print_findings(loaded: Rig, as_json: bool) -> None:
     else:
         for finding in findings:
             stdout.print(f"{finding.severity:>7}  {escape(finding.key)}: {escape(finding.message)}")
-        errors = sum(finding.severity == "error" for finding in findings)
-        stdout.print(f"{loaded.name}: {'the rig file is good' if not errors else f'{errors} error(s)'}")
+        counts = Counter(finding.severity for finding in findings)
+        found = ", ".join(f"{counts[kind]} {kind}(s)" for kind in ("error", "warning") if counts[kind])
+        stdout.print(f"{loaded.name}: {found or 'the rig file is good'}")
     if any(finding.severity == "error" for finding in findings):
         raise typer.Exit(RigError.exit_code)
 
@@ -339,6 +342,7 @@ def replay(
         else:
             stdout.print(tables.scores(scores))
     stop.raise_if_asked()
+    check_measured(file, scores)
 
 
 def _replay_to_rig(

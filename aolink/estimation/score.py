@@ -1,9 +1,10 @@
-"""Estimates against the truth."""
+"""Estimates against the truth, and what became of the frames that they were made from."""
 
 from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation.estimate import Estimate
+from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure
 
 FloatArray = NDArray[np.float64]
@@ -34,11 +35,60 @@ class Consistency:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Unused:
+    """Exposures whose measurement was not used, or not for every axis, all for the same reason."""
+
+    exposures: int
+    status: str
+    """Name of the `Status` that their estimates have."""
+    reason: str
+    """What the first of these estimates says; the others may have other numbers in it."""
+    first_frame: int
+    """Frame of the first."""
+
+
+class UnusedCounter:
+    """Counts estimates that could not use their exposure, by status and reason."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[str, str], Unused] = {}
+
+    def add(self, status: Status, reason: str, frame_id: int) -> None:
+        """Count an estimate; one that used its exposure, or that never looks at the camera, counts nothing."""
+        if status in (Status.OK, Status.PREDICTED):
+            return
+        # Reasons hold numbers, such as a NIS, that differ from frame to frame.
+        key = (status.name, _NUMBER.sub("#", reason))
+        before = self._found.get(key)
+        self._found[key] = Unused(
+            exposures=before.exposures + 1 if before else 1,
+            status=status.name,
+            reason=before.reason if before else reason,
+            first_frame=before.first_frame if before else frame_id,
+        )
+
+    def result(self) -> tuple[Unused, ...]:
+        """What was counted so far, the most frequent first."""
+        return tuple(sorted(self._found.values(), key=lambda each: -each.exposures))
+
+
+_NUMBER = re.compile(r"\d+(\.\d+)?(e[+-]?\d+)?")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Score:
-    """How well an estimator knew the truth."""
+    """How well an estimator knew the truth, and how many of its frames it could measure."""
 
     exposures: int
     """Exposures with truth that were scored."""
+    estimated: int
+    """Exposures that were estimated, with truth or without."""
+    measured: int
+    """Those of them whose frame gave a measurement, for one axis at least."""
+    looks: bool
+    """Whether the estimator takes measurements at all; `open-loop` does not."""
+    unused: tuple[Unused, ...]
+    """Why measurements were not used, the most frequent reason first."""
     start_rmse: float
     """Root mean square over exposures and axes of the norm of the error of the start state (Mishra & Wen, figure 5)."""
     end_rmse: float
@@ -49,6 +99,14 @@ class Score:
     start_nees: Consistency
     end_nees: Consistency
 
+    @property
+    def nothing_measured(self) -> str:
+        """Why none of the exposures gave a measurement, in words; empty where one did or the estimator never looks."""
+        if not self.looks or self.measured:
+            return ""
+        why = self.unused[0].reason if self.unused else "no reason is known"
+        return f"none of {self.estimated} exposures gave a measurement: {why}"
+
 
 class Scorer:
     """A score that grows exposure by exposure, in the same memory however many there are."""
@@ -57,10 +115,20 @@ class Scorer:
         self._exposures = self._states = 0
         self._start, self._end, self._path = _Sum(), _Sum(), _Sum()
         self._start_nees, self._end_nees, self._nis = _Sum(), _Sum(), _Sum()
-        self._measurements = 0
+        self._measurements = self._estimated = self._measured = 0
+        self._looks = False
+        self._unused = UnusedCounter()
 
     def add(self, exposure: Exposure, estimate: Estimate) -> None:
-        """Count one exposure's estimate; where the exposure has no truth, nothing."""
+        """Count one exposure's estimate; its errors only where the exposure has a truth."""
+        self._estimated += 1
+        self._looks |= estimate.status != Status.PREDICTED
+        self._unused.add(estimate.status, estimate.reason, estimate.frame_id)
+        if estimate.innovation.shape[1]:
+            seen = estimate.nis > 0  # nothing was measured of the other axes
+            self._measured += bool(seen.any())
+            self._nis.add(estimate.nis[seen])
+            self._measurements += estimate.innovation.shape[1] * int(seen.sum())
         truth = exposure.truth
         if truth is None:
             return
@@ -72,15 +140,15 @@ class Scorer:
         self._path.add(np.mean((estimate.path - truth.path) ** 2, keepdims=True))
         self._start_nees.add(_normalised(at_start, estimate.start_covariance))
         self._end_nees.add(_normalised(at_end, estimate.end_covariance))
-        if estimate.innovation.shape[1]:
-            seen = estimate.nis > 0  # nothing was measured of the other axes
-            self._nis.add(estimate.nis[seen])
-            self._measurements += estimate.innovation.shape[1] * int(seen.sum())
 
     def result(self) -> Score:
         """The score of what was added so far."""
         return Score(
             exposures=self._exposures,
+            estimated=self._estimated,
+            measured=self._measured,
+            looks=self._looks,
+            unused=self._unused.result(),
             start_rmse=math.sqrt(self._start.mean),
             end_rmse=math.sqrt(self._end.mean),
             path_rmse=math.sqrt(self._path.mean),

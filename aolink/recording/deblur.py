@@ -18,7 +18,7 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RestorationError
-from aolink.estimation import Estimate
+from aolink.estimation import Estimate, Scorer
 from aolink.estimation.motion import coefficient_roots, motion
 from aolink.exposure import Exposure, step_shares
 from aolink.files import writing
@@ -26,7 +26,7 @@ from aolink.optics.camera import is_saturated, to_density
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.reader import RawMessage, Recording, RestoredPictures
-from aolink.recording.reestimate import recorded_estimates, reestimated
+from aolink.recording.reestimate import check_has_exposures, recorded_estimates, reestimated
 from aolink.restoration import Method, Psf, Restored, motion_psf_by_root, restore
 from aolink.rig import Rig
 from aolink.scene import SceneSensor, scene_motion
@@ -51,6 +51,8 @@ class Summary:
     psnr_blurred: list[float] = field(default_factory=list)
     """Peak signal-to-noise ratio of each scene as it came, moved back by its mean displacement, dB."""
     psnr_restored: list[float] = field(default_factory=list)
+    motion: Scorer = field(default_factory=Scorer)
+    """Of the estimates whose paths the pictures were restored with."""
 
 
 def estimated_psfs(
@@ -156,10 +158,11 @@ def write_deblurred(
     Raises
     ------
     RecordingError
-        ``path`` exists and not ``overwrite``, or cannot be written.
+        There is no exposure; ``path`` exists and not ``overwrite``, or cannot be written.
     EstimatorError
         There is no such estimator, or it cannot work on this rig.
     """
+    check_has_exposures(recording)
     made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
     held = next(made, None)  # whether the estimator can work shows before the file is made
     notes = {
@@ -269,6 +272,7 @@ def _score(
     done: RestoredPictures,
 ) -> None:  # fmt: skip
     summary.exposures += 1
+    summary.motion.add(exposure, estimate)
     summary.scenes += done.scene is not None
     if done.info.reason:
         summary.reasons[done.info.reason] += 1

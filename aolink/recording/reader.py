@@ -116,6 +116,8 @@ class Recording:
         else:
             _check_replaces(rig, recorded_rig, self.path)
         self.rig: Rig = rig or recorded_rig
+        self.rig_is_recorded = self.rig.toml == rig_text
+        """Whether ``rig`` is the one in the file, so that the estimates in the file can be read with it."""
 
     @property
     def losses(self) -> list[Loss]:

@@ -89,13 +89,15 @@ def recorded_estimates(recording: Recording, name: str) -> Iterator[Estimate]:
 def scored_and_compared(
     recording: Recording, series: Iterable[tuple[Exposure, Sequence[Estimate]]], names: Sequence[str]
 ) -> tuple[dict[str, Score], dict[str, str | None]]:
-    """Scores by name, and where estimates first differ from those in the recording, for the names that it has."""
+    """Scores by name, and where estimates first differ from those in the recording, for the names that it has.
+
+    With another rig than the recording's own there is nothing to compare them with.
+    """
     scorers = {name: Scorer() for name in names}
     skipped = skipped_by(recording, names)
+    made_before = recording.estimators if recording.rig_is_recorded else []
     recorded = {
-        name: recorded_estimates(recording, name)
-        for name in names
-        if name in recording.estimators and name not in skipped
+        name: recorded_estimates(recording, name) for name in names if name in made_before and name not in skipped
     }
     differences: dict[str, str | None] = dict.fromkeys(recorded)
     for name, frames in skipped.items():
@@ -119,20 +121,32 @@ def scored_and_compared(
     return {name: scorer.result() for name, scorer in scorers.items()}, differences
 
 
+def check_has_exposures(recording: Recording) -> None:
+    """Raise RecordingError if there is nothing to estimate."""
+    if not (recording.counts.get(topics.EXPOSURE) and recording.counts.get(topics.IMAGE)):
+        raise RecordingError(
+            f"{recording.path} holds no exposure, which is a message on {topics.EXPOSURE} and one on {topics.IMAGE}:"
+            " there is nothing to estimate; `aolink info` says what it holds"
+        )
+
+
 def write_reestimated(
     recording: Recording,
     names: Sequence[str],
     path: str | Path,
     *,
+    only: bool = False,
     overwrite: bool = False,
     progress: Callable[[int], None] = lambda exposures: None,
     engine: Engine = "aolink",
     as_recorded: bool = False,
 ) -> None:
-    """Copy a recording with new estimates in the place of those that it has.
+    """Copy a recording with new estimates.
 
-    Messages of other software come along as they are. The same recording and the same version of aolink give the
-    same bytes. With ``as_recorded`` estimators skip what they had no time for in the session.
+    Estimates by other names, and pictures restored with them, stay in the copy, unless ``only``; those that were made
+    with another rig than ``recording.rig`` could not be read in it and are left out. Messages of other software come
+    along as they are. The same recording and the same version of aolink give the same bytes. With ``as_recorded``
+    estimators skip what they had no time for in the session.
 
     Raises
     ------
@@ -141,7 +155,9 @@ def write_reestimated(
     """
     path = Path(path)
     with writing(path, overwrite=overwrite, sources=[recording.path], error=RecordingError) as partial:
-        fill_reestimated(recording, names, partial, progress=progress, engine=engine, as_recorded=as_recorded)
+        fill_reestimated(
+            recording, names, partial, only=only, progress=progress, engine=engine, as_recorded=as_recorded
+        )  # fmt: skip
 
 
 def fill_reestimated(
@@ -149,14 +165,16 @@ def fill_reestimated(
     names: Sequence[str],
     path: Path,
     *,
+    only: bool = False,
     progress: Callable[[int], None] = lambda exposures: None,
     engine: Engine = "aolink",
     as_recorded: bool = False,
 ) -> None:
     """What `write_reestimated` writes, into an empty file that is there already. Raises OSError as the disk does."""
+    kept = kept_estimators(recording, names, only=only)
     notes = recording.metadata | {
         "aolink_version": version("aolink"),
-        "estimators": " ".join(names),
+        "estimators": " ".join([*kept, *names]),
         "estimated_from": recording.path.name,
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
@@ -166,7 +184,9 @@ def fill_reestimated(
     try:
         done = 0
         skipped = skipped_by(recording, names) if as_recorded else None
-        for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), as_recorded):
+        # What a session had no time for is told in the copy where that is so of its estimates as well.
+        told = [*kept, *(names if as_recorded else ())]
+        for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), kept, told):
             copy.add(some)
             if done < copy.result.exposures:
                 progress(done := copy.result.exposures)
@@ -176,18 +196,40 @@ def fill_reestimated(
         raise
 
 
-def _with_estimates(recording: Recording, driver: Driver, as_recorded: bool) -> Iterator[RawMessage]:
-    """The messages of a recording, without estimates and restored pictures, and new estimates after their exposures.
+def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -> list[str]:
+    """Whose estimates stay in a copy of a recording with new estimates by ``names``."""
+    if only or not recording.rig_is_recorded:
+        return []
+    return [name for name in recording.estimators if name not in names]
 
-    What the session had no time for is only told where that is so of the new estimates as well, ``as_recorded``.
+
+def _without_old_estimates(recording: Recording, kept: Sequence[str], told: Sequence[str]) -> Iterator[RawMessage]:
+    """The messages of a recording; of its estimates and of the pictures restored with them, those of ``kept``.
+
+    Of the accounts of what an estimator had time for, those of the estimators ``told``.
     """
-    left_out = (topics.ESTIMATE, topics.RESTORED, *([] if as_recorded else [topics.ESTIMATION]))
+    restored_with = ""
+    for raw in recording.raw_messages():
+        if raw.topic == topics.RESTORATION:  # it comes before its pictures
+            message = recording.decoded(raw)
+            restored_with = message.estimator if isinstance(message, schemas_pb2.Restoration) else ""
+        if raw.topic.startswith(topics.RESTORED) and restored_with not in kept:
+            continue
+        if raw.topic.startswith(topics.ESTIMATE) and raw.topic.removeprefix(topics.ESTIMATE) not in kept:
+            continue
+        if raw.topic.startswith(topics.ESTIMATION) and raw.topic.removeprefix(topics.ESTIMATION) not in told:
+            continue
+        yield raw
+
+
+def _with_estimates(
+    recording: Recording, driver: Driver, kept: Sequence[str], told: Sequence[str]
+) -> Iterator[RawMessage]:
+    """The messages of a recording with new estimates after their exposures; of the old ones, those of ``kept``."""
     assembly = ExposureAssembly(recording.rig)
     waiting: list[tuple[RawMessage, list[Exposure]]] = []
     exposures = size = 0
-    for raw in recording.raw_messages():
-        if raw.topic.startswith(left_out):
-            continue
+    for raw in _without_old_estimates(recording, kept, told):
         message = recording.decoded_run(raw) or recording.decoded(raw)
         if message is None and raw.schema in topics.SCHEMAS:
             continue  # it is among the losses

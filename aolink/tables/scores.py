@@ -8,12 +8,16 @@ from dataclasses import asdict
 from typing import Any
 
 from rich import box
+from rich.markup import escape
 from rich.table import Table
 
 from aolink.estimation import Estimate
 from aolink.estimation.score import Consistency, Score, Scorer
 from aolink.recording.reader import Recording
 from aolink.tables.json import without_nan
+
+_MOST_REASONS = 3
+"""How many reasons of one estimator the table shows."""
 
 
 def score_all(recording: Recording, estimates: Mapping[str, Iterable[Estimate]]) -> dict[str, Score]:
@@ -54,10 +58,29 @@ def scores(by_name: Mapping[str, Score]) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     for name, each in by_name.items():
         table.add_row(name, *(column(each) for column in columns.values()))
-    table.caption = (
-        "RMSE of states: norm over the states. ! outside the 95 % bounds of a consistent filter:\n" + _bounds(by_name)
-    )
+    lines = unused_lines(by_name)
+    if bounds := _bounds(by_name):
+        norm = "RMSE of states: norm over the states. " if counted else ""
+        lines = [f"{norm}! outside the 95 % bounds of a consistent filter:", bounds, *lines]
+    table.caption = escape("\n".join(lines))
     return table
+
+
+def unused_lines(by_name: Mapping[str, Score]) -> list[str]:
+    """How many exposures each estimator could not use and why, in words; empty where all used all."""
+    lines = []
+    for name, each in by_name.items():
+        for unused in each.unused[:_MOST_REASONS]:
+            what = unused.status.lower().replace("_", " ")
+            first = "" if unused.exposures == 1 else ", the first"
+            lines.append(
+                f"{name}: {unused.exposures} of {each.estimated} exposures {what}: {unused.reason}"
+                f" (frame {unused.first_frame}{first})"
+            )
+        more = len(each.unused) - _MOST_REASONS
+        if more > 0:
+            lines.append(f"{name}: and {more} other reasons, which --json has")
+    return lines
 
 
 def _consistency(value: Consistency) -> str:

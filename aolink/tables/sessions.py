@@ -12,6 +12,7 @@ from rich.table import Table
 from aolink.recording import schemas_pb2 as pb
 from aolink.session import EstimatorReport, Report
 from aolink.tables.json import without_nan
+from aolink.tables.scores import unused_lines
 
 if TYPE_CHECKING:
     from aolink.demo import DemoResult
@@ -116,6 +117,7 @@ def deblurred(summary: Summary) -> dict[str, Any]:
     blurred, restored = summary.psnr_blurred, summary.psnr_restored
     return {
         "exposures": summary.exposures,
+        "exposures_measured": summary.motion.result().measured,
         "scenes_restored": summary.scenes,
         "missing": dict(summary.reasons),
         "psnr_blurred_db": float(np.mean(blurred)) if blurred else None,
@@ -134,6 +136,7 @@ def deblurred_lines(summary: Summary, estimator: str, method: str) -> list[str]:
             f"PSNR of the scene: {facts['psnr_blurred_db']:.1f} dB as it came (its shift forgiven),"
             f" {facts['psnr_restored_db']:.1f} dB restored (at least {facts['psnr_restored_least_db']:.1f})"
         )
+    lines += unused_lines({estimator: summary.motion.result()})
     return lines + [f"{count} not restored: {reason}" for reason, count in summary.reasons.items()]
 
 

@@ -55,9 +55,13 @@ def centroid(sensor: Sensor, profile: FloatArray) -> float:
 
 
 def density_top(sensor: Sensor, exposures: Sequence[Exposure]) -> float:
-    """Density at the top of the profile's plot: the brightest pixel of all but the most extreme exposures."""
+    """Density at the top of the profile's plot: the brightest pixel of all but the most extreme exposures.
+
+    Where all exposures are dark, the peak of a resting spot: the plot has the scale that it has with light.
+    """
     brightest = [np.nanmax(density(sensor, e)) for e in exposures if e.mask.any()]
-    return float(np.percentile(brightest, 98)) if brightest else 1.0
+    top = float(np.percentile(brightest, 98)) if brightest else 0.0
+    return top if top > pixel_noise_sd(sensor) else sensor.peak_density
 
 
 def log_frames(stream: rr.RecordingStream, timebase: Timebase, exposures: Sequence[Exposure]) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import rerun as rr
 
+from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
 from aolink.exposure import Exposure
@@ -59,6 +60,11 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
     """Send everything in a recording to a stream; tells what there was, for the layout."""
     rig = recording.rig
     exposures = list(recording.exposures())
+    if strange := [e for e in exposures if e.pixels.shape != rig.sensor.shape]:
+        raise ViewerError(
+            f"frame {strange[0].frame_id} of {recording.path} has {strange[0].pixels.shape} pixels, the sensor of the"
+            f" rig file in it {rig.sensor.shape}: it was recorded with another rig file"
+        )
     timebase = Timebase.of(rig, exposures)
     truths = {e.frame_id: e.truth for e in exposures if e.truth is not None}
     names = by_rank(list(recording.estimators))

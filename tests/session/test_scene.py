@@ -263,9 +263,13 @@ def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sha
         # Two threads add up in another order than one, and the solver stops at 1e-4 of what it began with.
         np.testing.assert_allclose(a.scene, b.scene, atol=1e-4)
     assert Recording(again).counts[wanted[0]] == EXPOSURES
-    write_reestimated(Recording(sharp), ["o3"], tmp_path / "new.mcap")  # restored with what is no longer in it
-    assert not set(wanted) & set(Recording(tmp_path / "new.mcap").counts)
-    assert Recording(tmp_path / "new.mcap").true_scene is not None
+    new = tmp_path / "new.mcap"
+    write_reestimated(Recording(sharp), ["o3"], new)
+    assert data(Recording(new), *wanted) == data(Recording(sharp), *wanted)
+    # Estimated anew, the path is no longer the one that the pictures were restored with.
+    write_reestimated(Recording(sharp), ["moments"], new, overwrite=True)
+    assert not set(wanted) & set(Recording(new).counts)
+    assert Recording(new).true_scene is not None
 
 
 def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:

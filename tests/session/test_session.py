@@ -17,6 +17,7 @@ import aolink
 from aolink.demo import simulated_rig
 from aolink.estimation import Driver, run, score
 from aolink.recording import topics
+from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import (
     first_difference,
@@ -26,7 +27,7 @@ from aolink.recording.reestimate import (
     scored_and_compared,
     write_reestimated,
 )
-from aolink.rig import load_rig
+from aolink.rig import load_rig, parse_rig
 from aolink.session import Report, open_devices, record
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
@@ -83,7 +84,23 @@ def test_writing_the_same_estimates_again_gives_the_same_bytes(recorded: Session
     assert again.read_bytes() == (tmp_path / "third.mcap").read_bytes()
     ours, theirs = Recording(again), Recording(recorded.path)
     assert first_difference(ours.estimates("o3"), theirs.estimates("o3")) is None
-    assert ours.estimators == ["o1", "o3"]
+    assert sorted(ours.estimators) == sorted(ESTIMATORS)
+    assert ours.metadata["estimators"] == "open-loop o2 o1 o3"
+
+
+def test_a_copy_keeps_the_estimates_that_were_there(recorded: Session, tmp_path: Path) -> None:
+    """Unless it is to have the new ones only, or they are of another rig, with which they could not be read."""
+    source, copy = Recording(recorded.path), tmp_path / "copy.mcap"
+    write_reestimated(source, ["o1"], copy)
+    found = compare(source, Recording(copy))
+    assert all(each.same for each in found.values()), found
+    write_reestimated(source, ["moments"], copy, overwrite=True)
+    assert sorted(Recording(copy).estimators) == sorted([*ESTIMATORS, "moments"])
+    write_reestimated(source, ["o1"], copy, only=True, overwrite=True)
+    assert Recording(copy).estimators == ["o1"]
+    other = Recording(recorded.path, rig=parse_rig(source.rig.toml.replace("process_noise = 10", "process_noise = 3")))
+    write_reestimated(other, ["o1"], copy, overwrite=True)
+    assert Recording(copy).estimators == ["o1"]
 
 
 def test_the_same_seed_gives_the_same_recording_byte_for_byte(recorded: Session, tmp_path: Path) -> None:
