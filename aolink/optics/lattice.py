@@ -13,7 +13,17 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from aolink.errors import FrameError
-from aolink.optics.maxima import Maxima, find_maxima, flatten, likeness, maxima_above, refine, smoothed_noise, spot_sd, spread
+from aolink.optics.maxima import (
+    Maxima,
+    find_maxima,
+    flatten,
+    likeness,
+    maxima_above,
+    noise_map,
+    refine,
+    smoothed_noise,
+    spot_sd,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -21,6 +31,8 @@ BoolArray = NDArray[np.bool_]
 Kind = Literal["square", "hexagonal"]
 
 _FEWEST_SPOTS = 7
+# Of which so many must hang together for the others to be found from there.
+_SEED = 4
 # How far from its node a spot may be to belong to it, in pitches.
 _NEAR = 0.25
 # Steps from a node to half of its neighbours, as (columns, rows); the other half are their opposites. The first
@@ -38,6 +50,8 @@ _ROUNDS = 12
 _ALIKE = 0.15
 # A maximum less bright than this share of the spots' median is a ring or a ghost, no rival that must be explained.
 _RIVAL = 0.25
+# A lattice that explains so much of the maxima is taken at once; otherwise other scales may show a better one.
+_CONVINCING = 0.8
 # From so many spots on, the lattice is followed where it bends, so many pitches from spots that are known.
 _MANY_SPOTS, _REACH = 40, 2.5
 # How far the two steps may be from those of a regular lattice, and a frame's from its reference's, in pitches.
@@ -109,6 +123,15 @@ class Lattice:
         return self.spots - self.node_positions(self.nodes)
 
     @property
+    def lenslet(self) -> FloatArray:
+        """Points that fill the cell about a node evenly, from the node, pixels, (144, 2): a square or a hexagon."""
+        part = (np.arange(12) + 0.5) / 12
+        points = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) @ self.steps
+        corners = np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) @ self.steps
+        nearest = np.linalg.norm(points[:, None] - corners, axis=-1).argmin(axis=1)
+        return np.asarray(points - corners[nearest])
+
+    @property
     def neighbours(self) -> IntArray:
         """Pairs of spots that are side by side, as their numbers, (pairs, 2)."""
         return _side_by_side(self.nodes, _MOVES[self.kind])
@@ -134,43 +157,50 @@ def find_lattice(frame: NDArray[np.generic]) -> Lattice:
     """
     flat, background = flatten(frame)
     most, rejected = 0, ""
+    best: Lattice | None = None
+    best_share = 0.0
     for maxima in find_maxima(flat):
         most = max(most, len(maxima.places))
         if len(maxima.places) < _FEWEST_SPOTS:
             continue
         try:
-            lattice = _explain(maxima, float(np.median(background)))
+            share, lattice = _explain(maxima, float(np.median(background)))
             if maxima.dense:
                 _refuse_veiled(lattice, flat, background)
         except FrameError as error:
             rejected = rejected or str(error)
             continue
-        lattice = _look_again(lattice, flat)
-        return _fit(lattice.kind, refine(flat, lattice.spots, lattice.pitch), lattice.nodes, lattice.background)
-    raise FrameError(
-        rejected
-        or f"no usable spots: {most} stand out of the noise, a grid needs {_FEWEST_SPOTS};"
-        " expose longer, or look whether the spots are in focus"
-    )
-
-
-def _explain(maxima: Maxima, background: float) -> Lattice:
-    """The lattice that explains most of the maxima; its spots are where the maxima are."""
-    followed = [_follow(kind, steps, maxima, background) for kind, steps in _guesses(maxima.places)]
-    explained = [len(lattice.spots) if lattice else 0 for lattice in followed]
-    best = followed[int(np.argmax(explained))] if explained else None
+        if share > best_share:
+            best_share, best = share, lattice
+        if share > _CONVINCING:
+            break
     if best is None:
         raise FrameError(
-            f"no grid: {len(maxima.places)} spots, and no {_FEWEST_SPOTS} of them hang together in steps of a square or"
-            " hexagonal grid; is this a Shack-Hartmann frame?"
+            rejected
+            or f"no usable spots: {most} stand out of the noise, a grid needs {_FEWEST_SPOTS};"
+            " expose longer, or look whether the spots are in focus"
+        )
+    lattice = _look_again(best, flat)
+    return _fit(lattice.kind, refine(flat, lattice.spots, lattice.pitch), lattice.nodes, lattice.background)
+
+
+def _explain(maxima: Maxima, background: float) -> tuple[float, Lattice]:
+    """The lattice that explains most of the maxima, which are its spots, and their share among those as bright."""
+    followed = [_follow(kind, steps, maxima, background) for kind, steps in _guesses(maxima.places)]
+    best = max((lattice for lattice in followed if lattice), key=lambda each: len(each.spots), default=None)
+    if best is None:
+        raise FrameError(
+            f"no grid: {len(maxima.places)} spots, and too few of them hang together in steps of a square or hexagonal"
+            " grid; is this a Shack-Hartmann frame?"
         )
     heights = maxima.heights[cKDTree(maxima.places).query(best.spots)[1]]
     rivals = int((maxima.heights > _RIVAL * np.median(heights)).sum())
-    if len(best.spots) < rivals / 2:
+    share = len(best.spots) / max(rivals, len(best.spots))
+    if share < 0.5:
         raise FrameError(
             f"no grid: of {rivals} spots only {len(best.spots)} lie on one; is this a Shack-Hartmann frame?"
         )
-    return best
+    return share, best
 
 
 def _guesses(places: FloatArray) -> list[tuple[Kind, FloatArray]]:
@@ -225,7 +255,7 @@ def _regular(lattice: Lattice) -> bool:
 def _follow(kind: Kind, steps: FloatArray, maxima: Maxima, background: float) -> Lattice | None:
     """All maxima on the lattice with about these steps, or None where too few hang together."""
     group, nodes = _walk(maxima.places, _MOVES[kind], steps)
-    if len(group) < _FEWEST_SPOTS or np.linalg.matrix_rank(nodes - nodes[0]) < 2:
+    if len(group) < _SEED or np.linalg.matrix_rank(nodes - nodes[0]) < 2:
         return None
     return _grow(_fit(kind, maxima.places[group], nodes, background), maxima)
 
@@ -236,7 +266,7 @@ def _grow(lattice: Lattice, maxima: Maxima) -> Lattice | None:
         # From the spots that are known the lattice reaches as far again: further out its nodes are not known yet.
         middle = lattice.spots.mean(axis=0)
         extent = np.linalg.norm(lattice.spots - middle, axis=1).max()
-        reached = np.linalg.norm(maxima.places - middle, axis=1) < 2 * extent
+        reached = np.asarray(np.linalg.norm(maxima.places - middle, axis=1) < 2 * extent)
         before, fine = lattice, (maxima.places - lattice.origin) @ np.linalg.inv(lattice.steps)
         found = _assign(lattice, maxima, fine, reached)
         if found is None or not _regular(found):
@@ -255,7 +285,7 @@ def _bend(lattice: Lattice, maxima: Maxima) -> Lattice:
     for _ in range(_ROUNDS):
         before, spots = lattice, lattice.spots
         bend = np.linalg.lstsq(_cubic(spots, spots), lattice.nodes, rcond=None)[0]
-        reached = cKDTree(spots).query(maxima.places)[0] < _REACH * lattice.pitch
+        reached = np.asarray(cKDTree(spots).query(maxima.places)[0] < _REACH * lattice.pitch)
         found = _assign(lattice, maxima, _cubic(maxima.places, spots) @ bend, reached)
         if found is None or len(found.spots) < len(lattice.spots):
             return before
@@ -287,15 +317,17 @@ def _look_again(lattice: Lattice, flat: FloatArray) -> Lattice:
     """The lattice with its fainter spots, where it bends as well, and without what has only come near a node.
 
     The frame is smoothed as suits the spots, whose width is known now, and maxima stand out of the noise far
-    from all spots, if the frame has such a place. Those that are not of the largest group yet must have its spots' shape.
+    from all spots, if the frame has such a place. Those that are not of the largest group must have its spots' shape.
     """
     scale = max(spot_sd(flat, lattice.spots, lattice.pitch) / 2, 0.75)
     smooth = ndimage.gaussian_filter(flat, scale)
     dark = np.ones(flat.shape, dtype=np.bool_)
     dark[tuple(np.rint(lattice.spots).astype(np.int64).T[::-1])] = False
     dark = ndimage.distance_transform_edt(dark) > _DARK * lattice.pitch
-    noise = spread(smooth[dark]) if dark.mean() > _DARKEST else smoothed_noise(flat, scale)
-    maxima = maxima_above(smooth, scale, noise)
+    if dark.mean() > _DARKEST:
+        maxima = maxima_above(smooth, scale, noise_map(smooth, dark), float(np.median(smooth[dark])))
+    else:
+        maxima = maxima_above(smooth, scale, smoothed_noise(flat, scale), float(np.quantile(smooth, 0.25)))
     label = _groups(lattice.nodes, _MOVES[lattice.kind])
     known = lattice.spots[label == np.bincount(label).argmax()]
     good = (likeness(flat, maxima.places, known, lattice.pitch) > _SHAPE) | (

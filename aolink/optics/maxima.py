@@ -26,6 +26,8 @@ _TINY = float(np.finfo(np.float64).tiny)
 _BRIGHT = 7
 # Background: medians of blocks of so many pixels.
 _BLOCK = 32
+# Noise is measured in so many parts along each side of a frame, from so many dark pixels at least.
+_PARTS, _FEWEST_DARK = 4, 300
 # Standard deviations of the Gaussians that frames are smoothed by, pixels, the usual spots' first.
 _SCALES = (1.5, 3.0, 6.0, 0.75)
 
@@ -60,7 +62,9 @@ def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
     if not np.isfinite(counts).all():
         raise FrameError(f"{int((~np.isfinite(counts)).sum())} pixels are not numbers")
     if counts.min() == counts.max():
-        raise FrameError(f"no usable spots: every pixel is {counts.flat[0]:g}; look whether the camera is saturated or dark")
+        raise FrameError(
+            f"no usable spots: every pixel is {counts.flat[0]:g}; look whether the camera is saturated or dark"
+        )
     rows, columns = (max(1, n // _BLOCK) for n in counts.shape)
     blocks = [[np.median(part) for part in np.array_split(strip, columns, 1)] for strip in np.array_split(counts, rows)]
     smooth = ndimage.zoom(
@@ -87,21 +91,42 @@ def find_maxima(flat: FloatArray) -> Iterator[Maxima]:
         wide = spread(smooth)
         narrow = smoothed_noise(flat, scale)
         for noise in (wide, narrow) if narrow < wide / 2 else (wide,):
-            yield maxima_above(smooth, scale, noise, dense=noise < wide)
+            dense = noise < wide
+            yield maxima_above(smooth, scale, noise, float(np.quantile(smooth, 0.25 if dense else 0.5)), dense=dense)
 
 
 def smoothed_noise(flat: FloatArray, scale: float) -> float:
-    """What a Gaussian of sd ``scale`` leaves of noise that is independent from pixel to pixel, by second differences."""
+    """What smoothing by a Gaussian of sd ``scale`` leaves of the noise, if pixels' noises are independent.
+
+    The pixels' noise is told by their second differences along both axes.
+    """
     fine = np.abs(np.diff(np.diff(flat, 2, axis=0), 2, axis=1))
     # A quarter of a normal variable's values lie within .3186 sd; there are fewer spots among them than in the half.
     return float(np.quantile(fine, 0.25)) / (0.3186 * 6) / (2 * math.sqrt(math.pi) * scale)
 
 
-def maxima_above(smooth: FloatArray, scale: float, noise: float, *, dense: bool = False) -> Maxima:
-    """Maxima of a frame that a Gaussian of sd ``scale`` has smoothed, far above the noise that it has then."""
+def noise_map(smooth: FloatArray, dark: NDArray[np.bool_]) -> FloatArray:
+    """Standard deviation of a frame's dark pixels about each pixel, (rows, columns): noise grows with stray light."""
+    noise = np.full(smooth.shape, spread(smooth[dark]))
+    for rows in np.array_split(np.arange(smooth.shape[0]), _PARTS):
+        for columns in np.array_split(np.arange(smooth.shape[1]), _PARTS):
+            part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+            if dark[part].sum() > _FEWEST_DARK:
+                noise[part] = spread(smooth[part][dark[part]])
+    return noise
+
+
+def maxima_above(
+    smooth: FloatArray, scale: float, noise: FloatArray | float, dark: float, *, dense: bool = False
+) -> Maxima:
+    """Maxima of a frame that a Gaussian of sd ``scale`` has smoothed, far above the noise that it has then.
+
+    ``dark`` is the smoothed frame's level without spots, which is above zero where a camera cuts its noise off below.
+    """
+    smooth = smooth - dark
     at_top = smooth == ndimage.maximum_filter(smooth, 2 * math.ceil(2 * scale) + 1)
     heights = np.sort(smooth[at_top])
-    threshold = max(_SIGNIFICANCE * noise, _FAINTEST * float(heights[-min(_BRIGHT, len(heights))]))
+    threshold = np.maximum(_SIGNIFICANCE * noise, _FAINTEST * heights[-min(_BRIGHT, len(heights))])
     # A saturated spot's top is flat: its pixels are one maximum.
     label, n = ndimage.label(at_top & (smooth > threshold), np.ones((3, 3)))
     y, x = np.nonzero(label)
