@@ -8,7 +8,8 @@ from scipy import ndimage
 
 from aolink.errors import FrameError
 from aolink.frame_file import read_frame
-from aolink.optics.lattice import cut_windows, find_lattice, flatten
+from aolink.optics.lattice import find_lattice
+from aolink.optics.maxima import cut_windows, flatten
 from aolink.slopes import measure_files, measure_slopes
 
 

@@ -31,7 +31,9 @@ def centre_of_gravity(windows: FloatArray, threshold: FloatArray | float = 0.0) 
     return np.stack([x, y], axis=1) / light[:, None]
 
 
-def weighted_centroid(windows: FloatArray, weight_sd: float, iterations: int = 20) -> FloatArray:
+def weighted_centroid(
+    windows: FloatArray, weight_sd: float, iterations: int = 20, start: FloatArray | None = None
+) -> FloatArray:
     """Centre of gravity under a Gaussian weight that is moved to where it was found, (n, 2).
 
     The mean under a weight at distance d from a Gaussian spot lies at a share of d; moved to the end of that, the
@@ -41,11 +43,13 @@ def weighted_centroid(windows: FloatArray, weight_sd: float, iterations: int = 2
     ----------
     weight_sd:
         Standard deviation of the weight, pixels.
+    start:
+        Where the weight is at first, (n, 2); None: at each window's brightest pixel.
     """
     rows, columns = windows.shape[1:]
     x, y = np.arange(columns), np.arange(rows)
     brightest = windows.reshape(len(windows), -1).argmax(axis=1)
-    place = np.stack([brightest % columns, brightest // columns], axis=1).astype(np.float64)
+    place = np.stack([brightest % columns, brightest // columns], axis=1).astype(np.float64) if start is None else start
     for _ in range(iterations):
         across = np.exp(-(((x - place[:, :1]) / weight_sd) ** 2) / 2)
         along = np.exp(-(((y - place[:, 1:]) / weight_sd) ** 2) / 2)

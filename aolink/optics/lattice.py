@@ -1,9 +1,10 @@
-"""The lattice of spots on a frame, found without knowing anything of it: spots, pitch, turn, which are missing."""
+"""The lattice of spots on a frame, found without knowing anything of it: kind, pitch, turn, which spots are missing."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,29 +13,67 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from aolink.errors import FrameError
-from aolink.optics.centroid import weighted_centroid
+from aolink.optics.maxima import (
+    Maxima,
+    find_maxima,
+    flatten,
+    likeness,
+    maxima_above,
+    noise_map,
+    refine,
+    smoothed_noise,
+    spot_sd,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+Kind = Literal["square", "hexagonal"]
 
-# A spot is a maximum that stands out so many times above the noise of the smoothed frame.
-_SIGNIFICANCE = 8.0
-_FEWEST_SPOTS = 9
-# A pixel so many times as bright as its neighbours is hot: a spot of sd 0.6 pixels or more makes none such.
-_HOT = 4.0
+_FEWEST_SPOTS = 7
+# Of which so many must hang together for the others to be found from there.
+_SEED = 4
 # How far from its node a spot may be to belong to it, in pitches.
 _NEAR = 0.25
-# Background: medians of blocks of so many pixels.
-_BLOCK = 32
+# Steps from a node to half of its neighbours, as (columns, rows); the other half are their opposites. The first
+# step of a hexagonal lattice goes along the row and the second one 60 degrees from it.
+_MOVES: dict[Kind, IntArray] = {
+    "square": np.array([(1, 0), (0, 1)]),
+    "hexagonal": np.array([(1, 0), (0, 1), (-1, 1)]),
+}
+_ANGLE: dict[Kind, float] = {"square": math.pi / 2, "hexagonal": math.pi / 3}
+# Neighbours whose differences are looked at, of so many spots; steps taken from them, and guesses followed up.
+_NEIGHBOURS, _ASKED, _STEPS, _GUESSES = 24, 400, 16, 6
+# How often a lattice is fitted anew to the spots that lie on it, each time further out.
+_ROUNDS = 12
+# A guessed step and a difference of two spots are alike if they differ by less than this share of the step.
+_ALIKE = 0.15
+# A maximum less bright than this share of the spots' median is a ring or a ghost, no rival that must be explained.
+_RIVAL = 0.25
+# A lattice that explains so much of the maxima is taken at once; otherwise other scales may show a better one.
+_CONVINCING = 0.8
+# From so many spots on, the lattice is followed where it bends, so many pitches from spots that are known.
+_MANY_SPOTS, _REACH = 40, 2.5
+# How far the two steps may be from those of a regular lattice, and a frame's from its reference's, in pitches.
+_IRREGULAR, _FOREIGN = 0.2, 0.25
+# What is fainter than this share of the brightest spot beside it is that one's ring; and light that is apart from the
+# largest group of spots is a spot if its shape correlates so well with theirs.
+_RING, _SHAPE = 0.02, 0.7
+# How many pitches from any spot that is known it is dark.
+_DARK = 1.5
+# Spots that are lower than this share of the light between them, over the darkest part of the frame, are out of focus.
+_VEILED, _DARKEST = 0.5, 0.05
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lattice:
     """Spots of a frame and the lattice that fits them: node (i, j) lies at origin + i column_step + j row_step.
 
-    Positions are (x, y) in pixels, 0 is the middle of the first one.
+    Positions are (x, y) in pixels, 0 is the middle of the first one. On a hexagonal lattice the two steps are 60
+    degrees apart, so that each row begins half a pitch further on than the one before.
     """
 
+    kind: Kind
     origin: FloatArray
     column_step: FloatArray
     """From a spot to the next one along the row, (2,)."""
@@ -48,9 +87,14 @@ class Lattice:
     """Median background of the frame, counts."""
 
     @property
+    def steps(self) -> FloatArray:
+        """Column step and row step, (2, 2)."""
+        return np.stack([self.column_step, self.row_step])
+
+    @property
     def pitch(self) -> float:
-        """Side of a cell, the root of its area, pixels."""
-        return math.sqrt(abs(float(np.linalg.det(np.stack([self.column_step, self.row_step])))))
+        """From a spot to the next one, pixels: of the regular lattice whose cells are as large."""
+        return _pitch(self.kind, self.steps)
 
     @property
     def turn_deg(self) -> float:
@@ -63,7 +107,7 @@ class Lattice:
         return int(self.nodes[:, 1].max()) + 1, int(self.nodes[:, 0].max()) + 1
 
     @property
-    def lit(self) -> NDArray[np.bool_]:
+    def lit(self) -> BoolArray:
         """Which nodes have a spot, `shape`."""
         lit = np.zeros(self.shape, dtype=np.bool_)
         lit[self.nodes[:, 1], self.nodes[:, 0]] = True
@@ -71,27 +115,40 @@ class Lattice:
 
     def node_positions(self, nodes: IntArray) -> FloatArray:
         """Where the lattice has nodes (..., 2), pixels."""
-        return np.asarray(self.origin + nodes @ np.stack([self.column_step, self.row_step]))
+        return np.asarray(self.origin + nodes @ self.steps)
 
     @property
     def displacements(self) -> FloatArray:
         """From each spot's node to the spot, pixels, (n, 2)."""
         return self.spots - self.node_positions(self.nodes)
 
+    @property
+    def lenslet(self) -> FloatArray:
+        """Points that fill the cell about a node evenly, from the node, pixels, (144, 2): a square or a hexagon."""
+        part = (np.arange(12) + 0.5) / 12
+        points = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) @ self.steps
+        corners = np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) @ self.steps
+        nearest = np.linalg.norm(points[:, None] - corners, axis=-1).argmin(axis=1)
+        return np.asarray(points - corners[nearest])
 
-def find_lattice(frame: NDArray[np.generic], *, spot_sd: float = 1.5) -> Lattice:
-    """Find the spots of a Shack-Hartmann frame and the lattice that they lie on.
+    @property
+    def neighbours(self) -> IntArray:
+        """Pairs of spots that are side by side, as their numbers, (pairs, 2)."""
+        return _side_by_side(self.nodes, _MOVES[self.kind])
 
-    Background and single hot pixels are taken out, maxima above the noise are found, the differences between
-    neighbours tell the two steps, and from spot to neighbouring spot each gets its node; spots may be missing
-    anywhere as long as the others hang together.
+
+def find_lattice(frame: NDArray[np.generic]) -> Lattice:
+    """Find the spots of a Shack-Hartmann frame and the square or hexagonal lattice that they lie on.
+
+    Background and single hot pixels are taken out, and maxima above the noise are found. The differences between
+    neighbouring maxima suggest lattices; each one is followed from spot to spot over the largest group that hangs
+    together, and from there to all other spots that lie on its nodes. The lattice that explains most spots is taken.
+    Spots may be missing anywhere, and the groups that remain need not touch.
 
     Parameters
     ----------
     frame:
-        Counts, (rows, columns).
-    spot_sd:
-        Standard deviation of a spot, about, pixels.
+        Counts of any real type and scale, (rows, columns).
 
     Raises
     ------
@@ -99,107 +156,223 @@ def find_lattice(frame: NDArray[np.generic], *, spot_sd: float = 1.5) -> Lattice
         There are no spots, or they lie on no lattice.
     """
     flat, background = flatten(frame)
-    places = _maxima(flat, spot_sd)
-    if len(places) < _FEWEST_SPOTS:
+    most, rejected = 0, ""
+    best: Lattice | None = None
+    best_share = 0.0
+    for maxima in find_maxima(flat):
+        most = max(most, len(maxima.places))
+        if len(maxima.places) < _FEWEST_SPOTS:
+            continue
+        try:
+            share, lattice = _explain(maxima, float(np.median(background)))
+            if maxima.dense:
+                _refuse_veiled(lattice, flat, background)
+        except FrameError as error:
+            rejected = rejected or str(error)
+            continue
+        if share > best_share:
+            best_share, best = share, lattice
+        if share > _CONVINCING:
+            break
+    if best is None:
         raise FrameError(
-            f"no usable spots: {len(places)} stand out of the noise, a grid needs {_FEWEST_SPOTS};"
+            rejected
+            or f"no usable spots: {most} stand out of the noise, a grid needs {_FEWEST_SPOTS};"
             " expose longer, or look whether the spots are in focus"
         )
-    steps = _steps(places)
-    group, nodes = _walk(places, steps)
-    # Now with the steps of all spots together, and each spot where a lattice that fits them all has a node.
-    lattice = _fit(places[group], nodes, background)
-    for _ in range(3):
-        wanted = np.rint(np.linalg.solve(_frame_steps(lattice).T, (places - lattice.origin).T).T).astype(np.int64)
-        away = np.linalg.norm(places - lattice.node_positions(wanted), axis=1)
-        order = np.argsort(away)
-        order = order[away[order] < _NEAR * lattice.pitch]
-        _, first = np.unique(wanted[order], axis=0, return_index=True)
-        chosen = order[first]
-        chosen = chosen[_largest_patch(wanted[chosen])]
-        lattice = _fit(places[chosen], wanted[chosen], background)
-    if len(lattice.spots) < max(_FEWEST_SPOTS, len(places) / 2):
+    lattice = _look_again(best, flat)
+    return _fit(lattice.kind, refine(flat, lattice.spots, lattice.pitch), lattice.nodes, lattice.background)
+
+
+def _explain(maxima: Maxima, background: float) -> tuple[float, Lattice]:
+    """The lattice that explains most of the maxima, which are its spots, and their share among those as bright."""
+    followed = [_follow(kind, steps, maxima, background) for kind, steps in _guesses(maxima.places)]
+    best = max((lattice for lattice in followed if lattice), key=lambda each: len(each.spots), default=None)
+    if best is None:
         raise FrameError(
-            f"no grid: of {len(places)} spots only {len(lattice.spots)} lie on one; is this a Shack-Hartmann frame?"
+            f"no grid: {len(maxima.places)} spots, and too few of them hang together in steps of a square or hexagonal"
+            " grid; is this a Shack-Hartmann frame?"
         )
-    refined = _refine(flat, lattice, spot_sd)
-    return _fit(refined, lattice.nodes, background)
+    heights = maxima.heights[cKDTree(maxima.places).query(best.spots)[1]]
+    rivals = int((maxima.heights > _RIVAL * np.median(heights)).sum())
+    share = len(best.spots) / max(rivals, len(best.spots))
+    if share < 0.5:
+        raise FrameError(
+            f"no grid: of {rivals} spots only {len(best.spots)} lie on one; is this a Shack-Hartmann frame?"
+        )
+    return share, best
 
 
-def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, float]:
-    """A frame without its background and its isolated hot pixels, and the median background.
+def _guesses(places: FloatArray) -> list[tuple[Kind, FloatArray]]:
+    """Lattices that the differences between neighbours suggest, as kind and steps (2, 2), the likeliest first."""
+    asked = places[:: math.ceil(len(places) / _ASKED)]
+    _, near = cKDTree(places).query(asked, k=min(_NEIGHBOURS + 1, len(places)))
+    differences = (places[np.asarray(near)[:, 1:]] - asked[:, None]).reshape(-1, 2)
+    tree, length = cKDTree(differences), np.linalg.norm(differences, axis=1)
+    votes = np.asarray(tree.query_ball_point(differences, _ALIKE * length, return_length=True))
+    found: list[tuple[int, float, Kind, FloatArray]] = []
+    while len(found) < 2 * _STEPS and votes.any():
+        top = int(votes.argmax())
+        step, radius = differences[top], _ALIKE * length[top]
+        step = differences[tree.query_ball_point(step, radius)].mean(axis=0)
+        for kind, angle in _ANGLE.items():
+            pair = _pair(kind, step)
+            moves = _MOVES[kind] @ pair
+            support = int(np.min(tree.query_ball_point(moves, _ALIKE * np.linalg.norm(step), return_length=True)))
+            found.append((support, float(np.linalg.norm(step)), kind, pair))
+            # The step's likes have had their say, and so have those that only the lattice's symmetry makes different.
+            for quarter in range(round(2 * math.pi / angle)):
+                votes[tree.query_ball_point(step @ _turned(quarter * angle), radius)] = 0
+    most = max((support for support, *_ in found), default=0)
+    # Twice a step is common as well: of those with good support the shortest come first.
+    found.sort(key=lambda guess: (guess[0] < 0.6 * most, guess[1]))
+    return [(kind, pair) for support, _, kind, pair in found[:_GUESSES] if support > 0]
 
-    Raises
-    ------
-    FrameError
-        It is not a picture, or has pixels that are not numbers.
+
+def _turned(angle: float) -> FloatArray:
+    """The matrix that turns row vectors from x towards y, (2, 2)."""
+    return np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+
+
+def _pair(kind: Kind, step: FloatArray) -> FloatArray:
+    """Column step and row step of a regular lattice that has this step, the column step nearest to x, (2, 2)."""
+    angle = _ANGLE[kind]
+    column = step @ _turned(-angle * round(math.atan2(step[1], step[0]) / angle))
+    return np.stack([column, column @ _turned(angle)])
+
+
+def _pitch(kind: Kind, steps: FloatArray) -> float:
+    return math.sqrt(abs(float(np.linalg.det(steps))) / math.sin(_ANGLE[kind]))
+
+
+def _regular(lattice: Lattice) -> bool:
+    """Whether the steps are about as long and as far apart in angle as the kind has them."""
+    column, row = lattice.steps
+    ideal = column @ _turned(_ANGLE[lattice.kind])
+    return bool(np.linalg.norm(row - ideal) < _IRREGULAR * np.linalg.norm(column))
+
+
+def _follow(kind: Kind, steps: FloatArray, maxima: Maxima, background: float) -> Lattice | None:
+    """All maxima on the lattice with about these steps, or None where too few hang together."""
+    group, nodes = _walk(maxima.places, _MOVES[kind], steps)
+    if len(group) < _SEED or np.linalg.matrix_rank(nodes - nodes[0]) < 2:
+        return None
+    return _grow(_fit(kind, maxima.places[group], nodes, background), maxima)
+
+
+def _grow(lattice: Lattice, maxima: Maxima) -> Lattice | None:
+    """The lattice with all maxima that lie on it, round by round, or None where they bend it out of shape."""
+    for _ in range(_ROUNDS):
+        # From the spots that are known the lattice reaches as far again: further out its nodes are not known yet.
+        middle = lattice.spots.mean(axis=0)
+        extent = np.linalg.norm(lattice.spots - middle, axis=1).max()
+        reached = np.asarray(np.linalg.norm(maxima.places - middle, axis=1) < 2 * extent)
+        before, fine = lattice, (maxima.places - lattice.origin) @ np.linalg.inv(lattice.steps)
+        found = _assign(lattice, maxima, fine, reached)
+        if found is None or not _regular(found):
+            return None
+        lattice = found
+        if np.array_equal(before.spots, lattice.spots):
+            break
+    return lattice
+
+
+def _bend(lattice: Lattice, maxima: Maxima) -> Lattice:
+    """The lattice with the maxima that lie on it where it bends, as an aberrated wavefront makes it.
+
+    Each maximum is where its neighbourhood has a node, by a polynomial of the third degree of its place.
     """
-    if frame.ndim != 2 or min(frame.shape) < _BLOCK:
-        raise FrameError(f"a frame of {_BLOCK} x {_BLOCK} pixels or more is needed, found {frame.shape}")
-    counts = frame.astype(np.float64)
-    if not np.isfinite(counts).all():
-        raise FrameError(f"{int((~np.isfinite(counts)).sum())} pixels are not numbers")
-    rows, columns = (max(1, n // _BLOCK) for n in counts.shape)
-    blocks = [[np.median(part) for part in np.array_split(strip, columns, 1)] for strip in np.array_split(counts, rows)]
-    smooth = ndimage.zoom(
-        np.array(blocks), (counts.shape[0] / rows, counts.shape[1] / columns), order=1, mode="nearest", grid_mode=True
-    )  # fmt: skip
-    flat = counts - smooth
-    ring = np.ones((3, 3), dtype=np.bool_)
-    ring[1, 1] = False
-    # A hot pixel, or one of a pair, is far brighter than its second brightest neighbour; light through a lens is not.
-    second = ndimage.rank_filter(flat, -2, footprint=ring)
-    alone = flat - _HOT * np.maximum(second, 0) > 6 * _spread(flat)
-    around = ndimage.median_filter(flat, 3)
-    return np.where(alone, around, flat), float(np.median(smooth))
+    for _ in range(_ROUNDS):
+        before, spots = lattice, lattice.spots
+        bend = np.linalg.lstsq(_cubic(spots, spots), lattice.nodes, rcond=None)[0]
+        reached = np.asarray(cKDTree(spots).query(maxima.places)[0] < _REACH * lattice.pitch)
+        found = _assign(lattice, maxima, _cubic(maxima.places, spots) @ bend, reached)
+        if found is None or len(found.spots) < len(lattice.spots):
+            return before
+        lattice = found
+        if np.array_equal(before.spots, lattice.spots):
+            break
+    return lattice
 
 
-def _spread(values: FloatArray) -> float:
-    """Standard deviation by the median of what deviates: spots do not count."""
-    return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), 1e-12)
+def _assign(lattice: Lattice, maxima: Maxima, fine: FloatArray, reached: BoolArray) -> Lattice | None:
+    """The lattice of those maxima whose places in steps, ``fine`` (n, 2), are near a node, the brightest of each."""
+    nodes = np.rint(fine).astype(np.int64)
+    near = np.flatnonzero(reached & (np.linalg.norm((fine - nodes) @ lattice.steps, axis=1) < _NEAR * lattice.pitch))
+    near = near[np.argsort(-maxima.heights[near], kind="stable")]
+    _, first = np.unique(nodes[near], axis=0, return_index=True)
+    chosen = near[first]
+    if len(chosen) < _FEWEST_SPOTS or np.linalg.matrix_rank(nodes[chosen] - nodes[chosen[0]]) < 2:
+        return None
+    return _fit(lattice.kind, maxima.places[chosen], nodes[chosen], lattice.background)
 
 
-def _maxima(flat: FloatArray, spot_sd: float) -> FloatArray:
-    """Maxima of the smoothed frame that stand out of its noise, (n, 2) as (x, y)."""
-    smooth = ndimage.gaussian_filter(flat, spot_sd)
-    top = ndimage.maximum_filter(smooth, 2 * math.ceil(2 * spot_sd) + 1)
-    y, x = np.nonzero((smooth == top) & (smooth > _SIGNIFICANCE * _spread(smooth)))
-    return np.stack([x, y], axis=1).astype(np.float64)
+def _cubic(places: FloatArray, spots: FloatArray) -> FloatArray:
+    """Powers of x and y up to the third degree together, in units of the spots' spread, (n, 10)."""
+    x, y = ((places - spots.mean(axis=0)) / spots.std(axis=0)).T
+    return np.stack([x**p * y**q for p in range(4) for q in range(4 - p)], axis=1)
 
 
-def _steps(places: FloatArray) -> FloatArray:
-    """The two steps of the lattice, from the differences that neighbours have most often, (2, 2)."""
-    _, neighbours = cKDTree(places).query(places, k=min(9, len(places)))
-    difference = (places[np.asarray(neighbours)[:, 1:]] - places[:, None]).reshape(-1, 2)
-    difference = difference[difference[:, 0] > np.abs(difference[:, 1]) * 0.9]  # to the right
-    if len(difference) < _FEWEST_SPOTS:
-        raise FrameError(f"no grid: the {len(places)} spots have no step in common along a row")
-    length = np.linalg.norm(difference, axis=1)
-    tree = cKDTree(difference)
-    votes = np.asarray(tree.query_ball_point(difference, 0.15 * length, return_length=True))
-    # Of all steps that are common, the shortest: two lenslets' step is common as well.
-    common = np.flatnonzero(votes > 0.5 * votes.max())
-    chosen = common[length[common].argmin()]
-    along = difference[tree.query_ball_point(difference[chosen], 0.15 * length[chosen])].mean(axis=0)
-    return np.stack([along, [-along[1], along[0]]])
+def _look_again(lattice: Lattice, flat: FloatArray) -> Lattice:
+    """The lattice with its fainter spots, where it bends as well, and without what has only come near a node.
+
+    The frame is smoothed as suits the spots, whose width is known now, and maxima stand out of the noise far
+    from all spots, if the frame has such a place. Those that are not of the largest group must have its spots' shape.
+    """
+    scale = max(spot_sd(flat, lattice.spots, lattice.pitch) / 2, 0.75)
+    smooth = ndimage.gaussian_filter(flat, scale)
+    dark = np.ones(flat.shape, dtype=np.bool_)
+    dark[tuple(np.rint(lattice.spots).astype(np.int64).T[::-1])] = False
+    dark = ndimage.distance_transform_edt(dark) > _DARK * lattice.pitch
+    if dark.mean() > _DARKEST:
+        maxima = maxima_above(smooth, scale, noise_map(smooth, dark), float(np.median(smooth[dark])))
+    else:
+        maxima = maxima_above(smooth, scale, smoothed_noise(flat, scale), float(np.quantile(smooth, 0.25)))
+    label = _groups(lattice.nodes, _MOVES[lattice.kind])
+    known = lattice.spots[label == np.bincount(label).argmax()]
+    good = (likeness(flat, maxima.places, known, lattice.pitch) > _SHAPE) | (
+        cKDTree(known).query(maxima.places)[0] < lattice.pitch / 8
+    )
+    candidates = replace(maxima, places=maxima.places[good], heights=maxima.heights[good])
+    whole = _grow(lattice, candidates)
+    if whole is None:
+        return lattice
+    if len(whole.spots) >= _MANY_SPOTS:
+        whole = _bend(whole, candidates)
+    # The rings of a bright spot may reach the nodes beside it.
+    heights = ndimage.map_coordinates(smooth, whole.spots.T[::-1], order=1)
+    brightest = heights.copy()
+    for a, b in (whole.neighbours.T, whole.neighbours.T[::-1]):
+        np.maximum.at(brightest, a, heights[b])
+    kept = heights > _RING * brightest
+    return _fit(whole.kind, whole.spots[kept], whole.nodes[kept], whole.background)
 
 
-def _walk(places: FloatArray, steps: FloatArray) -> tuple[IntArray, IntArray]:
+def _refuse_veiled(lattice: Lattice, flat: FloatArray, background: FloatArray) -> None:
+    """Raise `FrameError` where blurred spots have more light between them than they stand out by."""
+    x, y = np.rint(lattice.spots).astype(np.int64).T
+    height = float(np.median(flat[y, x]))
+    veil = float(np.median(background[y, x]) - np.quantile(background, _DARKEST))
+    if height < _VEILED * veil:
+        raise FrameError(
+            f"no grid: its spots stand out by {height:.3g} from {veil:.3g} of light between them; are they in focus?"
+        )
+
+
+def _walk(places: FloatArray, moves: IntArray, steps: FloatArray) -> tuple[IntArray, IntArray]:
     """The largest group of spots that are steps apart, and each one's node."""
     tree, near = cKDTree(places), _NEAR * float(np.linalg.norm(steps[0]))
-    edges, moves = [], []
-    for move in ((1, 0), (0, 1)):
-        distance, other = tree.query(places + np.array(move) @ steps, distance_upper_bound=near)
+    edges, taken = [], []
+    for move in moves:
+        distance, other = tree.query(places + move @ steps, distance_upper_bound=near)
         found = np.flatnonzero(np.isfinite(distance))
         edges.append(np.stack([found, np.asarray(other)[found]]))
-        moves.append(np.tile(move, (len(found), 1)))
-    (a, b), step = np.concatenate(edges, axis=1), np.concatenate(moves)
+        taken.append(np.tile(move, (len(found), 1)))
+    (a, b), step = np.concatenate(edges, axis=1), np.concatenate(taken)
     n = len(places)
     graph = sparse.coo_array((np.ones(len(a)), (a, b)), shape=(n, n)).tocsr()
     _, label = connected_components(graph, directed=False)
     group = np.flatnonzero(np.asarray(label) == np.bincount(label).argmax())
-    if len(group) < _FEWEST_SPOTS:
-        raise FrameError(f"no grid: of {n} spots no more than {len(group)} hang together in steps of a lattice")
     distance, before = dijkstra(graph, directed=False, indices=group[0], unweighted=True, return_predecessors=True)
     sign = {(int(p), int(q)): move for p, q, move in zip(a, b, step, strict=True)}
     nodes = np.zeros((n, 2), dtype=np.int64)
@@ -209,52 +382,33 @@ def _walk(places: FloatArray, steps: FloatArray) -> tuple[IntArray, IntArray]:
     return group, nodes[group]
 
 
-def _largest_patch(nodes: IntArray) -> NDArray[np.bool_]:
-    """Which nodes hang together side by side: what only happens to lie near a node far away is no spot."""
-    column, row = (nodes - nodes.min(axis=0)).T
-    lit = np.zeros((row.max() + 1, column.max() + 1), dtype=np.bool_)
-    lit[row, column] = True
-    patch = np.asarray(ndimage.label(lit)[0])[row, column]
-    return np.asarray(patch == np.bincount(patch).argmax())
+def _side_by_side(nodes: IntArray, moves: IntArray) -> IntArray:
+    """Pairs of nodes that are a move apart, as their numbers, (pairs, 2)."""
+    low, high = nodes.min(axis=0) - 1, nodes.max(axis=0) + 1
+    number = np.full(high - low + 1, -1)
+    at = nodes - low
+    number[at[:, 0], at[:, 1]] = np.arange(len(nodes))
+    pairs = [np.stack([np.arange(len(nodes)), number[tuple((at + move).T)]], axis=1) for move in moves]
+    joined = np.concatenate(pairs)
+    return np.asarray(joined[joined[:, 1] >= 0])
 
 
-def _fit(spots: FloatArray, nodes: IntArray, background: float) -> Lattice:
+def _groups(nodes: IntArray, moves: IntArray) -> IntArray:
+    """The number of the group that each node hangs together with, (n,)."""
+    a, b = _side_by_side(nodes, moves).T
+    graph = sparse.coo_array((np.ones(len(a)), (a, b)), shape=(len(nodes), len(nodes)))
+    return np.asarray(connected_components(graph.tocsr(), directed=False)[1])
+
+
+def _fit(kind: Kind, spots: FloatArray, nodes: IntArray, background: float) -> Lattice:
     """The lattice that fits spots best in the sense of least squares, its nodes counted from 0."""
     order = np.lexsort((nodes[:, 0], nodes[:, 1]))
     spots, nodes = spots[order], nodes[order] - nodes.min(axis=0)
     design = np.column_stack([np.ones(len(nodes)), nodes])
     (origin, column, row), *_ = np.linalg.lstsq(design, spots, rcond=None)
     return Lattice(
-        origin=origin, column_step=column, row_step=row, nodes=nodes, spots=spots, background=background
-    )  # fmt: skip
-
-
-def _frame_steps(lattice: Lattice) -> FloatArray:
-    return np.stack([lattice.column_step, lattice.row_step])
-
-
-def _refine(flat: FloatArray, lattice: Lattice, spot_sd: float) -> FloatArray:
-    """Each spot's weighted centroid in a window about it."""
-    half = max(2, math.floor(lattice.pitch / 2 - 0.5))
-    windows, corners = cut_windows(flat, lattice.spots, half)
-    found = corners + weighted_centroid(windows, 1.5 * spot_sd)
-    moved = np.linalg.norm(found - lattice.spots, axis=1) < _NEAR * lattice.pitch
-    return np.where(moved[:, None], found, lattice.spots)
-
-
-def cut_windows(frame: FloatArray, middles: FloatArray, half: int) -> tuple[FloatArray, FloatArray]:
-    """Square windows of 2 half + 1 pixels about the pixels nearest to ``middles``, zero beyond the frame.
-
-    Returns
-    -------
-    (n, side, side), and the middle of each window's first pixel on the frame as (x, y), (n, 2).
-    """
-    side = 2 * half + 1
-    corners = np.rint(middles).astype(np.int64) - half
-    padded = np.pad(frame, side)
-    view = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
-    inside = np.clip(corners + side, 0, np.array(view.shape[1::-1]) - 1)
-    return view[inside[:, 1], inside[:, 0]].copy(), corners.astype(np.float64)
+        kind=kind, origin=origin, column_step=column, row_step=row, nodes=nodes, spots=spots, background=background
+    )
 
 
 def match(lattice: Lattice, reference: Lattice) -> Lattice:
@@ -267,19 +421,25 @@ def match(lattice: Lattice, reference: Lattice) -> Lattice:
     FrameError
         The two are not of one instrument, or share too few spots.
     """
-    if abs(lattice.pitch / reference.pitch - 1) > 0.2 or abs(lattice.turn_deg - reference.turn_deg) > 10:
+    back = np.linalg.inv(reference.steps)
+    # The two may have called different ones of a lattice's directions its rows: 44 and -46 degrees are one square grid.
+    turn = np.rint(lattice.steps @ back)
+    moved = np.linalg.norm(lattice.steps - turn @ reference.steps, axis=1) / reference.pitch
+    if lattice.kind != reference.kind or abs(np.linalg.det(turn) - 1) > 1e-9 or moved.max() > _FOREIGN:
         raise FrameError(
-            f"the frame's grid (pitch {lattice.pitch:.2f} px, turned by {lattice.turn_deg:.1f} degrees) is not the"
-            f" reference's ({reference.pitch:.2f} px, {reference.turn_deg:.1f} degrees)"
+            f"the frame's grid ({lattice.kind}, pitch {lattice.pitch:.2f} px, turned by {lattice.turn_deg:.1f} degrees)"
+            f" is not the reference's ({reference.kind}, {reference.pitch:.2f} px, {reference.turn_deg:.1f} degrees)"
         )
-    middle = lattice.spots.mean(axis=0)
-    steps = _frame_steps(reference)
-    here = np.linalg.solve(_frame_steps(lattice).T, middle - lattice.origin)
-    offset = np.rint(np.linalg.solve(steps.T, middle - reference.origin) - here).astype(np.int64)
-    nodes = lattice.nodes + offset
-    known = (nodes[:, None] == reference.nodes).all(axis=-1).any(axis=1)
+    nodes = lattice.nodes @ turn.astype(np.int64)
+    offset = np.rint(((lattice.spots - reference.origin) @ back - nodes).mean(axis=0)).astype(np.int64)
+    nodes = nodes + offset
+    rows, columns = reference.shape
+    inside = ((nodes >= 0) & (nodes < [columns, rows])).all(axis=1)
+    known = inside & reference.lit[tuple(np.where(inside[:, None], nodes, 0).T[::-1])]
     if known.sum() < _FEWEST_SPOTS:
         raise FrameError(f"the frame and the reference share {int(known.sum())} spots, {_FEWEST_SPOTS} are needed")
+    steps = np.linalg.inv(turn) @ lattice.steps
     return replace(
-        lattice, origin=lattice.origin - offset @ _frame_steps(lattice), nodes=nodes[known], spots=lattice.spots[known]
+        lattice, origin=lattice.origin - offset @ steps, column_step=steps[0], row_step=steps[1],
+        nodes=nodes[known], spots=lattice.spots[known],
     )  # fmt: skip

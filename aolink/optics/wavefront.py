@@ -7,6 +7,7 @@ wavefronts come in the unit of slopes times the lenslets' pitch.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -23,6 +24,69 @@ from aolink.optics.zernike import noll_to_orders, zernike, zernike_gradient
 FloatArray = NDArray[np.float64]
 Geometry = Literal["southwell", "fried"]
 _Equations = tuple[sparse.csr_array, sparse.csr_array, FloatArray, NDArray[np.bool_]]
+
+
+class _LeastSquares:
+    """Sparse equations differences @ values = averages @ slopes, factored once.
+
+    What they do not tell is zero: the mean of values over each part that they join, ``parts`` (points,).
+    """
+
+    def __init__(self, differences: sparse.csr_array, averages: sparse.csr_array, weights: FloatArray) -> None:
+        self._points, self._averages = differences.shape[1], averages
+        self._weighted = (differences.T * weights).tocsr()
+        self.parts = _joined(differences)
+        null = sparse.csr_array((np.ones(self._points), (self.parts, np.arange(self._points))))
+        self._unknown = null.shape[0]
+        right = sparse.vstack([null.T, sparse.csr_array((self._unknown, self._unknown))])
+        bordered = sparse.hstack([sparse.vstack([self._weighted @ differences, null]), right])
+        self._factor = splu(sparse.csc_array(bordered))
+
+    def solve(self, slopes: FloatArray) -> FloatArray:
+        """Values, (frames, points), from slopes, (frames, 2 spots)."""
+        if not np.isfinite(slopes).all():
+            raise ValueError("a lit lenslet has a slope that is not a number")
+        right = self._weighted @ (self._averages @ slopes.T)
+        right = np.concatenate([right, np.zeros((self._unknown, right.shape[1]))])
+        return np.asarray(self._factor.solve(right)[: self._points].T)
+
+
+class SpotReconstructor:
+    """Least squares of a wavefront's values at spots anywhere, sparse, factored once for a pattern of spots.
+
+    Southwell's geometry on the graph of neighbours, whatever lattice they are on: along each edge the wavefront
+    changes by the mean slope of its two spots times the way from one to the other. On a square lattice that is
+    `ZonalReconstructor`. It is exact for wavefronts of the second degree.
+
+    Parameters
+    ----------
+    positions:
+        Of the spots' lenslets, (spots, 2) as (x, y), in the length that the wavefront's unit is slopes times.
+    edges:
+        Pairs of neighbours, as numbers of spots, (edges, 2).
+    weights:
+        Of the slopes of each spot, (spots,); one where None.
+    """
+
+    def __init__(self, positions: FloatArray, edges: NDArray[np.int64], weights: FloatArray | None = None) -> None:
+        if not len(positions):
+            raise ValueError("there are no spots")
+        self._spots = len(positions)
+        self._equations = _LeastSquares(*_along_edges(positions, edges, weights))
+
+    @property
+    def parts(self) -> NDArray[np.int64]:
+        """The number, from 0, of the part that each spot hangs together with, (spots,).
+
+        Slopes do not tell the step from one part to another: the mean of each part is zero.
+        """
+        return self._equations.parts
+
+    def __call__(self, slopes: FloatArray) -> FloatArray:
+        """The wavefront, (..., spots), from slopes, (..., spots, 2)."""
+        if slopes.shape[-2:] != (self._spots, 2):
+            raise ValueError(f"slopes have shape {slopes.shape}, expected (..., {self._spots}, 2)")
+        return self._equations.solve(slopes.reshape(-1, 2 * self._spots)).reshape(slopes.shape[:-1])
 
 
 class ZonalReconstructor:
@@ -51,16 +115,8 @@ class ZonalReconstructor:
             raise ValueError("no lenslet is lit")
         self._lit = lit
         weights = np.ones(lit.shape) if weights is None else weights
-        self._differences, self._averages, w, self._where = (_southwell if geometry == "southwell" else _fried)(
-            lit, weights, pitch
-        )
-        self._weighted = (self._differences.T * w).tocsr()
-        normal = self._weighted @ self._differences
-        self._null = _null_space(self._differences)
-        parts = self._null.shape[0]
-        right = sparse.vstack([self._null.T, sparse.csr_array((parts, parts))])
-        bordered = sparse.hstack([sparse.vstack([normal, self._null]), right])
-        self._factor = splu(sparse.csc_array(bordered))
+        differences, averages, w, self._where = (_southwell if geometry == "southwell" else _fried)(lit, weights, pitch)
+        self._equations = _LeastSquares(differences, averages, w)
 
     @property
     def where(self) -> NDArray[np.bool_]:
@@ -72,32 +128,35 @@ class ZonalReconstructor:
         lead = slopes.shape[:-3]
         if slopes.shape[-3:] != (*self._lit.shape, 2):
             raise ValueError(f"slopes have shape {slopes.shape}, expected (..., {self._lit.shape}, 2)")
-        known = slopes[..., self._lit, :].reshape(-1, 2 * int(self._lit.sum()))
-        if not np.isfinite(known).all():
-            raise ValueError("a lit lenslet has a slope that is not a number")
-        right = self._weighted @ (self._averages @ known.T)
-        right = np.concatenate([right, np.zeros((self._null.shape[0], right.shape[1]))])
-        values = self._factor.solve(right)[: self._differences.shape[1]]
-        out = np.full((len(known), *self._where.shape), np.nan)
-        out[:, self._where] = values.T
+        values = self._equations.solve(slopes[..., self._lit, :].reshape(-1, 2 * int(self._lit.sum())))
+        out = np.full((len(values), *self._where.shape), np.nan)
+        out[:, self._where] = values
         return out.reshape(*lead, *self._where.shape)
 
 
+def _along_edges(
+    positions: FloatArray, edges: NDArray[np.int64], weights: FloatArray | None
+) -> tuple[sparse.csr_array, sparse.csr_array, FloatArray]:
+    """Differences of values, means of slopes along the way, and weights: differences @ values = means @ slopes."""
+    a, b = edges.T
+    row, n = np.arange(len(edges)), len(positions)
+    half_x, half_y = (positions[b] - positions[a]).T / 2
+    differences = _matrix([(row, b, 1.0), (row, a, -1.0)], (len(edges), n))
+    means = _matrix([(row, 2 * at + k, half) for k, half in ((0, half_x), (1, half_y)) for at in (a, b)],
+                    (len(edges), 2 * n))  # fmt: skip
+    w = np.ones(n) if weights is None else weights
+    return differences, means, (w[a] + w[b]) / 2
+
+
 def _southwell(lit: NDArray[np.bool_], weights: FloatArray, pitch: float) -> _Equations:
-    """Differences of values, means of slopes, weights and points: differences @ values = means @ slopes."""
+    """The equations, and which points have a value."""
     number = np.where(lit, np.cumsum(lit).reshape(lit.shape) - 1, -1)
-    first, second, axis = [], [], []
-    for along, (a, b) in enumerate([(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]):
-        both = (a >= 0) & (b >= 0)
-        first.append(a[both])
-        second.append(b[both])
-        axis.append(np.full(both.sum(), along))
-    a, b, k = np.concatenate(first), np.concatenate(second), np.concatenate(axis)
-    n, row = int(lit.sum()), np.arange(len(a))
-    differences = _matrix([(row, b, 1.0), (row, a, -1.0)], (len(a), n))
-    means = _matrix([(row, 2 * a + k, pitch / 2), (row, 2 * b + k, pitch / 2)], (len(a), 2 * n))
-    w = weights[lit]
-    return differences, means, (w[a] + w[b]) / 2, lit.copy()
+    pairs = [np.stack([a.ravel(), b.ravel()], axis=1) for a, b in (
+        (number[:, :-1], number[:, 1:]), (number[:-1], number[1:])
+    )]  # fmt: skip
+    edges = np.concatenate(pairs)
+    positions = pitch * np.argwhere(lit)[:, ::-1].astype(np.float64)
+    return *_along_edges(positions, edges[(edges >= 0).all(axis=1)], weights[lit]), lit.copy()
 
 
 def _fried(lit: NDArray[np.bool_], weights: FloatArray, pitch: float) -> _Equations:
@@ -117,24 +176,23 @@ def _fried(lit: NDArray[np.bool_], weights: FloatArray, pitch: float) -> _Equati
 
 
 def _matrix(
-    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], float]], shape: tuple[int, int]
+    parts: Sequence[tuple[NDArray[np.int64], NDArray[np.int64], FloatArray | float]], shape: tuple[int, int]
 ) -> sparse.csr_array:
     rows, columns = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-    values = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
+    values = np.concatenate([np.broadcast_to(part[2], len(part[0])) for part in parts])
     return sparse.csr_array((values, (rows, columns)), shape=shape)
 
 
-def _null_space(differences: sparse.csr_array) -> sparse.csr_array:
-    """What differences do not see: what is even over points that they join, (parts, points).
+def _joined(differences: sparse.csr_array) -> NDArray[np.int64]:
+    """The number of the part that each point is joined with, (points,).
 
-    Two points are joined where the normal matrix pulls them together.
+    Two points are joined where the normal matrix pulls them together; differences do not see what is even over a part.
     """
     joined = (differences.T @ differences).tocoo()
     pulls = joined.data < -1e-9
     n = differences.shape[1]
     graph = sparse.coo_array((joined.data[pulls], (joined.row[pulls], joined.col[pulls])), shape=(n, n))
-    parts, label = connected_components(graph.tocsr(), directed=False)
-    return sparse.csr_array((np.ones(n), (label, np.arange(n))), shape=(parts, n))
+    return np.asarray(connected_components(graph.tocsr(), directed=False)[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +221,28 @@ def zernike_modes(lenslets: Lenslets, highest: int) -> ZernikeModes:
         lambda p: np.stack([zernike_gradient(i, p / radius) / radius for i in indices], axis=-1)
     )
     return ZernikeModes(indices=indices, slopes=slopes, light=lenslets.light, radius_m=radius)
+
+
+def zernike_slopes(
+    positions: FloatArray, indices: tuple[int, ...], radius: float, within: FloatArray | None = None
+) -> FloatArray:
+    """Slopes of Zernike modes of unit rms at spots anywhere on the pupil, as `modal_reconstructor` takes them.
+
+    Parameters
+    ----------
+    positions:
+        Of the spots' lenslets from the middle of the pupil, (spots, 2).
+    radius:
+        Of the pupil, in the unit of the positions.
+    within:
+        Points that fill a lenslet evenly, from its middle, (points, 2): the slope is their mean. None: at its middle.
+
+    Returns
+    -------
+    (spots, 2, modes)
+    """
+    points = (positions[:, None] + (np.zeros((1, 2)) if within is None else within)) / radius
+    return np.stack([zernike_gradient(i, points).mean(axis=1) / radius for i in indices], axis=-1)
 
 
 def modal_reconstructor(

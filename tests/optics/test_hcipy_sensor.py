@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from aolink.optics.centroid import correlation_centroid
-from aolink.optics.lattice import cut_windows, find_lattice, flatten, match
+from aolink.optics.lattice import find_lattice, match
 from aolink.optics.lenslets import Lenslets
+from aolink.optics.maxima import cut_windows, flatten
 from aolink.optics.wavefront import ZonalReconstructor, modal_reconstructor, residual_rms, strehl, zernike_modes
 from aolink.optics.zernike import zernike, zernike_gradient
 

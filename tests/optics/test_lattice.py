@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aolink.errors import FrameError
-from aolink.optics.lattice import cut_windows, find_lattice, match
+from aolink.optics.lattice import find_lattice, match
+from aolink.optics.maxima import cut_windows
 
 
 def synthetic(pitch=18.3, turn=2.0, shape=(9, 11), missing=0.0, seed=0, noise=5.0, side=256, jitter=0.0, sd=1.5):

@@ -1,0 +1,215 @@
+"""Spots on a frame before anything is known of their lattice: background taken out, maxima found, centroids."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from aolink.errors import FrameError
+from aolink.optics.centroid import weighted_centroid
+
+FloatArray = NDArray[np.float64]
+
+# A spot is a maximum that stands out so many times above the noise of the smoothed frame.
+_SIGNIFICANCE = 8.0
+# And above this share of the brightest spots: where there is hardly any noise, what is fainter are spots' own rings.
+_FAINTEST = 2e-3
+# A pixel so many times as bright as its neighbours is hot: a spot of sd 0.6 pixels or more makes none such.
+_HOT = 4.0
+_TINY = float(np.finfo(np.float64).tiny)
+# How many bright maxima tell how bright spots are: one alone may be a cosmic ray.
+_BRIGHT = 7
+# Background: medians of blocks of so many pixels.
+_BLOCK = 32
+# Noise is measured in so many parts along each side of a frame, from so many dark pixels at least.
+_PARTS, _FEWEST_DARK = 4, 300
+# Standard deviations of the Gaussians that frames are smoothed by, pixels, the usual spots' first.
+_SCALES = (1.5, 3.0, 6.0, 0.75)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Maxima:
+    """Maxima of a smoothed frame that stand out of its noise."""
+
+    places: FloatArray
+    """(n, 2) as (x, y), pixels."""
+    heights: FloatArray
+    """Of the smoothed frame, counts above the background, (n,)."""
+    scale: float
+    """Standard deviation of the Gaussian that the frame was smoothed by, pixels."""
+    dense: bool
+    """Whether they stand out of the pixels' noise only, not of the spread of the whole frame."""
+
+
+def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
+    """A frame without its background and its isolated hot pixels, and that background, each (rows, columns).
+
+    Raises
+    ------
+    FrameError
+        It is not a picture, or has pixels that are not numbers.
+    """
+    if frame.ndim != 2 or min(frame.shape) < _BLOCK or frame.dtype.kind not in "biuf":
+        raise FrameError(
+            f"a frame of {_BLOCK} x {_BLOCK} real numbers or more is needed, found {frame.shape} of {frame.dtype}"
+        )
+    counts = frame.astype(np.float64)
+    if not np.isfinite(counts).all():
+        raise FrameError(f"{int((~np.isfinite(counts)).sum())} pixels are not numbers")
+    if counts.min() == counts.max():
+        raise FrameError(
+            f"no usable spots: every pixel is {counts.flat[0]:g}; look whether the camera is saturated or dark"
+        )
+    rows, columns = (max(1, n // _BLOCK) for n in counts.shape)
+    blocks = [[np.median(part) for part in np.array_split(strip, columns, 1)] for strip in np.array_split(counts, rows)]
+    smooth = ndimage.zoom(
+        np.array(blocks), (counts.shape[0] / rows, counts.shape[1] / columns), order=1, mode="nearest", grid_mode=True
+    )  # fmt: skip
+    flat = counts - smooth
+    ring = np.ones((3, 3), dtype=np.bool_)
+    ring[1, 1] = False
+    # A hot pixel, or one of a pair, is far brighter than its second brightest neighbour; light through a lens is not.
+    second = ndimage.rank_filter(flat, -2, footprint=ring)
+    alone = flat - _HOT * np.maximum(second, 0) > 6 * spread(flat)
+    around = ndimage.median_filter(flat, 3)
+    return np.where(alone, around, flat), smooth
+
+
+def find_maxima(flat: FloatArray) -> Iterator[Maxima]:
+    """The maxima of a flattened frame, smoothed more and less and by two estimates of its noise: one attempt each.
+
+    The spread of all pixels is the noise where most of them are dark. Where spots stand close together it is the
+    spots' own, and the noise is what second differences from pixel to pixel say.
+    """
+    for scale in _SCALES:
+        smooth = ndimage.gaussian_filter(flat, scale)
+        wide = spread(smooth)
+        narrow = smoothed_noise(flat, scale)
+        for noise in (wide, narrow) if narrow < wide / 2 else (wide,):
+            dense = noise < wide
+            yield maxima_above(smooth, scale, noise, float(np.quantile(smooth, 0.25 if dense else 0.5)), dense=dense)
+
+
+def smoothed_noise(flat: FloatArray, scale: float) -> float:
+    """What smoothing by a Gaussian of sd ``scale`` leaves of the noise, if pixels' noises are independent.
+
+    The pixels' noise is told by their second differences along both axes.
+    """
+    fine = np.abs(np.diff(np.diff(flat, 2, axis=0), 2, axis=1))
+    # A quarter of a normal variable's values lie within .3186 sd; there are fewer spots among them than in the half.
+    return float(np.quantile(fine, 0.25)) / (0.3186 * 6) / (2 * math.sqrt(math.pi) * scale)
+
+
+def noise_map(smooth: FloatArray, dark: NDArray[np.bool_]) -> FloatArray:
+    """Standard deviation of a frame's dark pixels about each pixel, (rows, columns): noise grows with stray light."""
+    noise = np.full(smooth.shape, spread(smooth[dark]))
+    for rows in np.array_split(np.arange(smooth.shape[0]), _PARTS):
+        for columns in np.array_split(np.arange(smooth.shape[1]), _PARTS):
+            part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+            if dark[part].sum() > _FEWEST_DARK:
+                noise[part] = spread(smooth[part][dark[part]])
+    return noise
+
+
+def maxima_above(
+    smooth: FloatArray, scale: float, noise: FloatArray | float, dark: float, *, dense: bool = False
+) -> Maxima:
+    """Maxima of a frame that a Gaussian of sd ``scale`` has smoothed, far above the noise that it has then.
+
+    ``dark`` is the smoothed frame's level without spots, which is above zero where a camera cuts its noise off below.
+    """
+    smooth = smooth - dark
+    at_top = smooth == ndimage.maximum_filter(smooth, 2 * math.ceil(2 * scale) + 1)
+    heights = np.sort(smooth[at_top])
+    threshold = np.maximum(_SIGNIFICANCE * noise, _FAINTEST * heights[-min(_BRIGHT, len(heights))])
+    # A saturated spot's top is flat: its pixels are one maximum.
+    label, n = ndimage.label(at_top & (smooth > threshold), np.ones((3, 3)))
+    y, x = np.nonzero(label)
+    which = label[y, x] - 1
+    size = np.maximum(np.bincount(which, minlength=n), 1)
+    places = np.stack([np.bincount(which, weights=v, minlength=n) / size for v in (x, y)], axis=1)
+    tops = np.zeros(n)
+    tops[which] = smooth[y, x]
+    return Maxima(places=places, heights=tops, scale=scale, dense=dense)
+
+
+def spread(values: FloatArray) -> float:
+    """Standard deviation by the median of what deviates: spots do not count."""
+    return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), _TINY)
+
+
+def refine(flat: FloatArray, places: FloatArray, pitch: float) -> FloatArray:
+    """Each spot's weighted centroid, (n, 2); the weight is as wide as the spots themselves prove to be.
+
+    A centroid that leaves its maximum by more than a quarter of the pitch is not taken.
+    """
+    windows, corners = cut_windows(flat, places, _half(pitch))
+    # A wider weight sees the spots beside this one.
+    weight_sd = min(1.5 * spot_sd(flat, places, pitch), pitch / 6)
+    found = corners + weighted_centroid(windows, weight_sd, start=places - corners)
+    moved = np.linalg.norm(found - places, axis=1) < pitch / 4
+    return np.where(moved[:, None], found, places)
+
+
+def likeness(flat: FloatArray, places: FloatArray, models: FloatArray, pitch: float) -> FloatArray:
+    """Correlation of what is at each place with the median spot of the models' places, (n,), 1 for the same shape."""
+    sd = spot_sd(flat, models, pitch)
+    half = min(math.ceil(3 * sd), _half(pitch))
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    weight = np.exp(-(x**2 + y**2) / (2 * (1.5 * sd) ** 2))  # little of the spots beside it
+    weight /= weight.sum()
+
+    def even(windows: FloatArray) -> FloatArray:
+        return np.asarray(windows - (weight * windows).sum(axis=(-2, -1), keepdims=True))
+
+    model, windows = even(_median_spot(cut_windows(flat, models, half)[0])), even(cut_windows(flat, places, half)[0])
+    power = (weight * windows**2).sum(axis=(1, 2)) * (weight * model**2).sum()
+    return np.asarray((weight * windows * model).sum(axis=(1, 2)) / np.sqrt(np.maximum(power, _TINY)))
+
+
+def _median_spot(windows: FloatArray) -> FloatArray:
+    """The median of windows, each of height one, (side, side)."""
+    height = windows.max(axis=(1, 2), keepdims=True)
+    return np.asarray(np.median(windows / np.where(height > 0, height, 1.0), axis=0))
+
+
+def _half(pitch: float) -> int:
+    """Pixels from the middle of a window to its edge, so that it holds one spot."""
+    return max(2, math.floor(pitch / 2 - 0.5))
+
+
+def spot_sd(flat: FloatArray, places: FloatArray, pitch: float) -> float:
+    """Standard deviation of the median spot, pixels, from half a pixel to a quarter of the pitch.
+
+    Under a Gaussian weight of sd w a Gaussian spot of sd s has the variance 1 / (1/s^2 + 1/w^2).
+    """
+    half = _half(pitch)
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    square, sd = x**2 + y**2, min(1.5, pitch / 4)
+    spot = np.maximum(_median_spot(cut_windows(flat, places, half)[0]), 0)
+    for _ in range(20):
+        weight = np.exp(-square / (2 * sd**2)) * spot
+        seen = float((weight * square).sum() / max(weight.sum(), _TINY)) / 2
+        steepness = 1 / max(seen, 0.1) - 1 / sd**2
+        sd = float(np.clip(steepness**-0.5 if steepness > 0 else np.inf, 0.5, pitch / 4))
+    return sd
+
+
+def cut_windows(frame: FloatArray, middles: FloatArray, half: int) -> tuple[FloatArray, FloatArray]:
+    """Square windows of 2 half + 1 pixels about the pixels nearest to ``middles``, zero beyond the frame.
+
+    Returns
+    -------
+    (n, side, side), and the middle of each window's first pixel on the frame as (x, y), (n, 2).
+    """
+    side = 2 * half + 1
+    corners = np.rint(middles).astype(np.int64) - half
+    padded = np.pad(frame, side)
+    view = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
+    inside = np.clip(corners + side, 0, np.array(view.shape[1::-1]) - 1)
+    return view[inside[:, 1], inside[:, 0]].copy(), corners.astype(np.float64)
