@@ -1,4 +1,4 @@
-"""A rig in real time on a clock that is simulated: sessions with latency, cuts and hold-ups, to the nanosecond the same.
+"""A rig in real time on a simulated clock: sessions with latency, cuts and hold-ups, the same every time.
 
 Session, protocol and rig are the real ones, bytes and packets too; only the clock and the line between them are not.
 """
@@ -14,6 +14,8 @@ from pathlib import Path
 from aolink.devices.native import NativeCamera, NativeMirror, identify
 from aolink.estimation import Driver
 from aolink.exposure import Exposure
+from aolink.recording import topics
+from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig
 from aolink.session.loop import Inputs, SessionLoop
@@ -25,7 +27,7 @@ from aolink.wire.hub import Hub
 from aolink.wire.link import Link, Received
 
 _EPOCH_NS = 1_767_225_600_000_000_000
-_TRUTH_STEPS = 1000
+_TRUTH_STEPS = 200
 _TURN_NS = 20_000
 """What the host takes for one turn of its loop."""
 
@@ -158,9 +160,12 @@ class Run:
     path: Path
     exposures: list[Exposure]
     """As they were made live."""
-    first_step: int = -1
-    """Of the session."""
     error: Exception | None = None
+
+    @property
+    def first_step(self) -> int:
+        """Of the session."""
+        return next(each.message.first_step for each in Recording(self.path).messages(topics.COMMAND))  # type: ignore[attr-defined, no-any-return]
 
     @property
     def report(self) -> Report:

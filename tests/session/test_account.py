@@ -1,0 +1,245 @@
+"""The account of commands: each commanded step ends exactly once, whatever the line does; the watchdog's latch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.errors import DeviceError
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.rig import Rig, load_rig, parse_rig
+from aolink.session.report import Report
+from aolink.simulation import devices
+from aolink.tables import recording_facts
+from aolink.wire import messages_pb2 as pb
+from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
+
+RIG = load_rig("section-vi")
+
+
+def rig_with(mirror: str = "", **faults: float) -> Rig:
+    text = RIG.toml.replace("block_steps = 50", f"block_steps = 50\n{mirror}")
+    return parse_rig(text + "\n[simulation.faults]\n" + "\n".join(f"{k} = {v}" for k, v in faults.items()))
+
+
+def ended(report: Report) -> int:
+    """Commanded steps that have ended."""
+    return (
+        report.steps_applied + report.steps_superseded + report.steps_late + report.steps_refused
+        + report.steps_not_reported
+    )  # fmt: skip
+
+
+def check_account(run: Run) -> None:
+    """The sums are exact, and what is said to be applied was applied."""
+    report, held = run.report, run.hub.truth()
+    assert ended(report) == report.steps_commanded
+    blocks = [each.message for each in Recording(run.path).messages(topics.COMMAND)]
+    really = sum(
+        held.get(step, (0, 0))[0] == block.block_id  # type: ignore[attr-defined]
+        for block in blocks
+        for step in range(block.first_step, block.first_step + block.n_steps)  # type: ignore[attr-defined]
+    )
+    assert report.steps_commanded == sum(block.n_steps for block in blocks)  # type: ignore[attr-defined]
+    assert report.steps_applied <= really <= report.steps_applied + report.steps_not_reported
+    # In the recording each step is reported, or said not to be, once.
+    ends = [each.message for each in Recording(run.path).messages(topics.APPLIED)]
+    steps = [
+        step
+        for m in ends
+        if m.source != pb.Applied.AWAITED  # type: ignore[attr-defined]
+        for step in range(m.first_step, m.first_step + m.n_steps)  # type: ignore[attr-defined]
+    ]
+    assert len(steps) == len(set(steps))
+
+
+def recorded_steps(run: Run, source: pb.Applied.Source) -> set[int]:
+    ends = [each.message for each in Recording(run.path).messages(topics.APPLIED)]
+    return {
+        step
+        for m in ends
+        if m.source == source  # type: ignore[attr-defined]
+        for step in range(m.first_step, m.first_step + m.n_steps)  # type: ignore[attr-defined]
+    }
+
+
+def log_of(run: Run) -> list[str]:
+    return [each.message.message for each in Recording(run.path).messages(topics.LOG)]  # type: ignore[attr-defined]
+
+
+def check_live_is_recorded(run: Run) -> None:
+    """The exposures of the recording are those that were made live."""
+    for live, again in zip(run.exposures, Recording(run.path).exposures(), strict=True):
+        assert (live.frame_id, live.inputs_assumed) == (again.frame_id, again.inputs_assumed)
+        assert np.array_equal(live.inputs, again.inputs)
+        assert np.array_equal(live.lead_inputs, again.lead_inputs)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {},
+        {"bit_error_rate": 1e-6},
+        {"bit_error_rate": 1e-5},
+        {"bit_error_rate": 1e-4},
+        {"bit_error_rate": 3e-4},
+        {"bit_error_rate": 1e-3},
+        {"packet_loss_rate": 0.1, "command_loss_rate": 0.1, "duplicate_rate": 0.1, "bit_flip_rate": 0.1},
+        {"packet_loss_rate": 0.4, "command_loss_rate": 0.4, "duplicate_rate": 0.3, "bit_flip_rate": 0.2},
+    ],
+    ids=str,
+)
+def test_every_commanded_step_ends_once_at_every_error_rate(
+    faults: dict[str, float], seed: int, tmp_path: Path
+) -> None:
+    rig = rig_with(**faults)
+    run = run_session(SimulatedTimeHub(rig, seed), rig, tmp_path / "a.mcap", 20)
+    check_account(run)
+    check_live_is_recorded(run)
+    if max(faults.values(), default=0) <= 1e-4:  # then nothing is lost for good
+        assert run.error is None
+        assert run.report.steps_commanded == run.report.steps_applied == 4000
+        assert (run.report.reports_asked > 0) == (run.report.packets_missing > run.report.frames_lost)
+        check_inputs_are_what_was_applied(run, rig)
+
+
+def check_inputs_are_what_was_applied(run: Run, rig: Rig) -> None:
+    exact = rig.mirror.quantise(rig.drive.inputs(0, 4000, rig.timing.fast_step_s))
+    for exposure in run.exposures:
+        since = exposure.first_step - run.first_step
+        assert np.array_equal(exposure.inputs, exact[since : since + exposure.n_steps])
+
+
+def test_what_the_mirror_no_longer_knows_is_not_reported_and_assumed_as_converted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The line from the mirror is dead for longer than it remembers; the commands get there all the while."""
+    monkeypatch.setattr(devices, "_HISTORY_WATCHDOGS", 0)  # then it remembers as many steps as its queue has
+    hub = SimulatedTimeHub(RIG)
+    hub.at = [
+        (1_300_000_000, lambda: hub.cut(to_device=False)),
+        (2_200_000_000, lambda: hub.cut(to_device=False, to_host=False)),
+    ]
+    run = run_session(hub, RIG, tmp_path / "a.mcap", 20)
+    assert run.error is None
+    assert run.report.ended == "complete"
+    assert 400 < run.report.steps_not_reported < 600
+    assert run.report.steps_applied + run.report.steps_not_reported == run.report.steps_commanded == 4000
+    assert sum(exposure.inputs_assumed for exposure in run.exposures) == run.report.steps_not_reported
+    check_account(run)
+    check_live_is_recorded(run)
+    check_inputs_are_what_was_applied(run, RIG)
+    commands = recording_facts(Recording(run.path))["commands"]
+    assert list(commands) == ["commanded", "applied", "superseded", "late", "refused", "not_reported"]
+    assert commands["commanded"] == sum(commands.values()) - commands["commanded"]
+    assert commands["not_reported"] == run.report.steps_not_reported
+
+
+@pytest.mark.parametrize("loss", [0.5, 0.8])
+def test_a_block_is_sent_again_as_often_as_its_lead_leaves_room_for(loss: float, tmp_path: Path) -> None:
+    """The lead is 150 steps of 1 ms, the time-out at least 10 ms: at 0, 10, ... 140 ms, and once more just before."""
+    rig = rig_with("watchdog_s = 10", command_loss_rate=loss)
+    run = run_session(SimulatedTimeHub(rig), rig, tmp_path / "a.mcap", 100)
+    assert run.error is None
+    check_account(run)
+    held = run.hub.truth()
+    blocks = [each.message for each in Recording(run.path).messages(topics.COMMAND)]
+    late = sum(held[block.first_step][0] != block.block_id for block in blocks)  # type: ignore[attr-defined]
+    expected = len(blocks) * loss**16
+    assert expected - 4 * expected**0.5 < late < expected + 4 * expected**0.5 + 1
+    assert (run.report.steps_late > 0) == (late > 0)
+    assert run.report.steps_late == run.report.steps_parked
+
+
+def test_a_slow_line_is_not_flooded(tmp_path: Path) -> None:
+    """Its round trip, 60 ms, is found out from the answers, also while blocks are sent again before they come."""
+    hub = SimulatedTimeHub(RIG)
+    for way in (hub.to_device["mirror"], hub.to_host["mirror"]):
+        way.latency_ns = 30_000_000
+    run = run_session(hub, RIG, tmp_path / "a.mcap", 20)
+    assert run.report.steps_applied == 4000
+    assert run.report.blocks_retransmitted <= 2
+    assert run.mirror.round_trip_s == pytest.approx(0.06, rel=0.02)
+
+
+def test_a_dead_mirror_line_ends_the_session_within_twice_the_watchdog(tmp_path: Path) -> None:
+    """The mirror parks itself, and stays parked until the next session tells it to go on."""
+    hub, path = SimulatedTimeHub(RIG), tmp_path / "a.mcap"
+    ended_ns: list[int] = []
+    hub.at = [(1_300_000_000, hub.cut)]
+    run = run_session(hub, RIG, path, 100, progress=lambda _: ended_ns.append(hub.clock_ns))
+    assert isinstance(run.error, DeviceError)
+    assert "the mirror has not acknowledged a command for 2.0 s, more than twice its watchdog" in str(run.error)
+    assert ended_ns[-1] < 1_300_000_000 + 2.1e9 * RIG.mirror.watchdog_s
+    check_account(run)
+    assert run.report.steps_not_reported > 0
+    held = hub.truth()
+    parked = [step for step, (_, source) in held.items() if source == pb.Applied.WATCHDOG]
+    assert parked == list(range(parked[0], len(held)))  # from the watchdog on
+    hub.cut(to_device=False, to_host=False)
+    hub.hold_up(1.0)
+    again = run_session(hub, RIG, tmp_path / "b.mcap", 3)
+    assert (again.error, again.report.ended, again.report.rearmed) == (None, "complete", 1)
+    assert again.mirror.identity.mirror.latched
+    assert again.report.steps_applied == 600
+    assert any("parked by its watchdog in a session before: told to go on" in text for text in log_of(again))
+
+
+@pytest.mark.parametrize("seconds", [0.9, 1.1, 1.9])
+def test_a_mirror_line_that_comes_back_in_time(seconds: float, tmp_path: Path) -> None:
+    """After the watchdog it takes a word to go on; before, the queue has run empty and nothing more."""
+    hub = SimulatedTimeHub(RIG)
+    mended_ns = 1_300_000_000 + round(seconds * 1e9)
+    hub.at = [(1_300_000_000, hub.cut), (mended_ns, lambda: hub.cut(to_device=False, to_host=False))]
+    run = run_session(hub, RIG, tmp_path / "a.mcap", 30)
+    assert (run.error, run.report.ended, run.report.exposures) == (None, "complete", 30)
+    check_account(run)
+    check_live_is_recorded(run)
+    latched = seconds > RIG.mirror.watchdog_s
+    assert run.report.rearmed == latched
+    assert any("parked by its watchdog in this session: told to go on" in text for text in log_of(run)) == latched
+    # The gap is in the recording as it was, though no report came while the line was cut.
+    parked = recorded_steps(run, pb.Applied.WATCHDOG)
+    assert parked == {step for step, (_, source) in hub.truth().items() if source == pb.Applied.WATCHDOG}
+    assert bool(parked) == latched
+    idle = [k for k in range(run.first_step, run.first_step + 6000) if hub.truth()[k][1] != pb.Applied.COMMAND]
+    assert run.report.steps_parked == len(idle)
+    assert idle[-1] < mended_ns / 1e6 + 100  # commanded again as soon as the line was back
+
+
+def test_a_host_that_was_away_for_longer_than_twice_the_watchdog_does_not_go_on(tmp_path: Path) -> None:
+    hub, held_up = SimulatedTimeHub(RIG), list[int]()
+
+    def progress(exposures: int) -> None:
+        if exposures == 5 and not held_up:
+            held_up.append(exposures)
+            hub.hold_up(2.5)
+
+    run = run_session(hub, RIG, tmp_path / "a.mcap", 100, progress=progress)
+    assert isinstance(run.error, DeviceError)
+    assert "the mirror was parked by its watchdog: it took no command for 2.5 s" in str(run.error)
+    check_account(run)
+    assert run.report.steps_refused > 0
+
+
+def test_an_interrupted_session_accounts_for_what_was_queued(tmp_path: Path) -> None:
+    hub, exposures = SimulatedTimeHub(RIG), list[int]()
+    run = run_session(
+        hub, RIG, tmp_path / "a.mcap", 0, stop=lambda: bool(exposures and exposures[-1] >= 3), progress=exposures.append
+    )
+    assert (run.error, run.report.ended) == (None, "interrupted")
+    check_account(run)
+    report = run.report
+    assert report.steps_not_reported == report.steps_late == report.steps_parked == 0
+    assert 100 <= report.steps_superseded <= 200  # the lead
+
+
+def test_long_blocks_keep_the_watchdog_quiet(tmp_path: Path) -> None:
+    """Commands go out twice a second, the watchdog is faster: something else has to be said in between."""
+    rig = parse_rig(RIG.toml.replace("block_steps = 50", "block_steps = 500\nwatchdog_s = 0.2"))
+    run = run_session(SimulatedTimeHub(rig), rig, tmp_path / "a.mcap", 20)
+    assert (run.error, run.report.rearmed, run.report.steps_applied) == (None, 0, 4000)
