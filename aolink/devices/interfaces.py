@@ -98,5 +98,8 @@ class Mirror(Device, Protocol):
     def retransmit(self, now_ns: int) -> None:
         """Send again what has timed out. Raises DeviceError after too many tries."""
 
+    def check_step(self, step: int, now_ns: int) -> None:
+        """Refuse a fast step that the mirror cannot be in at a host time. Raises DeviceError."""
+
     def park(self) -> None:
         """Put the mirror into its safe state and empty its queue. Raises DeviceError."""

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
+from aolink.devices.gate import Gate, check_identity, lie, printable
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.errors import DeviceError
 from aolink.rig import Rig
@@ -30,8 +32,9 @@ _MAX_QUERIES = 32
 class _NativeDevice:
     """What the native camera and mirror share: identity, clock, simple requests."""
 
-    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
         self.link, self.identity = link, identity
+        self._gate = gate
         self.clock = ClockRegression()
         self.steps = StepClock(self.clock, identity.step_zero_ns, identity.fast_step_ns)
         self._hub = hub
@@ -59,14 +62,14 @@ class _NativeDevice:
         if ack is None:
             raise DeviceError(f"the {self.link.name} did not answer when told to {what}: is it still connected?")
         if ack.code != pb.OK:
-            raise DeviceError(f"the {self.link.name} refused to {what}: {ack.text or pb.Code.Name(ack.code)}")
+            raise DeviceError(f"the {self.link.name} refused to {what}: {_reason(ack)}")
 
 
 class NativeCamera(_NativeDevice):
     """A camera on the packet protocol."""
 
-    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
-        super().__init__(hub, link, identity)
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
+        super().__init__(hub, link, identity, gate)
         geometry = identity.camera
         shapes = [(geometry.height, geometry.width)]
         if geometry.scene_width:
@@ -89,11 +92,22 @@ class NativeCamera(_NativeDevice):
 
     def handle(self, received: Received) -> list[Event]:
         message = received.message
+        if not self._gate.passes(self.link, message, received.receive_ns):
+            return []
         if isinstance(message, pb.FrameChunk):
-            return list(self._frames.add(message, received.receive_ns))
+            frames = self._frames.add(message, received.receive_ns)
+            for frame in frames:
+                self._gate.check_frame(self.link.name, frame)
+            return list(frames)
         if isinstance(message, pb.TruthChunk):
-            truth = self._truths.add(message)
-            return [truth] if truth else []
+            try:
+                truth = self._truths.add(message)
+            except DecodeError:
+                raise lie(self.link.name, "TruthChunk.data", "bytes that are no Truth", "a serialised Truth") from None
+            if truth is None:
+                return []
+            self._gate.check_truth(self.link.name, truth, message.frame_id)
+            return [truth]
         if isinstance(message, pb.ClockReply):
             return self._sample_clock(message, received.receive_ns)
         return [message] if isinstance(message, pb.Event) else []
@@ -112,8 +126,8 @@ class _Flight:
 class NativeMirror(_NativeDevice):
     """A mirror driver on the packet protocol: blocks are acknowledged, and sent again on time-out."""
 
-    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
-        super().__init__(hub, link, identity)
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
+        super().__init__(hub, link, identity, gate)
         self.retransmits = 0
         self.queue_end_step = 0
         self._block_ids = count(1)
@@ -146,6 +160,7 @@ class NativeMirror(_NativeDevice):
             u=u.ravel(),
             cause_frame_id=cause_frame_id,
         )
+        self._gate.sent(block)
         self._flights[block.block_id] = _Flight(block, now_ns, now_ns + self._timeout_ns())
         self.link.send(block)
         return block
@@ -171,8 +186,13 @@ class NativeMirror(_NativeDevice):
     def park(self) -> None:
         self._request(pb.Park(), "park")
 
+    def check_step(self, step: int, now_ns: int) -> None:
+        self._gate.check_step(self.link.name, step, now_ns)
+
     def handle(self, received: Received) -> list[Event]:
         message = received.message
+        if not self._gate.passes(self.link, message, received.receive_ns):
+            return []
         if isinstance(message, pb.CommandAck):
             return self._take_ack(message, received.receive_ns)
         if isinstance(message, pb.ClockReply):
@@ -194,7 +214,7 @@ class NativeMirror(_NativeDevice):
         if ack.code in (pb.OUT_OF_RANGE, pb.WRONG_SHAPE, pb.NOT_SUPPORTED):
             raise DeviceError(
                 f"the mirror refused command block {ack.block_id} from fast step {flight.block.first_step}:"
-                f" {ack.text or pb.Code.Name(ack.code)}"
+                f" {_reason(ack)}"
             )
         return [CommandAnswered(ack, flight.block)]
 
@@ -210,6 +230,12 @@ class NativeMirror(_NativeDevice):
         if math.isnan(timeout):
             timeout = _FIRST_TIMEOUT_S
         return round(min(max(timeout, _MIN_TIMEOUT_S), _MAX_TIMEOUT_S) * 1e9)
+
+
+def _reason(ack: pb.Ack | pb.CommandAck) -> str:
+    """Why a device refused something."""
+    known = pb.Code.Name(ack.code) if ack.code in pb.Code.values() else f"code {ack.code}"
+    return printable(ack.text) or known
 
 
 def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
@@ -242,6 +268,7 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
             f"the device on the {link.name} port was built with another messages.proto"
             f" ({identity.schema_hash.hex()}, here {schema_hash().hex()}): update the older of the two"
         )
+    check_identity(link, identity)
     return identity
 
 
@@ -287,6 +314,8 @@ def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> lis
         ("mirror.input_max", list(limits.input_max), rig.mirror.input_max.tolist()),
         ("mirror.park", list(limits.park), rig.mirror.park.tolist()),
         ("mirror.dac_bits", limits.dac_bits, rig.mirror.dac_bits),
+        ("mirror.queue_steps", limits.queue_steps, rig.mirror.queue_steps),
+        ("mirror.watchdog_s", limits.watchdog_s, rig.mirror.watchdog_s),
     ]
     for name, found, expected in pairs:
         if found != expected:
