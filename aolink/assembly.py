@@ -54,7 +54,12 @@ class FrameReassembly:
 
     def __init__(self, shape: tuple[int, int], fast_step_ns: int) -> None:
         self._shape, self._fast_step_ns = shape, fast_step_ns
-        self._parts: list[pb.FrameChunk] = []
+        self._first: pb.FrameChunk | None = None
+        """Of the frame that is in progress; it stands for what all of its chunks say."""
+        self._data = np.zeros(0, np.uint8)
+        self._arrived = np.zeros(0, bool)
+        self._largest = 0
+        """Bytes of its largest chunk."""
         self._first_byte_ns = self._last_byte_ns = 0
         self._last_id: int | None = None
         self.refused = 0
@@ -63,26 +68,31 @@ class FrameReassembly:
     def add(self, chunk: pb.FrameChunk, receive_ns: int) -> list[Frame]:
         """Take a chunk; gives the frames that are over with it, at most two."""
         frames = []
-        if self._parts and chunk.frame_id != self._parts[0].frame_id:
-            frames.append(self._close())
+        if self._first is not None and chunk.frame_id != self._first.frame_id:
+            frames.append(self._close(self._first))
         stale = self._last_id is not None and chunk.frame_id <= self._last_id
         if stale or not self._is_sound(chunk):
             self.refused += 1
             return frames
-        if not self._parts:
-            self._first_byte_ns = receive_ns
-        self._parts.append(chunk)
+        if self._first is None:
+            self._first, self._first_byte_ns, self._largest = chunk, receive_ns, 0
+            self._data, self._arrived = np.zeros(chunk.total, np.uint8), np.zeros(chunk.total, bool)
+        # Each goes to its place at once: however many come, a frame takes no more memory than it has bytes.
+        end = chunk.offset + len(chunk.data)
+        self._data[chunk.offset : end] = np.frombuffer(chunk.data, np.uint8)
+        self._arrived[chunk.offset : end] = True
+        self._largest = max(self._largest, len(chunk.data))
         self._last_byte_ns = receive_ns
-        if chunk.offset + len(chunk.data) == chunk.total:
-            frames.append(self._close())
+        if end == chunk.total:
+            frames.append(self._close(self._first))
         return frames
 
     def flush(self) -> list[Frame]:
         """The frame that is in progress, as it is."""
-        return [self._close()] if self._parts else []
+        return [self._close(self._first)] if self._first is not None else []
 
     def _is_sound(self, chunk: pb.FrameChunk) -> bool:
-        first = self._parts[0] if self._parts else chunk
+        first = self._first or chunk
         return (
             0 < len(chunk.data) <= chunk.total - chunk.offset
             and chunk.total == 2 * chunk.width * chunk.height
@@ -92,14 +102,8 @@ class FrameReassembly:
             and chunk.exposure_offset_ns == first.exposure_offset_ns < self._fast_step_ns
         )
 
-    def _close(self) -> Frame:
-        parts, self._parts = self._parts, []
-        first = parts[0]
-        data, arrived = np.zeros(first.total, dtype=np.uint8), np.zeros(first.total, dtype=bool)
-        for part in parts:
-            some = slice(part.offset, part.offset + len(part.data))
-            data[some], arrived[some] = np.frombuffer(part.data, np.uint8), True
-        size = max(len(part.data) for part in parts)
+    def _close(self, first: pb.FrameChunk) -> Frame:
+        data, arrived, self._first = self._data, self._arrived, None
         lost_before = 0 if self._last_id is None else first.frame_id - self._last_id - 1
         self._last_id = first.frame_id
         return Frame(
@@ -108,7 +112,7 @@ class FrameReassembly:
             last_step=first.last_step,
             pixels=data.view("<u2").astype(np.uint16, copy=False).reshape(self._shape),
             mask=(arrived[::2] & arrived[1::2]).reshape(self._shape),
-            chunks_lost=-(-(first.total - int(np.count_nonzero(arrived))) // size),
+            chunks_lost=-(-(first.total - int(np.count_nonzero(arrived))) // self._largest),
             frames_lost_before=lost_before,
             device_start_ns=first.exposure_start_ns,
             device_end_ns=first.exposure_end_ns,

@@ -117,6 +117,9 @@ class Mirror(Device, Protocol):
     def await_reports(self, end_step: int, now_ns: int) -> list[Event]:
         """Ask for all reports before ``end_step`` that have not come, as `handle` does where it sees a gap."""
 
+    def check_step(self, step: int, now_ns: int) -> None:
+        """Refuse a fast step that the mirror cannot be in at a host time. Raises DeviceError."""
+
     def park(self) -> int:
         """Put the mirror into its safe state and empty its queue; gives the first fast step that this holds for.
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from itertools import count
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
+from aolink.devices.gate import Gate, check_identity, lie, printable
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
@@ -36,8 +38,9 @@ _MAX_QUERIES = 32
 class _NativeDevice:
     """What the native camera and mirror share: identity, clock, simple requests."""
 
-    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
         self.link, self.identity = link, identity
+        self._gate = gate
         self.clock = ClockRegression()
         self.steps = StepClock(self.clock, identity.step_zero_ns, identity.fast_step_ns)
         self._hub = hub
@@ -64,16 +67,17 @@ class _NativeDevice:
         ack = self._hub.request(self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s)
         if ack is None:
             raise DeviceError(f"the {self.link.name} did not answer when told to {what}: is it still connected?")
+        self._gate.passes(self.link, ack, self._hub.now_ns())
         if ack.code != pb.OK:
-            raise DeviceError(f"the {self.link.name} refused to {what}: {ack.text or pb.Code.Name(ack.code)}")
+            raise DeviceError(f"the {self.link.name} refused to {what}: {_reason(ack)}")
         return ack
 
 
 class NativeCamera(_NativeDevice):
     """A camera on the packet protocol."""
 
-    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
-        super().__init__(hub, link, identity)
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
+        super().__init__(hub, link, identity, gate)
         geometry = identity.camera
         shapes = [(geometry.height, geometry.width)]
         if geometry.scene_width:
@@ -96,11 +100,22 @@ class NativeCamera(_NativeDevice):
 
     def handle(self, received: Received) -> list[Event]:
         message = received.message
+        if not self._gate.passes(self.link, message, received.receive_ns):
+            return []
         if isinstance(message, pb.FrameChunk):
-            return list(self._frames.add(message, received.receive_ns))
+            frames = self._frames.add(message, received.receive_ns)
+            for frame in frames:
+                self._gate.check_frame(self.link.name, frame)
+            return list(frames)
         if isinstance(message, pb.TruthChunk):
-            truth = self._truths.add(message)
-            return [truth] if truth else []
+            try:
+                truth = self._truths.add(message)
+            except DecodeError:
+                raise lie(self.link.name, "TruthChunk.data", "bytes that are no Truth", "a serialised Truth") from None
+            if truth is None:
+                return []
+            self._gate.check_truth(self.link.name, truth, message.frame_id)
+            return [truth]
         if isinstance(message, pb.ClockReply):
             return self._sample_clock(message, received.receive_ns)
         return [message] if isinstance(message, pb.Event) else []
@@ -137,8 +152,8 @@ class NativeMirror(_NativeDevice):
     are asked for again.
     """
 
-    def __init__(self, hub: Hub, link: Link, identity: pb.Identity) -> None:
-        super().__init__(hub, link, identity)
+    def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
+        super().__init__(hub, link, identity, gate)
         self.retransmits = 0
         self.queue_end_step = 0
         self.latched = identity.mirror.latched
@@ -183,6 +198,7 @@ class NativeMirror(_NativeDevice):
         )
         first_ns, over_ns = self._begins_ns(first_step), self._begins_ns(first_step + len(u))
         flight = _Flight(block, first_ns - self._timeout_ns() / 2, over_ns, now_ns)
+        self._gate.sent(block)
         self._flights[block.block_id] = flight
         self._reports.begin(first_step)
         self._send(flight, now_ns)
@@ -241,8 +257,13 @@ class NativeMirror(_NativeDevice):
         """How long to wait for an answer, s: the tries together take the watchdog's time. Then it parks by itself."""
         return min(ANSWER_S, max(self._watchdog_s / TRIES, self._timeout_ns() / 1e9))
 
+    def check_step(self, step: int, now_ns: int) -> None:
+        self._gate.check_step(self.link.name, step, now_ns)
+
     def handle(self, received: Received) -> list[Event]:
         message = received.message
+        if not self._gate.passes(self.link, message, received.receive_ns):
+            return []
         if isinstance(message, pb.CommandAck):
             return self._take_ack(message, received.receive_ns)
         if isinstance(message, pb.Applied):
@@ -286,6 +307,12 @@ class NativeMirror(_NativeDevice):
         return round(min(max(timeout, _MIN_TIMEOUT_S), _MAX_TIMEOUT_S) * 1e9)
 
 
+def _reason(ack: pb.Ack | pb.CommandAck) -> str:
+    """Why a device refused something."""
+    known = pb.Code.Name(ack.code) if ack.code in pb.Code.values() else f"code {ack.code}"
+    return printable(ack.text) or known
+
+
 def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     """Ask the device on a line who it is.
 
@@ -316,6 +343,7 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
             f"the device on the {link.name} port was built with another messages.proto"
             f" ({identity.schema_hash.hex()}, here {schema_hash().hex()}): update the older of the two"
         )
+    check_identity(link, identity)
     return identity
 
 
@@ -361,6 +389,8 @@ def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> lis
         ("mirror.input_max", list(limits.input_max), rig.mirror.input_max.tolist()),
         ("mirror.park", list(limits.park), rig.mirror.park.tolist()),
         ("mirror.dac_bits", limits.dac_bits, rig.mirror.dac_bits),
+        ("mirror.queue_steps", limits.queue_steps, rig.mirror.queue_steps),
+        ("mirror.watchdog_s", limits.watchdog_s, rig.mirror.watchdog_s),
     ]
     for name, found, expected in pairs:
         if found != expected:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from aolink.devices.gate import Gate
 from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig, check_kind, identify
 from aolink.errors import AolinkError, DeviceError, PortError
 from aolink.estimation import Driver, Estimate
@@ -67,21 +68,24 @@ def open_devices(
     """
     hub = Hub(stop)
     try:
-        camera_link = hub.connect("camera", SerialPort(camera_port))
-        mirror_link = hub.connect("mirror", SerialPort(mirror_port))
+        camera_link = hub.connect("camera", SerialPort(camera_port, stop=stop))
+        mirror_link = hub.connect("mirror", SerialPort(mirror_port, stop=stop))
+        asked_ns = hub.now_ns()
         camera_identity = identify(hub, camera_link, secrets.randbits(48))
         check_kind(camera_link, camera_identity, wire.Identity.CAMERA)
         mirror_identity = identify(hub, mirror_link, secrets.randbits(48))
         check_kind(mirror_link, mirror_identity, wire.Identity.MIRROR)
         warnings = check_against_rig(rig, camera_identity, mirror_identity)
+        gate = Gate(rig, hub, (camera_identity, mirror_identity), asked_ns)
+        hub.budget_bytes += gate.exposure_bytes * (2 + rig.mirror.queue_steps // rig.timing.frame_period_steps)
         if camera_identity.virtual_time:
-            hub.go_virtual()
+            hub.go_virtual(gate.check_virtual_time)
         for link in hub.links:
             link.reset_counts()
         yield Opened(
             hub,
-            NativeCamera(hub, camera_link, camera_identity),
-            NativeMirror(hub, mirror_link, mirror_identity),
+            NativeCamera(hub, camera_link, camera_identity, gate),
+            NativeMirror(hub, mirror_link, mirror_identity, gate),
             warnings,
         )
     finally:
@@ -198,6 +202,7 @@ def record(
             loop.run(exposures, stop, progress)
         except BaseException as error:
             report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
+            hub.hurry()
             try:
                 loop.make_safe()
             except AolinkError as unsafe:

@@ -17,6 +17,7 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.assembly import Assembler, Frame
+from aolink.devices.gate import printable
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
 from aolink.errors import DeviceError
 from aolink.estimation import Driver
@@ -118,7 +119,11 @@ class SessionLoop:
 
     def run(self, exposures: int, stop: Callable[[], bool], progress: Callable[[int], None]) -> None:
         self._estimating.get_ready(stop)
-        self._warm_up_clocks()
+        self._warm_up_clocks(stop)
+        if stop():
+            self.report.ended = "interrupted"
+            self.make_safe()
+            return
         timing, hub = self._rig.timing, self._hub
         if self._mirror.latched:
             self._rearm("in a session before")
@@ -177,8 +182,10 @@ class SessionLoop:
     def _device(self, link: Link) -> Camera | Mirror:
         return self._camera if link is self._camera.link else self._mirror
 
-    def _warm_up_clocks(self) -> None:
+    def _warm_up_clocks(self, stop: Callable[[], bool]) -> None:
         for _ in range(2 * WARM_UP_QUERIES):
+            if stop():
+                return
             self._query_next_clock(self._hub.now_ns())
             deadline_ns = self._hub.now_ns() + _ANSWER_NS
             while not self._receive(0.05) and not self._hub.virtual and self._hub.now_ns() < deadline_ns:
@@ -202,7 +209,9 @@ class SessionLoop:
     def _choose_first_step(self) -> int:
         if self._hub.virtual:
             return self._mirror.identity.next_step
-        return self._device_step() + round(_START_DELAY_S * 1e9) // self._step_ns
+        step = self._device_step()
+        self._mirror.check_step(step, self._hub.now_ns())
+        return step + round(_START_DELAY_S * 1e9) // self._step_ns
 
     def _device_step(self) -> int:
         """The fast step that the device is in: by its clock, or on virtual time the one that it waits at."""
@@ -334,7 +343,7 @@ class SessionLoop:
                 self._take_answer(event, receive_ns)
             else:
                 level = {wire.Event.INFO: Log.INFO, wire.Event.WARNING: Log.WARNING}.get(event.level, Log.ERROR)
-                self._log(level, f"{link.name}: {event.text}")
+                self._log(level, f"{link.name}: {printable(event.text)}")
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
         frame = self._record_picture(frame, topics.EXPOSURE, topics.IMAGE, receive_ns)
@@ -457,7 +466,7 @@ class SessionLoop:
         if ack.code in REFUSALS and ack.code != wire.LATCHED:
             raise DeviceError(
                 f"the mirror refused command block {ack.block_id} from fast step {answer.block.first_step}:"
-                f" {ack.text or wire.Code.Name(ack.code)}"
+                f" {printable(ack.text) or wire.Code.Name(ack.code)}"
             )
 
     def _take_clock(self, device: str, sampled: ClockSampled) -> None:

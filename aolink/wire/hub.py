@@ -7,6 +7,7 @@ speed of either side, so neither does anything that follows from it.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -15,14 +16,22 @@ from typing import Protocol, TypeVar
 from google.protobuf.message import Message
 
 from aolink.errors import DeviceError
+from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
-from aolink.wire.port import HasFileno, Transport, wait_readable
+from aolink.wire.port import HasFileno, Transport, is_local, wait_readable
 
 ANSWER_S = 1.0
-"""How long an answer may take before a request is sent again."""
+"""How long an answer may take before a request is sent again, and how long one is waited for after a stop."""
 TRIES = 3
 _VIRTUAL_SILENCE_S = 20.0
 """A rig on virtual time that says nothing for so long is gone."""
+_BUDGET_BYTES = 64 << 20
+"""What may come between two times that the session deals with what came, besides what the camera is to send."""
+_MESSAGE_BYTES = 512
+"""What a message takes in memory beyond its own bytes."""
+_MOST_HOST_NS = 1 << 62
+_LAST_PATIENCE_S = 0.2
+"""How long a device is waited for that has kept a session from ending before."""
 _SLICE_S = 0.1
 """Longest sleep: a request to stop is seen that soon."""
 
@@ -52,10 +61,19 @@ class Hub:
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop
+        self._hurried = False
+        self._patience_s = ANSWER_S
+        """How long the rig on virtual time may take to deal with something once the session is to end."""
         self.links: list[Link] = []
         self.virtual = False
         self.beside: Sequence[Served] = ()
         """Served while the hub waits in real time."""
+        self.virtual_since_ns = 0
+        """Host time at which the rig began to hand it down."""
+        self.elapsed_ns = 0
+        """Virtual time that went by in time-outs."""
+        self.budget_bytes = _BUDGET_BYTES
+        """Memory for messages that nobody has dealt with yet; a device that sends more ends the session."""
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._virtual_ns = 0
         self._pending: list[tuple[Link, Received]] = []
@@ -64,23 +82,45 @@ class Hub:
         """Host time, ns since 1970: steady within a session, handed down by the rig on virtual time."""
         return self._virtual_ns if self.virtual else self._epoch_ns + time.monotonic_ns()
 
+    def hurry(self) -> None:
+        """Wait from now on as if a stop had been asked for: the session ends with an error."""
+        self._hurried = True
+
     def connect(self, name: str, transport: Transport) -> Link:
         """Add a line."""
         link = Link(name, transport, self.now_ns)
         self.links.append(link)
         return link
 
-    def go_virtual(self) -> None:
-        """From now on time is what the rig says."""
-        self.virtual = True
-        self._virtual_ns = max(link.handed.host_ns for link in self.links if link.handed)
+    def go_virtual(self, check: Callable[[Link, pb.VirtualTime], None]) -> None:
+        """From now on time is what the rig says, as far as ``check`` lets it, which raises DeviceError.
+
+        Only a simulated rig on this machine may do that: a device on a serial line or on another machine that says so
+        would take the session's clock away from it.
+        """
         for link in self.links:
+            if not is_local(link.transport):
+                raise DeviceError(
+                    f"the {link.name} says that it runs on virtual time, as only a simulated rig on this machine may"
+                    " (a pseudo terminal, or a TCP port of 127.0.0.1): run it with --real-time, or through a tunnel"
+                )
+        self.virtual = True
+        self._pending += self._receive_until_dealt_with()
+        self.virtual_since_ns = self._virtual_ns = max(link.handed.host_ns for link in self.links if link.handed)
+        if not 0 < self._virtual_ns < _MOST_HOST_NS:
+            raise DeviceError(
+                f"the rig says VirtualTime.host_ns = {self._virtual_ns}, expected ns since 1970 up to {_MOST_HOST_NS}"
+            )
+        for link in self.links:
+            link.virtual = True
+            link.check_virtual_time = partial(check, link)
             link.before_send = partial(self._settle_others, link)
 
     def elapse_until(self, host_ns: int) -> None:
         """Virtual time: let a time-out pass in which nothing can come."""
-        if self.virtual:
-            self._virtual_ns = max(self._virtual_ns, host_ns)
+        if self.virtual and host_ns > self._virtual_ns:
+            self.elapsed_ns += host_ns - self._virtual_ns
+            self._virtual_ns = host_ns
 
     def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
         """The messages that came, in order of time; in real time, wait for them for up to ``timeout_s``."""
@@ -113,8 +153,9 @@ class Hub:
         ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number. Each of the
         `TRIES` tries waits for ``answer_s``.
         """
+        before = self._memory_bytes()
         for attempt in range(TRIES):
-            if attempt and self._stop():
+            if attempt and (self._hurried or self._stop()):
                 break
             sequence = link.send(request)
             deadline_ns = self.now_ns() + round(answer_s * 1e9)
@@ -129,6 +170,7 @@ class Hub:
                     else:
                         kept.append((source, received))
                 self._pending = kept
+                self._keep_to_budget(before)
                 if answer is not None:
                     return answer
                 if self.virtual or self.now_ns() >= deadline_ns:
@@ -152,19 +194,37 @@ class Hub:
     def _receive_until_dealt_with(self) -> list[tuple[Link, Received]]:
         """Everything that came until the rig had dealt with all that was sent."""
         received: list[tuple[Link, Received]] = []
-        heard, last_heard = -1, time.monotonic()
+        before, heard, last_heard, stop_since = self._memory_bytes(), -1, time.monotonic(), math.inf
         while True:
             received.extend((link, r) for link in self.links for r in link.receive())
             waiting = [link.transport for link in self.links if not self._has_dealt_with(self.links, link)]
             if not waiting:
-                break
-            total = sum(link.counts.bytes_received for link in self.links)
-            if total != heard:
-                heard, last_heard = total, time.monotonic()
-            elif (silence := time.monotonic() - last_heard) > (ANSWER_S if self._stop() else _VIRTUAL_SILENCE_S):
-                raise DeviceError(f"the rig on virtual time has said nothing for {silence:.0f} s: is it stopped?")
+                return received
+            self._keep_to_budget(before)
+            now = time.monotonic()
+            if (total := self._memory_bytes()) != heard:
+                heard, last_heard = total, now
+            if now - last_heard > _VIRTUAL_SILENCE_S:
+                raise DeviceError(
+                    f"the rig on virtual time has said nothing for {now - last_heard:.0f} s: is it stopped?"
+                )
+            if self._hurried or self._stop():
+                stop_since = min(stop_since, now)
+            if now - stop_since > self._patience_s:
+                self._patience_s = _LAST_PATIENCE_S
+                raise DeviceError(f"the rig on virtual time has not dealt within {ANSWER_S:g} s with what it was sent")
             wait_readable(waiting, _SLICE_S)
-        return received
+
+    def _memory_bytes(self) -> int:
+        """What all messages so far took."""
+        return sum(each.counts.bytes_received + _MESSAGE_BYTES * each.counts.packets_received for each in self.links)
+
+    def _keep_to_budget(self, before: int) -> None:
+        if (used := self._memory_bytes() - before) > self.budget_bytes:
+            raise DeviceError(
+                f"the devices have sent messages of {used >> 20} MiB without answering, expected at most"
+                f" {self.budget_bytes >> 20} MiB: their firmware is at fault"
+            )
 
     def _has_dealt_with(self, senders: Sequence[Link], link: Link) -> bool:
         """Whether the rig has said so on ``link``: everything that follows from it has come as well."""
@@ -172,4 +232,5 @@ class Hub:
         if handed is None:
             return False
         taken = {"camera": handed.camera_packets, "mirror": handed.mirror_packets}
-        return all(taken[each.name] >= each.sent_packets for each in senders)
+        # More than were sent is what it had taken in a session before.
+        return all(taken[each.name] == each.sent_packets for each in senders)

@@ -55,6 +55,10 @@ class Link:
         """Protocol version of the last packet of another version, if one came."""
         self.handed: pb.VirtualTime | None = None
         """The last `VirtualTime` that came."""
+        self.virtual = False
+        """Whether time is what the device hands down. Until then, `VirtualTime` packets change no time."""
+        self.check_virtual_time: Callable[[pb.VirtualTime], None] = lambda handed: None
+        """Raises DeviceError for a time that cannot be."""
         self.sent_packets = 0
         """Since the last Identify, which is packet 1."""
         self.last_sent_ns = 0
@@ -112,11 +116,12 @@ class Link:
             if message is None:  # more of it is to come
                 continue
             if isinstance(message, pb.VirtualTime):
+                self.check_virtual_time(message)
                 self.handed = message
                 continue
             if isinstance(message, pb.Identity):
                 self._recent.clear()
-            received.append(Received(message, self.handed.host_ns if self.handed else now))
+            received.append(Received(message, self.handed.host_ns if self.virtual and self.handed else now))
         self.counts.bad_crc = self._decoder.bad_crc
         self.counts.bad_framing = self._decoder.bad_framing
         return received

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import ipaddress
 import os
 import select
-from collections.abc import Sequence
+import socket
+import stat
+import time
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import serial
@@ -16,6 +20,9 @@ from aolink.errors import PortError
 BAUD_RATE = 921_600
 """For ports that have one; USB and pseudo terminals ignore it."""
 _WRITE_TIMEOUT_S = 5.0
+_STOPPED_TIMEOUT_S = 1.0
+"""The same once a stop is asked for."""
+_SLICE_S = 0.1
 _SOCKET_READ = 65_536
 
 
@@ -36,10 +43,11 @@ class Transport(Protocol):
 
 
 class SerialPort:
-    """A `Transport` over pyserial."""
+    """A `Transport` over pyserial. Once ``stop()`` says so, a device that takes nothing is not waited for."""
 
-    def __init__(self, url: str, baud_rate: int = BAUD_RATE) -> None:
+    def __init__(self, url: str, baud_rate: int = BAUD_RATE, *, stop: Callable[[], bool] = lambda: False) -> None:
         self.url = url
+        self._stop = stop
         try:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
@@ -68,11 +76,19 @@ class SerialPort:
         return data
 
     def write(self, data: bytes) -> None:
+        # pyserial's own write cannot be interrupted and does not say how much went out before a time-out.
+        start = time.monotonic()
         try:
-            self._serial.write(data)
-        except serial.SerialTimeoutException:
-            raise PortError(f"{self.url} took no data for {_WRITE_TIMEOUT_S:g} s; is the device running?") from None
-        except (OSError, TypeError) as error:
+            descriptor = self._serial.fileno()
+            while data:
+                with contextlib.suppress(BlockingIOError):
+                    data = data[os.write(descriptor, data) :]
+                    continue
+                waited_s = time.monotonic() - start
+                if waited_s > (_STOPPED_TIMEOUT_S if self._stop() else _WRITE_TIMEOUT_S):
+                    raise PortError(f"{self.url} took no data for {waited_s:.0f} s; is the device running?")
+                select.select([], [descriptor], [], _SLICE_S)
+        except (OSError, TypeError, serial.SerialException) as error:
             raise PortError(f"lost {self.url}: {_plain(error)}; is the device still there?") from None
 
     def fileno(self) -> int:
@@ -92,6 +108,18 @@ class HasFileno(Protocol):
 def wait_readable(some: Sequence[HasFileno], timeout_s: float, writable: Sequence[HasFileno] = ()) -> None:
     """Wait until one of ``some`` has something or one of ``writable`` takes something, or for ``timeout_s``."""
     select.select(some, writable, [], max(0.0, timeout_s))
+
+
+def is_local(transport: Transport) -> bool:
+    """Whether a program of this machine is at the other end: of a pseudo terminal, or of a socket on loopback."""
+    mode = os.fstat(transport.fileno())
+    if stat.S_ISSOCK(mode.st_mode):
+        with socket.socket(fileno=os.dup(transport.fileno())) as connection:
+            peer = connection.getpeername()
+        return not isinstance(peer, tuple) or ipaddress.ip_address(str(peer[0]).partition("%")[0]).is_loopback
+    with contextlib.suppress(OSError):
+        return os.ttyname(transport.fileno()).startswith(("/dev/pts/", "/dev/ttys"))  # of Linux, of macOS
+    return False
 
 
 def _open_error(url: str, error: Exception) -> PortError:

@@ -85,6 +85,7 @@ def test_another_protocol_version_is_remembered(peer: Peer, link: Link) -> None:
 
 
 def test_what_comes_behind_a_virtual_time_came_at_that_time(peer: Peer, link: Link) -> None:
+    link.virtual = True
     peer.say(encode_message(pb.VirtualTime(host_ns=1000), 0) + event("a", 1))
     peer.say(encode_message(pb.VirtualTime(host_ns=2000), 2) + event("b", 3))
     times = []

@@ -1,0 +1,336 @@
+"""The gate: what a device says is checked here, against the rig file, the host's clock and what it was sent.
+
+Nothing that a device says changes any state before it has passed. The packet's checksum lets damage through once in
+2^32 times, so a message that says what cannot be was sent like that: by faulty firmware, or by a device that is not
+what the rig file describes. Numbers of such a device are worth nothing, so the session ends with a `DeviceError`
+that names the field. What an honest device may do as well is no error: repeated, late and unasked answers, clock
+replies that the regression refuses, reports from before the session. Those are dropped or counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+from google.protobuf.message import Message
+
+from aolink.assembly import Frame
+from aolink.errors import DeviceError
+from aolink.rig import Rig
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.hub import Hub
+from aolink.wire.link import Link
+
+MOST_STEP = 1 << 53
+"""No count of fast steps comes so far."""
+MOST_TIME_NS = 3_600_000_000_000_000_000
+"""No clock reads a time further from its zero: 114 years. The difference of two such times fits into int64."""
+MOST_RATE_ERROR = 1e-3
+"""No crystal is off by more."""
+_SLACK_S = 1.0
+"""How far a device may be ahead of what its crystal explains."""
+_DELAY_S = 0.01
+"""On virtual time, how long a packet may take beyond four times the rig file's latency."""
+_LONGEST_NAME = 200
+_LONGEST_TEXT = 1000
+_REMEMBERED_BLOCKS = 65_536
+_KINDS: dict[str, tuple[type[Message], ...]] = {
+    "camera": (pb.FrameChunk, pb.TruthChunk, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
+    "mirror": (pb.Applied, pb.CommandAck, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
+}
+"""What each device has to say."""
+
+
+def lie(device: str, field: str, found: object, expected: str) -> DeviceError:
+    """The error for a field that says what cannot be."""
+    return DeviceError(
+        f"the {device} says {field} = {found}, expected {expected}: its firmware is at fault, or the rig file is"
+        " another device's; what was recorded before is kept"
+    )
+
+
+def check_identity(link: Link, identity: pb.Identity) -> None:
+    """Refuse an Identity whose numbers or names cannot be. Raises DeviceError naming the field."""
+    if identity.kind not in (pb.Identity.CAMERA, pb.Identity.MIRROR):
+        raise lie(link.name, "Identity.kind", identity.kind, "1 (camera) or 2 (mirror)")
+    for name in ("model", "serial_number", "firmware", "rig_digest"):
+        text = getattr(identity, name)
+        if len(text) > _LONGEST_NAME or not text.isprintable():
+            raise lie(
+                link.name,
+                f"Identity.{name}",
+                repr(text[:40]),
+                f"at most {_LONGEST_NAME} characters that can be printed",
+            )
+    if not 0 < identity.fast_step_ns <= 10**10:
+        raise lie(link.name, "Identity.fast_step_ns", identity.fast_step_ns, "1 to 10^10")
+    if identity.next_step > MOST_STEP:
+        raise lie(link.name, "Identity.next_step", identity.next_step, "at most 2^53")
+    _check_times(link.name, identity, ("step_zero_ns",))
+
+
+def printable(text: str) -> str:
+    """A device's own words, as they may go into a log or onto a terminal."""
+    return "".join(each if each.isprintable() else " " for each in text[:_LONGEST_TEXT])
+
+
+class Gate:
+    """What the two devices of a session may say.
+
+    Parameters
+    ----------
+    rig:
+        What they are. Their identities have been compared with it.
+    hub:
+        The host's clock.
+    identities:
+        Of camera and mirror.
+    asked_ns:
+        Host time before they were asked who they are: they were no further then than they say.
+    """
+
+    def __init__(self, rig: Rig, hub: Hub, identities: Iterable[pb.Identity], asked_ns: int) -> None:
+        self._rig, self._hub = rig, hub
+        self._step_ns = rig.timing.fast_step_ns
+        self._first_step = max(identity.next_step for identity in identities)
+        self._asked_ns = asked_ns
+        self._sent: dict[int, tuple[int, int]] = {}
+        """First step and one past the last of command blocks, by id, oldest first."""
+        self._last_block = 0
+        self._sent_end = self._first_step
+        mirror = rig.mirror
+        low, high = mirror.voltage.input_range if mirror.voltage else (mirror.input_min, mirror.input_max)
+        converter = (np.asarray(high) - low) / ((1 << mirror.dac_bits) - 1) if mirror.dac_bits else 0.0
+        margin = converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
+        self._input_min, self._input_max = mirror.input_min - margin, mirror.input_max + margin
+        planes = [(rig.sensor.shape, rig.sensor.bit_depth)]
+        if rig.scene is not None:
+            planes.append((rig.scene.shape, rig.scene.bit_depth))
+        self._planes = planes
+        states = 2 * rig.plant.axes * rig.plant.n_states
+        # Twice: a number may have come with its tag, and states of a rig with another plant are no matter.
+        self._most_truth = 16 * (4 * states + rig.n_outputs * rig.timing.exposure_steps) + 1024
+        self._frame_head: tuple[object, ...] = ()
+        self._frame_id = -1
+        self._frame_step = 0
+
+    @property
+    def exposure_bytes(self) -> int:
+        """The most that the camera sends for one exposure."""
+        return sum(2 * height * width for (height, width), _ in self._planes) + self._most_truth
+
+    def sent(self, block: pb.CommandBlock) -> None:
+        """Remember a command block: the mirror may say of it that it was applied."""
+        end = block.first_step + block.n_steps
+        self._sent[block.block_id] = block.first_step, end
+        self._last_block, self._sent_end = max(self._last_block, block.block_id), max(self._sent_end, end)
+        while len(self._sent) > _REMEMBERED_BLOCKS:
+            del self._sent[next(iter(self._sent))]
+
+    def passes(self, link: Link, message: Message, receive_ns: int) -> bool:
+        """Whether to act on a message; False for one that is to be dropped. Raises DeviceError naming the field."""
+        device = link.name
+        if not isinstance(message, _KINDS[device]):
+            raise lie(device, "a message", type(message).__name__, f"what a {device} has to say")
+        if isinstance(message, pb.FrameChunk):
+            self._check_chunk(device, message, receive_ns)
+        elif isinstance(message, pb.Applied):
+            return self._check_applied(device, message, receive_ns)
+        elif isinstance(message, pb.CommandAck):
+            self._check_command_ack(device, message, receive_ns)
+        elif isinstance(message, pb.TruthChunk):
+            self._check_truth_chunk(device, message)
+        elif isinstance(message, pb.ClockReply):
+            _check_times(device, message, ("device_receive_ns", "device_send_ns"))
+        elif isinstance(message, pb.Ack):
+            latest = max(self._sent_end, self._end(receive_ns))
+            if message.step > latest:
+                raise lie(device, "Ack.step", message.step, f"at most {latest}, where the device is at most")
+        return True
+
+    def check_step(self, device: str, step: int, now_ns: int) -> None:
+        """Refuse a step that a device is in by its clock and cannot be in. Raises DeviceError."""
+        slack = round(_SLACK_S * 1e9) // self._step_ns
+        end = self._end(now_ns)
+        if not self._first_step - slack <= step <= end:
+            what = f"a time that puts it between its fast steps {self._first_step - slack} and {end}"
+            raise lie(device, "Identity.step_zero_ns and ClockReply", f"fast step {step}", what)
+
+    def check_frame(self, device: str, frame: Frame) -> None:
+        """Refuse a frame with counts that its converter cannot give. Raises DeviceError."""
+        bits = self._planes[frame.plane][1]
+        brightest = int(frame.pixels.max())
+        if brightest >> bits:
+            raise lie(
+                device, f"a pixel of frame {frame.frame_id}", brightest, f"at most {(1 << bits) - 1} ({bits} bits)"
+            )
+
+    def check_truth(self, device: str, truth: pb.Truth, frame_id: int) -> None:
+        """Refuse a truth that is not one of this rig. Raises DeviceError."""
+        rig, path = self._rig, truth.path or truth.path_single
+        outputs, axes = rig.n_outputs, rig.plant.axes
+        pairs = [
+            ("frame_id", truth.frame_id, frame_id),
+            ("axes", truth.axes, axes),
+            ("n_outputs", truth.n_outputs, outputs),
+            ("path: numbers", len(path), outputs * rig.timing.exposure_steps),
+            ("end_state: numbers", len(truth.end_state), len(truth.start_state)),
+            ("start_state: numbers beyond whole axes", len(truth.start_state) % axes, 0),
+        ]
+        for name, found, expected in pairs:
+            if found != expected:
+                raise lie(device, f"Truth.{name}", found, str(expected))
+        for name, numbers in (("path", path), ("start_state", truth.start_state), ("end_state", truth.end_state)):
+            if not np.isfinite(np.array(numbers)).all():
+                raise lie(device, f"Truth.{name}", "a number that is not finite", "finite ones")
+
+    def check_virtual_time(self, link: Link, handed: pb.VirtualTime) -> None:
+        """Refuse a host time that what was sent does not explain. Raises DeviceError.
+
+        On virtual time commands drive time, so the rig cannot be later than the end of what it was told to do, the
+        time-outs that the host let pass, and what packets take on their way.
+        """
+        hub, before = self._hub, link.handed
+        for each in hub.links:
+            name = f"{each.name}_packets"
+            taken, least = getattr(handed, name), getattr(before, name) if before else 0
+            if not least <= taken <= each.sent_packets:
+                raise lie(link.name, f"VirtualTime.{name}", taken, f"{least} to {each.sent_packets}")
+        delay_s = _SLACK_S + (_DELAY_S + 4 * self._rig.simulation.latency_s) * sum(e.sent_packets for e in hub.links)
+        driven_s = (self._sent_end - self._first_step) * self._step_ns / 1e9 * (1 + MOST_RATE_ERROR)
+        first_ns = before.host_ns if before else 0
+        last_ns = hub.virtual_since_ns + hub.elapsed_ns + round((driven_s + delay_s) * 1e9)
+        if not first_ns <= handed.host_ns <= last_ns:
+            raise lie(link.name, "VirtualTime.host_ns", handed.host_ns, f"{first_ns} to {last_ns}")
+
+    def _end(self, now_ns: int) -> int:
+        """First fast step that cannot have ended."""
+        if self._hub.virtual:
+            return self._sent_end
+        elapsed_s = max(now_ns - self._asked_ns, 0) / 1e9
+        return self._first_step + math.ceil((elapsed_s * (1 + MOST_RATE_ERROR) + _SLACK_S) * 1e9 / self._step_ns)
+
+    def _check_chunk(self, device: str, chunk: pb.FrameChunk, receive_ns: int) -> None:
+        head = (
+            chunk.frame_id, chunk.plane, chunk.total, chunk.width, chunk.height, chunk.first_step, chunk.last_step,
+            chunk.exposure_start_ns, chunk.exposure_end_ns, chunk.exposure_offset_ns,
+        )  # fmt: skip
+        if not 0 < len(chunk.data) <= chunk.total - chunk.offset:
+            what = f"1 to {chunk.total - chunk.offset} bytes from offset {chunk.offset} on"
+            raise lie(device, "FrameChunk.data", f"{len(chunk.data)} bytes", what)
+        if head == self._frame_head:
+            return
+        timing, end = self._rig.timing, self._end(receive_ns)
+        if chunk.plane >= len(self._planes):
+            raise lie(device, "FrameChunk.plane", chunk.plane, f"below {len(self._planes)}")
+        rows, columns = self._planes[chunk.plane][0]
+        first = chunk.first_step
+        pairs = [
+            ("height", chunk.height, rows),
+            ("width", chunk.width, columns),
+            ("total", chunk.total, 2 * rows * columns),
+            ("last_step", chunk.last_step, first + timing.exposure_steps - 1),
+        ]
+        for name, found, expected in pairs:
+            if found != expected:
+                raise lie(device, f"FrameChunk.{name}", found, str(expected))
+        if chunk.last_step >= end:
+            what = f"below {end}, where the device is at most"
+            raise lie(device, "FrameChunk.last_step", chunk.last_step, what)
+        if chunk.exposure_offset_ns >= self._step_ns:
+            raise lie(device, "FrameChunk.exposure_offset_ns", chunk.exposure_offset_ns, f"below {self._step_ns}")
+        _check_times(device, chunk, ("exposure_start_ns", "exposure_end_ns"))
+        if self._frame_id >= 0:
+            self._check_order(device, chunk.frame_id, first)
+        elif chunk.frame_id > MOST_STEP:
+            raise lie(device, "FrameChunk.frame_id", chunk.frame_id, "at most 2^53")
+        if chunk.frame_id >= self._frame_id:
+            self._frame_id, self._frame_step, self._frame_head = chunk.frame_id, first, head
+
+    def _check_order(self, device: str, frame_id: int, first_step: int) -> None:
+        """Whether a frame can follow the one before: a newer one begins later, and its id is as much higher at most."""
+        timing, before, since = self._rig.timing, self._frame_id, first_step - self._frame_step
+        if frame_id == before and since:
+            what = f"{self._frame_step}, as the rest of frame {frame_id} has"
+            raise lie(device, "FrameChunk.first_step", first_step, what)
+        if frame_id > before and since < timing.exposure_steps:
+            what = (
+                f"at least {self._frame_step + timing.exposure_steps}, for frame {before} began at {self._frame_step}"
+            )
+            raise lie(device, "FrameChunk.first_step", first_step, what)
+        most = before + since // timing.frame_period_steps + 1
+        if frame_id > before and frame_id > most:
+            what = f"at most {most}, {since} fast steps after frame {before}"
+            raise lie(device, "FrameChunk.frame_id", frame_id, what)
+
+    def _check_applied(self, device: str, applied: pb.Applied, receive_ns: int) -> bool:
+        n_inputs, numbers = self._rig.n_inputs, len(applied.u)
+        end, sources = applied.first_step + applied.n_steps, pb.Applied.Source
+        if applied.source not in sources.values() or applied.source == pb.Applied.AWAITED:
+            what = f"one of {[each for each in sources.values() if each != pb.Applied.AWAITED]}"
+            raise lie(device, "Applied.source", applied.source, what)
+        known = applied.source != pb.Applied.NOT_REPORTED
+        if not applied.n_steps or numbers != known * applied.n_steps * n_inputs:
+            what = f"as many as it has inputs for, {numbers / n_inputs:g}, at least 1" if known else "no inputs with it"
+            raise lie(device, "Applied.n_steps", applied.n_steps, what)
+        if end <= self._first_step:  # of a session before
+            return False
+        latest = self._end(receive_ns)
+        if end > latest:
+            what = f"to end by {latest}, where the device is at most"
+            raise lie(device, "Applied.first_step + n_steps", end, what)
+        if not applied.block_id and applied.source in (pb.Applied.COMMAND, pb.Applied.CLIPPED):
+            raise lie(device, "Applied.block_id", 0, f"a command's, where the source is {sources.Name(applied.source)}")
+        if applied.block_id > self._last_block:
+            raise lie(
+                device, "Applied.block_id", applied.block_id, f"at most {self._last_block}, the newest that was sent"
+            )
+        first_sent, end_sent = self._sent.get(applied.block_id, (0, MOST_STEP))
+        if applied.first_step < first_sent or end > end_sent:
+            what = f"steps {first_sent} to {end_sent - 1} of block {applied.block_id}"
+            raise lie(device, "Applied.first_step", f"{applied.first_step} (to {end - 1})", what)
+        u = np.array(applied.u, dtype=np.float64).reshape(-1, n_inputs)
+        inside = (u >= self._input_min) & (u <= self._input_max)
+        if not inside.all():  # NaN fails as well
+            step, channel = np.argwhere(~inside)[0]
+            mirror = self._rig.mirror
+            limits = f"{mirror.input_min[channel]:g} to {mirror.input_max[channel]:g}, its limits"
+            raise lie(
+                device,
+                f"Applied.u (input {channel} at fast step {applied.first_step + step})",
+                u[step, channel],
+                limits,
+            )
+        _check_times(device, applied, ("device_ns",))
+        return True
+
+    def _check_command_ack(self, device: str, ack: pb.CommandAck, receive_ns: int) -> None:
+        if not 0 < ack.block_id <= self._last_block:
+            raise lie(device, "CommandAck.block_id", ack.block_id, f"1 to {self._last_block}, those that were sent")
+        if ack.code not in pb.Code.values():
+            raise lie(device, "CommandAck.code", ack.code, f"one of {pb.Code.values()}")
+        if ack.block_id in self._sent:
+            first, end = self._sent[ack.block_id]
+            for name in ("late_steps", "superseded_steps"):
+                if (found := getattr(ack, name)) > end - first:
+                    raise lie(
+                        device, f"CommandAck.{name}", found, f"at most {end - first}, the steps of block {ack.block_id}"
+                    )
+        latest = max(self._sent_end, self._end(receive_ns))
+        if ack.queue_end_step > latest:
+            raise lie(device, "CommandAck.queue_end_step", ack.queue_end_step, f"at most {latest}")
+
+    def _check_truth_chunk(self, device: str, chunk: pb.TruthChunk) -> None:
+        if not 0 < chunk.total <= self._most_truth:
+            raise lie(device, "TruthChunk.total", chunk.total, f"1 to {self._most_truth} bytes")
+        if not 0 < len(chunk.data) <= chunk.total - chunk.offset:
+            what = f"1 to {chunk.total - chunk.offset} bytes from offset {chunk.offset} on"
+            raise lie(device, "TruthChunk.data", f"{len(chunk.data)} bytes", what)
+
+
+def _check_times(device: str, message: Message, names: Iterable[str]) -> None:
+    for name in names:
+        if abs(time_ns := getattr(message, name)) > MOST_TIME_NS:
+            field = f"{type(message).__name__}.{name}"
+            raise lie(device, field, time_ns, f"within {MOST_TIME_NS} ns of the device's zero")
