@@ -217,6 +217,7 @@ def record(
 ) -> None:
     """Record a session: play the rig's drive, record everything, estimate on the way.
 
+    In real time an estimator that is slower than the camera skips exposures; the recording has them all.
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
     """
     from aolink import session
@@ -305,7 +306,10 @@ def replay(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Play a recording again: through the estimators as if it were live, or to a rig."""
+    """Play a recording again: through the estimators as if it were live, or to a rig.
+
+    What an estimator skipped in the session for want of time, it skips again; `aolink estimate` skips nothing.
+    """
     recording = open_recording(file)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     get_ready(recording.rig, names)

@@ -420,10 +420,13 @@ class SessionLoop:
             if name in self.report.estimation:
                 self.report.estimation[name].add(outcome)
                 self._record(topics.estimation_topic(name), outcome.account(), log_time_ns)
-            self._unsettled[frame_id].append(outcome)
+            outcomes_so_far = self._unsettled[frame_id]
+            if message is not None and all(each.message is None for each in outcomes_so_far):
+                self._know(frame_id, self._hub.now_ns())
+            outcomes_so_far.append(outcome)
             if message is None:
                 self._note_failures()
-            if len(self._unsettled[frame_id]) == len(self._estimating.names):
+            if len(outcomes_so_far) == len(self._estimating.names):
                 self._settle(frame_id)
 
     def _note_failures(self) -> None:
@@ -437,10 +440,14 @@ class SessionLoop:
     def _settle(self, frame_id: int) -> None:
         """All estimators are done with an exposure, or have skipped it."""
         outcomes = self._unsettled.pop(frame_id)
-        self._newest_frame = max(self._newest_frame, frame_id)
-        skipped = bool(outcomes) and all(each.message is None for each in outcomes)
-        self._latencies.estimated(frame_id, 0 if skipped else self._hub.now_ns())
+        if all(each.message is None for each in outcomes):
+            self._know(frame_id, 0 if outcomes else self._hub.now_ns())
         self._show_unseen()
+
+    def _know(self, frame_id: int, estimated_ns: int) -> None:
+        """From now on commands know a frame: its first estimate is there, or there will be none."""
+        self._newest_frame = max(self._newest_frame, frame_id)
+        self._latencies.estimated(frame_id, estimated_ns)
 
     def _take_applied(self, applied: wire.Applied, receive_ns: int) -> None:
         self._record(topics.APPLIED, applied, receive_ns)

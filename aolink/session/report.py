@@ -111,7 +111,8 @@ class Report:
 class LatencyBook:
     """The way of each frame from the end of its exposure to the command that knew it. Real time only.
 
-    A command knows a frame when it is sent after the last estimator was done with the frame, or had skipped it.
+    A command knows a frame when it is sent after the first estimate of the frame was there, or all estimators had
+    skipped it. (What each estimator takes is in `EstimatorReport`.)
     """
 
     def __init__(self, report: Report, record: Callable[[pb.Latency, int], None]) -> None:
@@ -120,14 +121,14 @@ class LatencyBook:
         self._blocks: dict[int, int] = {}
         """First command block that knew a frame, by frame."""
         self._known: set[int] = set()
-        """Frames that all estimators are done with, and no command is known of."""
+        """Frames that the next command knows."""
 
     def frame(self, latency: pb.Latency) -> None:
         """A frame is complete."""
         self._open[latency.frame_id] = latency
 
     def estimated(self, frame_id: int, now_ns: int) -> None:
-        """All estimators are done with a frame; ``now_ns`` is 0 if they have skipped it."""
+        """The first estimate of a frame is there; ``now_ns`` is 0 if all estimators have skipped it."""
         if latency := self._open.get(frame_id):
             latency.estimated_ns = now_ns
             self._known.add(frame_id)

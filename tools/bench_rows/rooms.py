@@ -9,7 +9,7 @@ ROWS = {
         "frame_synthesis", "diffraction_synthesis", "picture_synthesis", "coupled_exposure", "cost_against_lenslets",
         "turbulence", "zonal_wavefront",
     ),
-    "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz"),
+    "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz", "slow_estimator"),
     "recording": (
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes",

@@ -19,6 +19,7 @@ from bench_rows.row import Effort, Row
 
 _MINUTE_EXPOSURES = 300
 _LENSLET_FRAMES = 500
+_SLOW_EXPOSURES = 400
 
 
 def link_throughput(effort: Effort) -> Row:
@@ -90,6 +91,35 @@ def commands_at_1_khz(effort: Effort) -> Row:
         f"{report.steps_late} steps late, {lost} lost",
         "limit 0",
         1.0 if not (report.steps_late or lost or report.frames_lost) else 0.0,
+        1.0,
+    )
+
+
+def slow_estimator(effort: Effort) -> Row:
+    """A session in real time with an estimator that is slower than the camera, and one without: what else it costs."""
+    from aolink.demo import simulated_rig
+    from aolink.rig import load_rig, parse_rig
+    from aolink.session import record
+
+    # 20 exposures a second, of which each takes `sampled` some tenths of a second.
+    text = load_rig("section-vi-lively").toml.replace("exposure_steps = 200", "exposure_steps = 50")
+    reports, count = [], effort.of(_SLOW_EXPOSURES, 20)
+    with tempfile.TemporaryDirectory() as folder:
+        (source := Path(folder) / "fast.toml").write_text(text)
+        for names in ([], ["sampled"]):
+            with simulated_rig(source, "--real-time") as ports:
+                path = Path(folder) / f"{len(names)}.mcap"
+                reports.append(record(parse_rig(text), *ports, path, estimators=names, exposures=count))
+    lost, with_slow = (
+        each.frames_lost + each.frames_incomplete + each.steps_commanded - each.steps_applied for each in reports
+    )
+    counted = reports[1].estimation["sampled"]
+    return Row(
+        f"live session, an estimate takes {statistics.median(counted.took_ms):.0f} ms of a frame period of 50 ms:"
+        f" {counted.estimated} estimated, {counted.skipped} skipped",
+        f"{with_slow} frames and steps lost or late",
+        f"{lost} without estimator",
+        1.0 if with_slow <= lost else lost / with_slow,
         1.0,
     )
 
