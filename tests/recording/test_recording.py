@@ -320,3 +320,12 @@ def test_no_schema_has_a_map() -> None:
         inner = [each.message_type for each in kind.fields if each.message_type is not None]
         waiting += [each for each in inner if each.full_name not in seen]
     assert "foxglove.RawImage" in seen
+
+
+def test_a_recording_is_used_as_simulated_exposures_are(recorded: Session) -> None:
+    recording = Recording(recorded.path)
+    first = [exposure.frame_id for exposure in recording]
+    assert first == [exposure.frame_id for exposure in recording.exposures()]
+    assert first == [exposure.frame_id for exposure in recording]  # it begins anew each time
+    estimates = aolink.estimate(recording, "o3")
+    assert [each.frame_id for _, each in zip(recording, estimates, strict=True)] == first

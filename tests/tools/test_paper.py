@@ -41,7 +41,7 @@ NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("paper") / "made" / "here"
     command = [sys.executable, str(TOOLS / "paper"), "--quick", "--out", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=900, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=3000, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [str(folder / name) for name in ("paper.md", "shahin.md")]
     return folder
