@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation.estimate import Estimate
+from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure
 
 FloatArray = NDArray[np.float64]
@@ -39,6 +39,9 @@ class Score:
 
     exposures: int
     """Exposures with truth that were scored."""
+    gated: int
+    """Estimates whose measurement was too far from its prediction in some axis and was not used there (status GATED or
+    DIVERGED); exposures without truth are counted, too."""
     start_rmse: float
     """Root mean square over exposures and axes of the norm of the error of the start state (Mishra & Wen, figure 5)."""
     end_rmse: float
@@ -57,10 +60,11 @@ class Scorer:
         self._exposures = self._states = 0
         self._start, self._end, self._path = _Sum(), _Sum(), _Sum()
         self._start_nees, self._end_nees, self._nis = _Sum(), _Sum(), _Sum()
-        self._measurements = 0
+        self._measurements = self._gated = 0
 
     def add(self, exposure: Exposure, estimate: Estimate) -> None:
-        """Count one exposure's estimate; where the exposure has no truth, nothing."""
+        """Count one exposure's estimate; where the exposure has no truth, only whether it was gated."""
+        self._gated += estimate.status in (Status.GATED, Status.DIVERGED)
         truth = exposure.truth
         if truth is None:
             return
@@ -81,6 +85,7 @@ class Scorer:
         """The score of what was added so far."""
         return Score(
             exposures=self._exposures,
+            gated=self._gated,
             start_rmse=math.sqrt(self._start.mean),
             end_rmse=math.sqrt(self._end.mean),
             path_rmse=math.sqrt(self._path.mean),
