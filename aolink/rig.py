@@ -25,6 +25,7 @@ from aolink.rig_parts import MirrorDriver as MirrorDriver
 from aolink.rig_parts import Plant as Plant
 from aolink.rig_parts import Simulation as Simulation
 from aolink.rig_parts import Timing as Timing
+from aolink.rig_parts import UnmodelledSlopes as UnmodelledSlopes
 from aolink.scene import SceneSensor, read_scene
 from aolink.sensor import BaseSensor, read_calibration, read_grid, read_sensor
 from aolink.sensor import CalibrationTable as CalibrationTable

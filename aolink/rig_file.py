@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from aolink.blocks import stationary_covariance
 from aolink.errors import RigError
 from aolink.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
-from aolink.rig_parts import Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing
+from aolink.rig_parts import Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, UnmodelledSlopes
 from aolink.sensor import read_grid
 from aolink.toml_table import Table, shape_text
 
@@ -18,6 +18,9 @@ FloatArray = NDArray[np.float64]
 
 # A row of them, and their limits, in one message of the protocol.
 _MOST_INPUTS = 10_000
+# Each output has a coefficient of its own for the slopes that the model leaves out, and estimators keep the covariance
+# of all of them: of 512 it is 2 MB an exposure.
+_MOST_UNMODELLED = 512
 
 
 def read_plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
@@ -32,20 +35,39 @@ def read_plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
         spots = int(optics.lit.sum()) if optics else math.prod(read_grid(root.table("sensor")))
         model = read_tip_tilt(table, spots, timing.fast_step_s)
     else:
-        return _plant_by_matrices(table)
+        return _plant_by_matrices(table, timing)
     # A number is the variance of each noise.
     W = np.diag(table.vector("process_noise", model.B_w.shape[1], "noises"))
     if (W < 0).any():
         raise RigError("plant.process_noise has a variance below zero")
+    unmodelled = _read_unmodelled(table, len(model.C), timing)
     table.finish()
     initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
-        initial_covariance=initial, axes=1,
+        initial_covariance=initial, axes=1, unmodelled=unmodelled,
     )  # fmt: skip
 
 
-def _plant_by_matrices(table: Table) -> Plant:
+def _read_unmodelled(table: Table, n_outputs: int, timing: Timing) -> UnmodelledSlopes | None:
+    """The table ``[plant.unmodelled]``; None where the file has none."""
+    if not table.has("unmodelled"):
+        return None
+    if n_outputs > _MOST_UNMODELLED:
+        raise RigError(
+            f"{table.key('unmodelled')} is for at most {_MOST_UNMODELLED} slopes of one plant, this one has"
+            f" {n_outputs}: leave it out"
+        )
+    slopes = table.table("unmodelled")
+    unmodelled = UnmodelledSlopes(
+        sd=slopes.number("sd", above=0.0),
+        correlation_steps=slopes.number("correlation_s", above=0.0) / timing.fast_step_s,
+    )
+    slopes.finish()
+    return unmodelled
+
+
+def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
     A = table.matrix("A", (None, None), "states x states")
     n = A.shape[0]
     if A.shape != (n, n):
@@ -71,9 +93,11 @@ def _plant_by_matrices(table: Table) -> Plant:
     else:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)
+    unmodelled = _read_unmodelled(table, len(C), timing)
     table.finish()
     return Plant(
-        A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes
+        A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes,
+        unmodelled=unmodelled,
     )  # fmt: skip
 
 

@@ -13,6 +13,34 @@ from aolink.optics.mirror import VoltageLaw
 FloatArray = NDArray[np.float64]
 
 
+@dataclass(frozen=True, kw_only=True)
+class UnmodelledSlopes:
+    """Slopes that the camera sees and the plant's model does not make, as estimators expect them.
+
+    Such are the fitting error of a deformable mirror, which its actuators cannot make, and turbulence that no state
+    follows. They add to the outputs, theta(k) = C x(k) + v(k), with v Gaussian, independent of the state and from
+    output to output, and
+
+        Cov(v(i), v(j)) = sd^2 exp(-((i - j) / correlation_steps)^2)  within an exposure,  0 between exposures.
+
+    The mean of v over an exposure is one coefficient of each output in the exposure's model. Estimators that model the
+    noise inside an exposure estimate it from that exposure alone: between exposures this model remembers nothing of v.
+    What v does about its mean widens the spot.
+    """
+
+    sd: float
+    """Standard deviation of the slopes at any one time, slope units."""
+    correlation_steps: float
+    """Fast steps in which their correlation falls to 1/e."""
+
+    def variances(self, n_steps: int) -> tuple[float, float]:
+        """Variance of the mean over an exposure and mean variance about it, slope units squared; they sum to sd^2."""
+        lag = np.arange(1, n_steps)
+        pairs = n_steps + 2 * float(((n_steps - lag) * np.exp(-((lag / self.correlation_steps) ** 2))).sum())
+        share = pairs / n_steps**2
+        return self.sd**2 * share, self.sd**2 * (1 - share)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plant:
     """The fast-rate plant, x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x(k)  (Mishra & Wen (1)).
@@ -36,6 +64,8 @@ class Plant:
     """Covariance of x(0), (n_states, n_states)."""
     axes: int
     """Number of independent copies."""
+    unmodelled: UnmodelledSlopes | None = None
+    """What estimators expect of the outputs beside C x(k); None for nothing."""
 
     @property
     def n_states(self) -> int:

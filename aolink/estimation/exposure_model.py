@@ -6,6 +6,11 @@ With z = (x(k0), xi), xi ~ N(0, I) the coefficients of the process noise inside 
 
 Every estimator is an update of z; they differ in what they observe, and in whether they model xi.
 
+Where the plant says so (`UnmodelledSlopes`), xi begins with one coefficient for each output: the mean over the exposure
+of the slopes v that the plant does not make, in their standard deviations. It moves the output for the whole exposure
+and leaves the end state alone. What v does about its mean has no coefficient; it widens spots by its variance, and the
+standard deviation of a path contains it.
+
 The spot rests where theta(k) has it for the whole of a fast step, as the sum in Mishra & Wen (3) takes it. An exposure
 that starts a part f of a step late loses as much of its first step and gains as much of the one after its last:
 a mean over it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end state and path stay those
@@ -70,8 +75,21 @@ class ExposureModel:
         """C-bar, (n_outputs, n_states)."""
         self.moved = 0.0
         """f/N: the share of the exposure that is in the step after its last, and not in its first."""
-        # Many outputs are sums of few states: what is computed then are paths of the states.
-        self._few = replace(plant, C=np.eye(plant.n_states)) if plant.n_outputs > plant.n_states else plant
+        self._set_unmodelled()
+        # Many outputs are sums of few states, unless each has a slope of its own: what is computed then are paths of
+        # the states.
+        few = plant.n_outputs > plant.n_states and not self.n_unmodelled
+        self._few = replace(plant, C=np.eye(plant.n_states)) if few else plant
+
+    def _set_unmodelled(self) -> None:
+        unmodelled = self.plant.unmodelled
+        mean, rest = unmodelled.variances(self.n_steps) if unmodelled else (0.0, 0.0)
+        self.n_unmodelled = self.plant.n_outputs if unmodelled else 0
+        """Coefficients of `UnmodelledSlopes`, which come after the start state; the process noise comes after them."""
+        self.unmodelled_sd = float(np.sqrt(mean))
+        """Standard deviation of their means over the exposure, slope units."""
+        self.unmodelled_rest = rest
+        """Mean variance of them about these means, slope units squared."""
 
     def starting(self, offset: float) -> ExposureModel:
         """The same for exposures that start so far into their first fast step, in fast steps, 0 <= offset < 1."""
@@ -105,8 +123,16 @@ class ExposureModel:
         return np.asarray(self.plant.C @ self.transition)
 
     @property
+    def rows_after(self) -> FloatArray:
+        """What the coefficients make of the outputs in the step after the last, (n_outputs, n_coefficients)."""
+        rows = np.asarray(self.plant.C @ self.end_rows)
+        n = self.plant.n_states
+        rows[:, n : n + self.n_unmodelled] = self.unmodelled_sd * np.eye(len(rows), self.n_unmodelled)
+        return rows
+
+    @property
     def n_coefficients(self) -> int:
-        """States and noise coefficients together."""
+        """States, unmodelled slopes and noise coefficients together."""
         return int(self.end_rows.shape[1])
 
     @property
@@ -144,6 +170,10 @@ class ExposureModel:
         impulse = rows @ root  # C A^i B_w, (n_outputs, n_steps, n_noises)
         energy = (np.arange(n_steps - 1, -1, -1)[:, None] * self._squares(impulse)).sum()
         paths, ends, found = [rows], [self.transition], 0.0
+        if self.n_unmodelled:
+            own = self.unmodelled_sd * np.eye(self.n_unmodelled)
+            paths.append(np.repeat(own[:, None], n_steps, axis=1))
+            ends.append(np.zeros((plant.n_states, self.n_unmodelled)))
         phase = np.pi * (np.arange(n_steps) + 0.5) / n_steps
         driven = [replace(plant, B=column[:, None], axes=1) for column in root.T]
         for m in range(min(_MOST_NOISE_MODES, n_steps)):
@@ -239,6 +269,8 @@ class ExposureModel:
         for start in range(0, self.n_steps, _TIME_BLOCK):
             rows = np.ascontiguousarray(basis[:, start : start + _TIME_BLOCK, :count])
             variance[..., start : start + _TIME_BLOCK] = stacked.dot(stacked.matmul(rows, covariance), rows)
+        if count > self.plant.n_states:
+            variance += self.unmodelled_rest
         return np.sqrt(np.maximum(variance, 0.0))
 
     @cached_property

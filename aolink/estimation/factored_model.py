@@ -104,6 +104,7 @@ class FactoredModel(ExposureModel):
         self.plant, self.n_steps, self.systems = plant, n_steps, systems
         self.transition, self.process_noise = lift(plant, n_steps)
         self.moved = 0.0
+        self._set_unmodelled()
         self.state_courses = output_rows(systems.one, n_steps)[0]
         """C_1 A_1^k of one system, (n_steps, n)."""
         self.mean_row = self._of_states(self.state_courses.mean(axis=0))
@@ -146,17 +147,20 @@ class FactoredModel(ExposureModel):
         """P, (n_outputs, n_coefficients)."""
         own = np.empty((len(self.systems.gains), self.plant.n_states))
         own[:, self.systems.order] = self.systems.gains[:, :, None]
-        return np.concatenate([own, self.noise.patterns], axis=1)
+        unmodelled = self.unmodelled_sd * np.eye(len(own), self.n_unmodelled)
+        return np.concatenate([own, unmodelled, self.noise.patterns], axis=1)
 
     @cached_property
     def functions(self) -> FloatArray:
         """The distinct courses, (n_steps, m)."""
-        return np.concatenate([self.state_courses, self.noise.courses], axis=1)
+        still = np.ones((self.n_steps, min(self.n_unmodelled, 1)))
+        return np.concatenate([self.state_courses, still, self.noise.courses], axis=1)
 
     @cached_property
     def after(self) -> FloatArray:
         """The distinct courses in the step after the last, (m,)."""
-        return np.append(self.systems.one.C @ self.transition_of_one, self.noise.after)
+        still = np.ones(min(self.n_unmodelled, 1))
+        return np.concatenate([self.systems.one.C[0] @ self.transition_of_one, still, self.noise.after])
 
     @cached_property
     def course_of(self) -> Indices:
@@ -164,7 +168,8 @@ class FactoredModel(ExposureModel):
         each = self.systems.order.shape[1]
         own = np.empty(self.plant.n_states, dtype=np.intp)
         own[self.systems.order] = np.arange(each)
-        return np.append(own, each + self.noise.course_of)
+        still = np.full(self.n_unmodelled, each)
+        return np.concatenate([own, still, each + min(self.n_unmodelled, 1) + self.noise.course_of])
 
     @property
     def noise_left_out(self) -> float:
@@ -189,7 +194,8 @@ class FactoredModel(ExposureModel):
 
     @cached_property
     def _end_rows(self) -> FloatArray:
-        return np.concatenate([self.transition, self.noise.ends], axis=1)
+        unmodelled = np.zeros((len(self.transition), self.n_unmodelled))
+        return np.concatenate([self.transition, unmodelled, self.noise.ends], axis=1)
 
     def columns(self, count: int) -> list[Indices]:
         """Which of the first ``count`` coefficients have each of the distinct courses."""
@@ -230,7 +236,7 @@ class FactoredModel(ExposureModel):
         """Standard deviation of the path, as of `ExposureModel`; with process noise in it, also what is left out."""
         variance = ((self.functions @ self.of_outputs(covariance)) * self.functions).sum(axis=3)
         if covariance.shape[1] > self.plant.n_states:
-            variance += self.noise.left_out[:, None]
+            variance += self.noise.left_out[:, None] + self.unmodelled_rest
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
     def of_outputs(self, covariance: FloatArray) -> FloatArray:

@@ -47,13 +47,13 @@ class JointPaths:
 
     def __init__(self, model: FactoredModel, sensor: SpotSensor) -> None:
         self.model = model
-        n = model.plant.n_states
+        n = model.plant.n_states + model.n_unmodelled
         variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
         energy = (model.patterns[:, n:] ** 2).sum(axis=0) * (model.functions**2).mean(axis=0)[model.course_of[n:]]
         rest = np.append(np.cumsum(energy[::-1])[::-1], 0.0) + model.noise.left_out.sum()
         enough = np.flatnonzero(rest <= _LEFT_OUT**2 * variance * model.plant.n_outputs)
         kept = int(enough[0]) if len(enough) else len(energy)
-        self.widening = float(rest[kept]) / model.plant.n_outputs
+        self.widening = float(rest[kept]) / model.plant.n_outputs + model.unmodelled_rest
         """Mean variance of the path that is left out, which the kernel is to be widened by."""
         self.size = n + kept
         """Coefficients."""
@@ -170,8 +170,9 @@ class JointPaths:
         basis = np.zeros((2, nodes, 2, m))
         basis[0, :, 0] = basis[1, :, 1] = self.functions
         return Nodes(
-            basis=basis.reshape(2, nodes, 2 * m), weights=self.weights, inputs=self.inputs.reshape(self.spots, 2, nodes)
-        )
+            basis=basis.reshape(2, nodes, 2 * m), weights=self.weights,
+            inputs=self.inputs.reshape(self.spots, 2, nodes), widening=self.model.unmodelled_rest,
+        )  # fmt: skip
 
     def shares_of_spots(self, t: FloatArray) -> FloatArray:
         """`shares` of each spot, (spots, 2 m)."""

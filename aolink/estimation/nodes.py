@@ -11,7 +11,7 @@ foreseen to go further from one to the next than a spot is wide, more.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -87,10 +87,12 @@ class Nodes:
     """Each node's share of the exposure, (nodes,)."""
     inputs: FloatArray
     """The response to the inputs, (axes, n_outputs, nodes)."""
+    widening: float = 0.0
+    """Variance of the slopes about each node that no coefficient has, slope units squared."""
 
     def part(self, axes: slice) -> Nodes:
         """Of these axes alone."""
-        return Nodes(basis=self.basis, weights=self.weights, inputs=self.inputs[axes])
+        return replace(self, inputs=self.inputs[axes])
 
 
 def nodes_of(model: ExposureModel, response: InputResponse, q: Quadrature) -> Nodes:
@@ -99,12 +101,12 @@ def nodes_of(model: ExposureModel, response: InputResponse, q: Quadrature) -> No
     inputs = q.at(response.path)
     if model.moved:
         # So much of the first step is not in the exposure, but in the step after its last.
-        ends = (model.basis[:, 0], model.plant.C @ model.end_rows)
+        ends = (model.basis[:, 0], model.rows_after)
         late = (response.path[:, :, 0], model.last_response(response.end))
         basis = np.concatenate([basis, np.stack(ends, axis=1)], axis=1)
         weights = np.append(weights, [-model.moved, model.moved])
         inputs = np.concatenate([inputs, np.stack(late, axis=2)], axis=2)
-    return Nodes(basis=basis, weights=weights, inputs=inputs)
+    return Nodes(basis=basis, weights=weights, inputs=inputs, widening=model.unmodelled_rest)
 
 
 @dataclass(frozen=True, eq=False)

@@ -130,7 +130,7 @@ def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_st
         seen = nodes.resolution(_paths(model, expand), variance, sensor.profile)
     return Reduction(
         expand=expand, left_out=hidden, end_rows=model.end_rows @ expand, end_remainder=remainder,
-        widening=float(rest[kept]), resolution=seen,
+        widening=float(rest[kept]) + model.unmodelled_rest, resolution=seen,
     )  # fmt: skip
 
 

@@ -89,6 +89,9 @@ class Score:
     """Whether the estimator takes measurements at all; `open-loop` does not."""
     unused: tuple[Unused, ...]
     """Why measurements were not used, the most frequent reason first."""
+    gated: int
+    """Estimates whose measurement was too far from its prediction in some axis and was not used there (status GATED or
+    DIVERGED); exposures without truth are counted, too."""
     start_rmse: float
     """Root mean square over exposures and axes of the norm of the error of the start state (Mishra & Wen, figure 5)."""
     end_rmse: float
@@ -115,13 +118,14 @@ class Scorer:
         self._exposures = self._states = 0
         self._start, self._end, self._path = _Sum(), _Sum(), _Sum()
         self._start_nees, self._end_nees, self._nis = _Sum(), _Sum(), _Sum()
-        self._measurements = self._estimated = self._measured = 0
+        self._measurements = self._estimated = self._measured = self._gated = 0
         self._looks = False
         self._unused = UnusedCounter()
 
     def add(self, exposure: Exposure, estimate: Estimate) -> None:
         """Count one exposure's estimate; its errors only where the exposure has a truth."""
         self._estimated += 1
+        self._gated += estimate.status in (Status.GATED, Status.DIVERGED)
         self._looks |= estimate.status != Status.PREDICTED
         self._unused.add(estimate.status, estimate.reason, estimate.frame_id)
         if estimate.innovation.shape[1]:
@@ -149,6 +153,7 @@ class Scorer:
             measured=self._measured,
             looks=self._looks,
             unused=self._unused.result(),
+            gated=self._gated,
             start_rmse=math.sqrt(self._start.mean),
             end_rmse=math.sqrt(self._end.mean),
             path_rmse=math.sqrt(self._path.mean),

@@ -241,7 +241,7 @@ class WindowedMoments(Windowed[Profile]):
         spread = stacked.congruence(basis, about.covariance)
         W = self.window_weights(mean, np.einsum("akk->ak", spread), measured.mask)
         y, noise = self.measured(W, measured.density, measured.light)
-        return y, noise, self.regression(W, mean, spread, basis, nodes.weights)
+        return y, noise, self.regression(W, mean, spread, basis, nodes.weights, nodes.widening)
 
     def window_weights(self, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
         """Weights of the pixels about a path, (axes, sums, pixels), from its mean and variance, both (axes, nodes)."""
@@ -249,8 +249,9 @@ class WindowedMoments(Windowed[Profile]):
         return np.stack([self.function(p, u) * inside for p in self.orders], axis=1)
 
     def regression(
-        self, W: FloatArray, mean: FloatArray, spread: FloatArray, basis: FloatArray, weights: FloatArray
-    ) -> Regression:
+        self, W: FloatArray, mean: FloatArray, spread: FloatArray, basis: FloatArray, weights: FloatArray,
+        widening: float = 0.0,
+    ) -> Regression:  # fmt: skip
         """Regression of the weighted sums on the coefficients.
 
         Parameters
@@ -261,8 +262,12 @@ class WindowedMoments(Windowed[Profile]):
             Of the path at its nodes, (axes, nodes) and (axes, nodes, nodes).
         basis, weights:
             Rows of the exposure basis at the nodes, (nodes, n_coefficients), and the nodes' weights, (nodes,).
+        widening:
+            Variance of the path about its nodes that no coefficient has.
         """
         variance = np.maximum(np.einsum("akk->ak", spread), 0.0)
+        if widening:
+            variance = variance + widening
         g = expected_response(self.sensor.kernel.variance, self.sensor.edges, W, mean, variance)
         light = weights[:, None]
         # Mehler: Cov(g(a), g(b)) is the sum over j of C^j / j! times the means of the j-th derivatives.

@@ -102,7 +102,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         spread = stacked.congruence(rows, about.covariance).reshape(axes, *(self.spots, count, 2) * 2)
         own = np.einsum("askdske->askde", spread)
         along, across = self.window_functions(mean, np.einsum("askdd->askd", own), measured.mask)
-        fit = self.regression(along, across, mean, spread, rows, nodes.weights)
+        fit = self.regression(along, across, mean, spread, rows, nodes.weights, nodes.widening)
         y, noise = self.measured(along, across, measured.density, measured.light)
         return y, noise, fit
 
@@ -168,7 +168,7 @@ class WindowedSpots(Windowed[SpotWindows]):
 
     def regression(
         self, along: FloatArray, across: FloatArray, mean: FloatArray, spread: FloatArray, rows: FloatArray,
-        weights: FloatArray,
+        weights: FloatArray, widening: float = 0.0,
     ) -> Regression:  # fmt: skip
         """Regression of the weighted sums on the coefficients.
 
@@ -182,12 +182,14 @@ class WindowedSpots(Windowed[SpotWindows]):
             Of the exposure basis, (spots * nodes * 2, n_coefficients).
         weights:
             Of the nodes, (nodes,).
+        widening:
+            Variance of the path about its nodes that no coefficient has.
         """
         axes, spots = mean.shape[:2]
-        value, *derivatives = (
-            each * weights[:, None, None]
-            for each in self.expectations(along, across, mean, np.einsum("askdske->askde", spread))
-        )
+        own = np.einsum("askdske->askde", spread)
+        if widening:
+            own = own + widening * np.eye(2)
+        value, *derivatives = (each * weights[:, None, None] for each in self.expectations(along, across, mean, own))
         size = value.shape[-1]
         first, second, third = (stacked.transpose(d.reshape(axes, spots, -1, size)) for d in derivatives)
         of_spot = rows.reshape(spots, -1, rows.shape[-1])

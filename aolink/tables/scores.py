@@ -39,7 +39,10 @@ def score_all(recording: Recording, estimates: Mapping[str, Iterable[Estimate]])
 
 
 def scores(by_name: Mapping[str, Score]) -> Table:
-    """RMSE against truth, NIS and NEES with their 95 % bounds; what is outside its bounds is marked."""
+    """RMSE against truth, NIS and NEES with their 95 % bounds; what is outside its bounds is marked.
+
+    Where any exposure was gated, a column says how many.
+    """
     counted = max((each.exposures for each in by_name.values()), default=0)
     title = f"Estimates of {counted} exposures against the truth" if counted else "No truth in this recording: NIS only"
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, caption_justify="left", pad_edge=False)
@@ -54,6 +57,8 @@ def scores(by_name: Mapping[str, Score]) -> Table:
             "NEES start": lambda each: _consistency(each.start_nees),
             "NEES end": lambda each: _consistency(each.end_nees),
         }
+    if any(each.gated for each in by_name.values()):
+        columns["gated"] = lambda each: f"{each.gated}  "
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
     for name, each in by_name.items():

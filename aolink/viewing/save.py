@@ -175,8 +175,8 @@ def _summary(recording: Recording, exposures: list[Exposure], estimates: dict[st
         f"{len(exposures)} exposures of {steps} fast steps, {steps * rig.timing.fast_step_s:g} s each;"
         f" {frames - len(exposures)} frames lost.",
         "",
-        "| estimator | path RMSE (slope units) | end state | NIS (95 % bounds) |",
-        "| --- | --- | --- | --- |",
+        "| estimator | path RMSE (slope units) | end state | NIS (95 % bounds) | gated |",
+        "| --- | --- | --- | --- | --- |",
     ]
     by_frame = {e.frame_id: e for e in exposures}
     for name, sequence in estimates.items():
@@ -185,7 +185,7 @@ def _summary(recording: Recording, exposures: list[Exposure], estimates: dict[st
         path, end = (f"{x:.4f}" if result.exposures else "truth unknown" for x in (result.path_rmse, result.end_rmse))
         nis = result.nis
         shown = "" if np.isnan(nis.mean) else f"{nis.mean:.2f} ({nis.low:.2f} to {nis.high:.2f})"
-        lines.append(f"| {name} | {path} | {end} | {shown} |")
+        lines.append(f"| {name} | {path} | {end} | {shown} | {result.gated} of {len(known)} |")
     skipped = {name: n for name in estimates if (n := len(recording.skipped(name)))}
     if skipped:
         lines += ["", "Exposures skipped for want of time: " + ", ".join(f"{name} {n}" for name, n in skipped.items())]
