@@ -303,7 +303,8 @@ class SimulatedDevices:
         if first < min(oldest, end):
             n_steps = min(end, oldest) - first
             self._say("mirror", pb.Applied(first_step=first, n_steps=n_steps, source=pb.Applied.NOT_REPORTED))
-        elif first < end:
+            first += n_steps
+        if first < end:
             most = max(1, _PACKET_INPUTS // self.rig.n_inputs)
             held = [self._history[k - oldest] for k in range(first, min(end, first + most))]
             self._say("mirror", self._runs(first, held, most)[0])

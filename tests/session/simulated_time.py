@@ -141,12 +141,10 @@ class SimulatedTimeHub(Hub):
     def _move(self, end_ns: int) -> None:
         """On to the next event, but not beyond ``end_ns``."""
         ways = [*self.to_device.values(), *self.to_host.values()]
-        due_ns = min(
-            self.clock_ns + math.ceil(self.server.idle_s() * 1e9),
-            *(way.next_ns() for way in ways),
-            self.at[0][0] if self.at else math.inf,
-            end_ns,
-        )
+        events = [way.next_ns() for way in ways] + [at for at, _ in self.at]
+        # What has come already waits for a host that is held up: it is no event.
+        events = [at for at in events if at > self.clock_ns]
+        due_ns = min(self.clock_ns + math.ceil(self.server.idle_s() * 1e9), *events, end_ns)
         self.clock_ns = max(self.clock_ns + 1000, int(due_ns))
 
 

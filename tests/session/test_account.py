@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
+from aolink.session.account import Account
 from aolink.session.report import Report
 from aolink.simulation import devices
 from aolink.tables import recording_facts
@@ -212,16 +217,17 @@ def test_a_mirror_line_that_comes_back_in_time(seconds: float, tmp_path: Path) -
 
 
 def test_a_host_that_was_away_for_longer_than_twice_the_watchdog_does_not_go_on(tmp_path: Path) -> None:
-    hub, held_up = SimulatedTimeHub(RIG), list[int]()
+    rig, held_up = rig_with("watchdog_s = 0.5"), list[int]()
+    hub = SimulatedTimeHub(rig)
 
     def progress(exposures: int) -> None:
         if exposures == 5 and not held_up:
             held_up.append(exposures)
-            hub.hold_up(2.5)
+            hub.hold_up(1.5)
 
-    run = run_session(hub, RIG, tmp_path / "a.mcap", 100, progress=progress)
+    run = run_session(hub, rig, tmp_path / "a.mcap", 100, progress=progress)
     assert isinstance(run.error, DeviceError)
-    assert "the mirror was parked by its watchdog: it took no command for 2.5 s" in str(run.error)
+    assert "the mirror was parked by its watchdog: it took no command for 1.5 s" in str(run.error)
     check_account(run)
     assert run.report.steps_refused > 0
 
@@ -243,3 +249,111 @@ def test_long_blocks_keep_the_watchdog_quiet(tmp_path: Path) -> None:
     rig = parse_rig(RIG.toml.replace("block_steps = 50", "block_steps = 500\nwatchdog_s = 0.2"))
     run = run_session(SimulatedTimeHub(rig), rig, tmp_path / "a.mcap", 20)
     assert (run.error, run.report.rearmed, run.report.steps_applied) == (None, 0, 4000)
+
+
+def test_a_refusal_is_in_the_account_of_the_session_that_it_ends(tmp_path: Path) -> None:
+    """The device's limits change while the session goes on."""
+    hub = SimulatedTimeHub(RIG)
+    narrow = replace(RIG, mirror=replace(RIG.mirror, input_max=np.array([0.001])))
+    hub.at = [(1_300_000_000, lambda: setattr(hub.server.devices, "rig", narrow))]
+    run = run_session(hub, RIG, tmp_path / "a.mcap", 100)
+    assert isinstance(run.error, DeviceError)
+    assert "the mirror refused command block" in str(run.error)
+    check_account(run)
+    assert run.report.steps_refused == 50
+
+
+spans = st.tuples(st.integers(-20, 120), st.integers(1, 60))
+
+
+@given(
+    st.lists(
+        st.one_of(
+            st.tuples(st.just("block"), spans, st.booleans()),
+            st.tuples(st.just("advance"), st.integers(1, 80), st.booleans()),
+            st.tuples(st.just("park"), st.just(0), st.booleans()),
+            st.tuples(st.just("watchdog"), st.just(0), st.booleans()),
+            st.tuples(st.just("rearm"), st.just(0), st.booleans()),
+        ),
+        max_size=25,
+    ),
+    st.booleans(),
+)
+def test_the_account_agrees_with_the_device_whatever_it_is_told(
+    calls: list[tuple[str, object, bool]], all_arrive: bool
+) -> None:
+    """Blocks that overlap, come late or are refused, parking, the watchdog; answers and reports that are lost."""
+    device = devices.SimulatedDevices(RIG, virtual_time=True, step_zero_ns=0)
+    reports, account = AppliedReports(1_000_000, 0), Account(report := Report())
+    blocks: dict[int, range] = {}
+    acks: dict[int, pb.CommandAck] = {}
+    held: dict[int, int] = {}
+
+    def hear(*, lost: bool = False) -> None:
+        for message in [each.message for each in device.outbox]:
+            if isinstance(message, pb.CommandAck):
+                acks[message.block_id] = message
+                if all_arrive or not lost:
+                    account.answered(message)
+            elif isinstance(message, pb.Applied) and not lost:
+                for new in reports.take(message, 0):
+                    if new.source != pb.Applied.AWAITED:
+                        account.reported(new)
+        device.outbox.clear()
+
+    def advance(n_steps: int, lost: bool) -> None:
+        before = device.step
+        device.advance_to(before + n_steps)
+        hear(lost=lost)
+        while before < device.step:
+            device.handle("mirror", pb.AppliedQuery(first_step=before, n_steps=n_steps), 0)
+            answer = device.outbox.pop().message
+            assert isinstance(answer, pb.Applied)
+            held.update(dict.fromkeys(range(before, before + answer.n_steps), answer.block_id))
+            before += answer.n_steps
+
+    for what, value, lost in calls:
+        if what == "block":
+            assert isinstance(value, tuple)
+            first = max(device.step + value[0], 0)
+            block = pb.CommandBlock(
+                block_id=len(blocks) + 1,
+                first_step=first,
+                n_steps=value[1],
+                u=[0.06 if lost and all_arrive else 0.01] * value[1],
+            )
+            blocks[block.block_id] = range(first, first + value[1])
+            reports.begin(0)
+            account.commanded(block)
+            device.handle("mirror", block, 0)
+            hear(lost=lost)
+        elif what == "advance":
+            assert isinstance(value, int)
+            advance(value, lost)
+        elif what == "park":
+            device.handle("mirror", pb.Park(), 0)
+            account.parked_from(device.step)
+        elif what == "watchdog":
+            device.watchdog_expires()
+        else:
+            device.handle("mirror", pb.Rearm(), 0)
+        hear()
+    advance(200, False)
+    # What was missed is asked for, until all is known.
+    reports.expect_until(device.step, 0)
+    for _ in range(1000):
+        queries, _given_up = reports.ask(0, 0)
+        if not queries:
+            break
+        for query in queries:
+            device.handle("mirror", query, 0)
+        hear()
+    account.close()
+
+    assert ended(report) == report.steps_commanded == sum(map(len, blocks.values()))
+    assert report.steps_applied == sum(held.get(k) == name for name, steps in blocks.items() for k in steps)
+    if all_arrive:
+        refused = {name for name, ack in acks.items() if ack.code in (pb.OUT_OF_RANGE, pb.LATCHED)}
+        assert report.steps_refused == sum(len(blocks[name]) for name in refused)
+        assert report.steps_late == sum(ack.late_steps for ack in acks.values())
+        assert report.steps_not_reported == 0
