@@ -189,19 +189,34 @@ class _InputHistory:
         self._last = park
         self.reported_until = 0
         """First step that no report covers yet."""
+        self._known_until: int | None = None
+        """First step that no command, report or frame is of."""
 
     def add_applied(self, message: pb.Applied | Run) -> None:
-        self._add(self._applied, message)
-        self.reported_until = max(self.reported_until, message.first_step + message.n_steps)
+        end = message.first_step + message.n_steps
+        # A mirror reports what it has been told to do: a report of steps far beyond that would make everything late.
+        if self._known_until is not None and end > self._known_until + _MOST_LEAD_STEPS:
+            return
+        if self._add(self._applied, message):
+            self.reported_until = max(self.reported_until, end)
+            self.know(end)
 
     def add_command(self, message: pb.CommandBlock | Run) -> None:
-        self._add(self._commanded, message)
+        if self._add(self._commanded, message):
+            self.know(message.first_step + message.n_steps)
 
-    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> None:
+    def know(self, end: int) -> None:
+        """Something is known of the steps before ``end``."""
+        self._known_until = end if self._known_until is None else max(self._known_until, end)
+
+    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> bool:
+        """Take the inputs of a run of steps; False where there are not as many as it says."""
         n_steps, u = message.n_steps, message.u
         inputs = np.frombuffer(u, _DOUBLE) if isinstance(u, bytes) else np.array(u, dtype=np.float64)
-        if n_steps and inputs.size == n_steps * self._n_inputs:
-            blocks.append((message.first_step, inputs.reshape(n_steps, self._n_inputs)))
+        if not n_steps or inputs.size != n_steps * self._n_inputs:
+            return False
+        blocks.append((message.first_step, inputs.reshape(n_steps, self._n_inputs)))
+        return True
 
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
         """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
@@ -266,6 +281,7 @@ class Assembler:
     def add_frame(self, frame: Frame) -> list[Exposure]:
         """Take a frame; gives the exposures that are complete with it."""
         self._frames.append(frame)
+        self._history.know(frame.last_step + 1)
         return self._ready()
 
     def flush(self) -> list[Exposure]:

@@ -15,8 +15,8 @@ from aolink.simulation.server import RigServer
 from aolink.simulation.streams import PtyStream, Stream
 from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
 
-Lie = Callable[[Message], Message | list[Message] | bytes | None]
-"""What is sent in the place of a message: itself or another, several, bytes as they are, or None for nothing."""
+Lie = Callable[[Message], Message | Iterator[Message] | None]
+"""What is sent in the place of a message: itself or another, several, perhaps without end, or None for nothing."""
 
 
 class LyingStream:
@@ -41,18 +41,14 @@ class LyingStream:
             message = self._messages.take(packet)
             if message is not None:
                 said = self._lie(message)
-                for each in said if isinstance(said, list) else [said]:
-                    self._send(each)
+                for each in [said] if said is None or isinstance(said, Message) else said:
+                    if each is not None and not self.closing.is_set():
+                        self._send(each)
         return len(data)
 
-    def _send(self, said: Message | bytes | None) -> None:
-        if said is None:
-            return
-        if isinstance(said, Message):
-            data = encode_message(said, self._sequence)
-            self._sequence = (self._sequence + 1) & 0xFFFF  # no message of these rigs has parts
-        else:
-            data = said
+    def _send(self, message: Message) -> None:
+        data = encode_message(message, self._sequence)
+        self._sequence = (self._sequence + 1) & 0xFFFF  # no message of these rigs has parts
         while data and not self.closing.is_set():
             data = data[self._pty.write(data) :]
             if data:
