@@ -215,7 +215,13 @@ class _InputHistory:
         inputs = np.frombuffer(u, _DOUBLE) if isinstance(u, bytes) else np.array(u, dtype=np.float64)
         if not n_steps or inputs.size != n_steps * self._n_inputs:
             return False
+        if blocks and blocks[-1][0] == message.first_step and len(blocks[-1][1]) == n_steps:
+            del blocks[-1]  # the same steps again: the last word counts
         blocks.append((message.first_step, inputs.reshape(n_steps, self._n_inputs)))
+        # Where no frame comes to use them, inputs are not kept for longer than a frame would look back.
+        oldest = message.first_step - _MOST_LEAD_STEPS
+        while len(blocks) > _MOST_BLOCKS or blocks[0][0] + len(blocks[0][1]) <= oldest:
+            del blocks[0]
         return True
 
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
@@ -257,6 +263,9 @@ def _after(end: int, blocks: _Blocks) -> _Blocks:
 
 _MOST_LEAD_STEPS = 100_000
 """A longer gap between exposures is not followed input by input; the estimators are told by its missing inputs."""
+
+_MOST_BLOCKS = 100_000
+"""Runs of steps that wait for their frame; more than one for each step is not to be expected."""
 
 
 class Assembler:
