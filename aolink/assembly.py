@@ -192,30 +192,52 @@ class _InputHistory:
         self._last = mirror.park
         self._reported_until = 0
         """First step that no report covers yet."""
+        self._known_until: int | None = None
+        """First step that no command, report or frame is of."""
 
     def add_applied(self, message: pb.Applied | Run) -> None:
         first, end = message.first_step, message.first_step + message.n_steps
-        if isinstance(message, pb.Applied) and message.source == pb.Applied.AWAITED:
+        # A mirror reports what it has been told to do: a report of steps far beyond that would make everything late.
+        if self._known_until is not None and end > self._known_until + _MOST_LEAD_STEPS:
+            return
+        source = message.source if isinstance(message, pb.Applied) else pb.Applied.COMMAND
+        if source == pb.Applied.AWAITED:
             self._awaited.append((first, end))
+            return
+        if not self._add(self._applied, message) and source != pb.Applied.NOT_REPORTED:
             return
         if self._awaited:
             parts = [part for low, high in self._awaited for part in ((low, min(high, first)), (max(low, end), high))]
             self._awaited = [(low, high) for low, high in parts if low < high]
-        self._add(self._applied, message)
         self._reported_until = max(self._reported_until, end)
+        self.know(end)
 
     def is_known_until(self, end: int) -> bool:
         """Whether nothing more is to be had of the steps before ``end``."""
         return end <= self._reported_until and all(first >= end for first, _ in self._awaited)
 
     def add_command(self, message: pb.CommandBlock | Run) -> None:
-        self._add(self._commanded, message)
+        if self._add(self._commanded, message):
+            self.know(message.first_step + message.n_steps)
 
-    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> None:
+    def know(self, end: int) -> None:
+        """Something is known of the steps before ``end``."""
+        self._known_until = end if self._known_until is None else max(self._known_until, end)
+
+    def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> bool:
+        """Take the inputs of a run of steps; False where there are not as many as it says."""
         n_steps, u = message.n_steps, message.u
         inputs = np.frombuffer(u, _DOUBLE) if isinstance(u, bytes) else np.array(u, dtype=np.float64)
-        if n_steps and inputs.size == n_steps * self._n_inputs:
-            blocks.append((message.first_step, inputs.reshape(n_steps, self._n_inputs)))
+        if not n_steps or inputs.size != n_steps * self._n_inputs:
+            return False
+        if blocks and blocks[-1][0] == message.first_step and len(blocks[-1][1]) == n_steps:
+            del blocks[-1]  # the same steps again: the last word counts
+        blocks.append((message.first_step, inputs.reshape(n_steps, self._n_inputs)))
+        # Where no frame comes to use them, inputs are not kept for longer than a frame would look back.
+        oldest = message.first_step - _MOST_LEAD_STEPS
+        while len(blocks) > _MOST_BLOCKS or blocks[0][0] + len(blocks[0][1]) <= oldest:
+            del blocks[0]
+        return True
 
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
         """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
@@ -261,6 +283,9 @@ def _after(end: int, blocks: _Blocks) -> _Blocks:
 _MOST_LEAD_STEPS = 100_000
 """A longer gap between exposures is not followed input by input; the estimators are told by its missing inputs."""
 
+_MOST_BLOCKS = 100_000
+"""Runs of steps that wait for their frame; more than one for each step is not to be expected."""
+
 
 class Assembler:
     """Frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
@@ -284,6 +309,7 @@ class Assembler:
     def add_frame(self, frame: Frame) -> list[Exposure]:
         """Take a frame; gives the exposures that are complete with it."""
         self._frames.append(frame)
+        self._history.know(frame.last_step + 1)
         return self._ready()
 
     def flush(self) -> list[Exposure]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import queue
 import select
 import threading
 from collections.abc import Callable, Iterator
@@ -15,19 +16,24 @@ from aolink.simulation.server import RigServer
 from aolink.simulation.streams import PtyStream, Stream
 from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
 
-Lie = Callable[[Message], Message | list[Message] | bytes | None]
-"""What is sent in the place of a message: itself or another, several, bytes as they are, or None for nothing."""
+Lie = Callable[[Message], Message | Iterator[Message] | None]
+"""What is sent in the place of a message: itself or another, several, perhaps without end, or None for nothing."""
 
 
 class LyingStream:
-    """The device's end of a pseudo terminal. Whatever the rig writes is decoded, changed and encoded again."""
+    """The device's end of a pseudo terminal. Whatever the rig writes is decoded, changed and encoded again.
+
+    A thread of its own sends it, so that the rig goes on reading while the host does not.
+    """
 
     def __init__(self, lie: Lie) -> None:
         self._pty: Stream = PtyStream()
         self._lie = lie
         self._packets, self._messages = PacketDecoder(), MessageDecoder()
-        self._sequence = 0
-        self.closing = threading.Event()
+        self._queue: queue.SimpleQueue[Message | Iterator[Message] | None] = queue.SimpleQueue()
+        self._closing = threading.Event()
+        self._sender = threading.Thread(target=self._send_all)
+        self._sender.start()
         self.name = self._pty.name
 
     def fileno(self) -> int:
@@ -40,25 +46,29 @@ class LyingStream:
         for packet in self._packets.feed(data):
             message = self._messages.take(packet)
             if message is not None:
-                said = self._lie(message)
-                for each in said if isinstance(said, list) else [said]:
-                    self._send(each)
+                self._queue.put(self._lie(message))
         return len(data)
 
-    def _send(self, said: Message | bytes | None) -> None:
-        if said is None:
-            return
-        if isinstance(said, Message):
-            data = encode_message(said, self._sequence)
-            self._sequence = (self._sequence + 1) & 0xFFFF  # no message of these rigs has parts
-        else:
-            data = said
-        while data and not self.closing.is_set():
-            data = data[self._pty.write(data) :]
-            if data:
-                select.select([], [self._pty.fileno()], [], 0.05)
+    def _send_all(self) -> None:
+        sequence = 0  # no message of these rigs has parts
+        while not self._closing.is_set():
+            try:
+                said = self._queue.get(timeout=0.05)
+            except queue.Empty:
+                continue
+            for message in [said] if isinstance(said, Message) else said or ():
+                data = encode_message(message, sequence)
+                sequence = (sequence + 1) & 0xFFFF
+                while data and not self._closing.is_set():
+                    data = data[self._pty.write(data) :]
+                    if data:
+                        select.select([], [self._pty.fileno()], [], 0.05)
+                if self._closing.is_set():
+                    return
 
     def close(self) -> None:
+        self._closing.set()
+        self._sender.join()
         self._pty.close()
 
 
@@ -80,12 +90,9 @@ def lying_rig(
         yield streams["camera"].name, streams["mirror"].name
     finally:
         done.set()
+        thread.join()
         for stream in streams.values():
-            stream.closing.set()
-        thread.join(10)
-        for stream in streams.values():
-            with contextlib.suppress(OSError):
-                stream.close()
+            stream.close()
 
 
 def changed(kind: type[Message], change: Callable[[Message], None], from_number: int = 1) -> Lie:

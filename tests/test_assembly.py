@@ -291,3 +291,25 @@ def test_a_picture_that_the_camera_does_not_have_is_refused() -> None:
     reassembly = PlanesReassembly([SHAPE], 1_000_000)
     assert [frame for part in planes(set(), 1) for frame in reassembly.add(part, 0)] == []
     assert reassembly.refused == 6
+
+
+def test_a_report_that_cannot_be_changes_nothing() -> None:
+    """One without the inputs of its steps, and one of steps that nothing leads up to."""
+    assembler = Assembler(RIG)
+    assembler.add_command(pb.CommandBlock(block_id=1, first_step=0, n_steps=200, u=[0.01] * 200))
+    for first, n_steps, inputs in ((0, 2**32 - 1, 50), (0, 2**32 - 1, 0), (2**50, 50, 50)):
+        bad = pb.Applied(block_id=1, first_step=first, n_steps=n_steps, u=[0.05] * inputs)
+        assert assembler.add_applied(bad) == []
+    (frame,) = feed(FrameReassembly(SHAPE, 1_000_000), chunks(0))
+    assert assembler.add_frame(frame) == []  # it still waits for the report of its steps
+    (exposure,) = assembler.add_applied(pb.Applied(block_id=1, first_step=0, n_steps=200, u=[0.02] * 200))
+    assert set(exposure.inputs[:, 0]) == {0.02}
+    assert exposure.inputs_assumed == 0
+
+
+def test_reports_that_no_frame_uses_are_not_kept_forever() -> None:
+    history = _InputHistory(1, np.zeros(1))
+    for k in range(5000):
+        history.add_applied(pb.Applied(block_id=k + 1, first_step=50 * k, n_steps=50, u=[0.01] * 50))
+    assert history.take(0, 100)[1] == 100  # 200 000 steps ago
+    assert history.take(249_800, 250_000)[1] == 0

@@ -175,10 +175,15 @@ class Recording:
         if kind is None:
             return None
         try:
-            return kind.FromString(raw.data)
+            message = kind.FromString(raw.data)
         except DecodeError:
+            message = None
+        # A report that has not the inputs of its steps would stand for all of these steps.
+        if isinstance(message, Applied) and len(message.u) != message.n_steps * self.rig.n_inputs:
+            message = None
+        if message is None:
             self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
-            return None
+        return message
 
     def decoded_run(self, raw: RawMessage) -> Run | None:
         """A command or what the mirror did with it, its inputs as bytes; None if it is neither, or not laid out so."""

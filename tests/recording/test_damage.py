@@ -7,6 +7,8 @@ import io
 import os
 import struct
 import tracemalloc
+from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +27,11 @@ from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.editing import recover
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
-from aolink.recording.reader import Recording
+from aolink.recording.reader import RawMessage, Recording
 from aolink.recording.scan import MAX_CHUNK, Loss, broken_up, scan
 from aolink.recording.writer import RecordingWriter, begin_recording
 from aolink.rig import load_rig
+from aolink.wire import messages_pb2 as wire
 from tests.conftest import Session
 
 
@@ -294,14 +297,16 @@ def test_small_messages_in_a_large_chunk_cost_no_memory() -> None:
     assert len(losses) == 1
 
 
-def other_writer(source: Recording, path: Path, **options: bool) -> None:
+def other_writer(
+    source: Recording, path: Path, change: Callable[[RawMessage], RawMessage] = lambda raw: raw, **options: bool
+) -> None:
     """A recording by the stock writer, as other software may set it up."""
     with path.open("wb") as file:
         writer = Writer(file, **options)  # type: ignore[arg-type] # of each kind its own
         writer.start()
         writer.add_attachment(0, 0, topics.RIG_ATTACHMENT, "application/toml", source.rig.toml.encode())
         channels: dict[str, int] = {}
-        for raw in source.raw_messages():
+        for raw in map(change, source.raw_messages()):
             if raw.topic not in channels:
                 schema = schema_of(topics.SCHEMAS[raw.schema])
                 known = writer.register_schema(schema.name, schema.encoding, schema.data)
@@ -353,6 +358,27 @@ def test_a_message_of_another_kind_is_a_loss(tmp_path: Path) -> None:
     assert loss.what == f"1 message(s) on {topics.EXPOSURE} cannot be decoded"
     path.write_bytes(path.read_bytes()[:-40])
     assert (Recording(path).start_ns, Recording(path).end_ns) == (0, 9)
+
+
+def test_a_report_without_the_inputs_of_its_steps_is_a_loss(recorded: Session, tmp_path: Path) -> None:
+    """It does not stand for the steps that it names: all other exposures keep their inputs."""
+    source = Recording(recorded.path)
+    seen = count()
+
+    def spoil(raw: RawMessage) -> RawMessage:
+        if raw.topic != topics.APPLIED or next(seen) != 6:
+            return raw
+        report = wire.Applied.FromString(raw.data)
+        report.n_steps = 2**32 - 1
+        return raw._replace(data=report.SerializeToString())
+
+    other_writer(source, tmp_path / "a.mcap", spoil)
+    found = Recording(tmp_path / "a.mcap")
+    assumed = [exposure.inputs_assumed for exposure in found.exposures()]
+    assert len(assumed) == len(list(source.exposures()))
+    assert sorted(assumed)[:-1] == [0] * (len(assumed) - 1)
+    assert max(assumed) == 50
+    assert found.damage == f"1 message(s) on {topics.APPLIED} cannot be decoded"
 
 
 def test_lists_of_missing_pixels_that_do_not_fit_are_one_error(tmp_path: Path) -> None:
