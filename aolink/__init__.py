@@ -11,18 +11,27 @@ from __future__ import annotations
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError
-from aolink.rig import Rig, load_rig
 
 if TYPE_CHECKING:
     from aolink.estimation import Estimate
     from aolink.exposure import Exposures
     from aolink.recording.reader import Recording
+    from aolink.rig import Rig, load_rig
 
 __version__ = version("aolink")
 __all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate", "smooth"]
+
+
+def __getattr__(name: str) -> Any:
+    """What needs SciPy is imported when it is used, so that `aolink --help` need not wait for it."""
+    if name in ("Rig", "load_rig"):
+        from aolink import rig
+
+        return getattr(rig, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def read(path: str | Path) -> Recording:
@@ -56,6 +65,7 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
         The rig file cannot be read or cannot work.
     """
     from aolink.exposure import Exposures
+    from aolink.rig import Rig, load_rig
     from aolink.simulation.model import simulate as simulate_exposures
 
     rig = rig if isinstance(rig, Rig) else load_rig(rig)

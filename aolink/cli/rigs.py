@@ -31,7 +31,6 @@ from aolink.cli.common import (
     stdout,
 )
 from aolink.errors import AolinkError, RigError
-from aolink.rig import Rig, load_rig, parse_light
 from aolink.terminal import StopRequest, ask, input_ended, progress_bar
 
 if TYPE_CHECKING:
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
     from aolink.recording.reader import Recording
+    from aolink.rig import Rig
 
 MOST_EXPOSURES = 2**32 - 1
 
@@ -73,6 +73,8 @@ def rig(
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
+    from aolink.rig import load_rig, parse_light
+
     if check:
         _print_findings(load_rig(rig), as_json)
         return
@@ -398,6 +400,7 @@ def calibrate(
     from tempfile import TemporaryDirectory
 
     from aolink import calibrating, tables
+    from aolink.rig import load_rig
 
     loaded = load_rig(rig)
     if bool(files) == bool(camera) or bool(camera) != bool(mirror):
