@@ -28,7 +28,7 @@ __all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate", "sm
 if not TYPE_CHECKING:  # the type checker would believe in any name
 
     def __getattr__(name: str) -> Any:
-        """What takes time to load, when it is asked for: a command has to hear signals before."""
+        """What needs SciPy, or a search for the version, is loaded when it is used: a command hears signals before."""
         if name in ("Rig", "load_rig"):
             import aolink.rig
 

@@ -13,11 +13,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from aolink.errors import EstimatorError, RigError
-from aolink.rig import Rig, load_rig
 
 if TYPE_CHECKING:
     from aolink.estimation import Score
     from aolink.recording.reader import Recording
+    from aolink.rig import Rig
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -40,6 +40,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 
 def load_checked(path_or_name: str) -> Rig:
     """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
+    from aolink.rig import load_rig
     from aolink.rig_check import check_rig
 
     loaded = load_rig(path_or_name)

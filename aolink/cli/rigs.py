@@ -32,7 +32,6 @@ from aolink.cli.common import (
 )
 from aolink.errors import AolinkError, EstimatorError, RigError
 from aolink.files import check_target, writing
-from aolink.rig import Rig, load_rig, parse_light
 from aolink.signals import Interrupted, StopRequest, stop_after
 from aolink.terminal import ask, input_ended, progress_bar
 
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
     from aolink.recording.reader import Recording
+    from aolink.rig import Rig
     from aolink.session import Report
 
 MOST_EXPOSURES = 2**32 - 1
@@ -82,6 +82,8 @@ def rig(
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
+    from aolink.rig import load_rig, parse_light
+
     if check:
         _print_findings(load_rig(rig), as_json)
         return
@@ -406,6 +408,7 @@ def calibrate(
     from tempfile import TemporaryDirectory
 
     from aolink import calibrating, tables
+    from aolink.rig import load_rig
 
     loaded = load_rig(rig)
     if bool(files) == bool(camera) or bool(camera) != bool(mirror):

@@ -6,16 +6,18 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.markup import escape
 from rich.table import Table
 
 from aolink.recording import topics
-from aolink.recording.compare import TopicComparison
-from aolink.recording.reader import Recording
 from aolink.tables.json import without_nan
+
+if TYPE_CHECKING:
+    from aolink.recording.compare import TopicComparison
+    from aolink.recording.reader import Recording
 
 _LOSSES = (
     "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
