@@ -27,6 +27,7 @@ ESTIMATORS = ("open-loop", "o1", "o2", "o3", "moments")
 _OF_LINES = ("profile", "mixture")
 """For line sensors as well; of spots on a plane they would make a demo long."""
 _RIG_START_S = 20.0
+_RIG_END_S = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +75,7 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
     command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
     # A group of its own: Ctrl-C is for the session, which still has to park the mirror.
     # Its input is a pipe that ends with this process, and the rig with it, whatever ends this process.
+    started = False
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, start_new_session=True)
     try:
         assert process.stdout is not None
@@ -81,17 +83,17 @@ def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
         line = process.stdout.readline() if ready else b""
         if not line:
             raise DeviceError(f"the simulated rig did not start; try it by hand: {' '.join(command)}")
-        ports = json.loads(line)
+        ports, started = json.loads(line), True
         yield ports["camera"], ports["mirror"]
     finally:
-        process.terminate()
+        if process.stdin is not None:
+            process.stdin.close()  # a rig that serves ends with it, and says nothing; one that does not is killed
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(5)
+            process.wait(_RIG_END_S if started else 0)
         process.kill()
         process.wait()
-        for pipe in (process.stdin, process.stdout):
-            if pipe:
-                pipe.close()
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 def new_folder(parent: Path) -> Path:

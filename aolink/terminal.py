@@ -11,6 +11,8 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from aolink.signals import Interrupted
+
 
 class Tell(Protocol):
     """Moves a progress bar."""
@@ -45,7 +47,11 @@ def progress_bar(console: Console, total: int | None) -> Iterator[Tell]:
 def ask(console: Console, question: str) -> str:
     """Put a question; gives the line that answers it. Raises EOFError if there is none."""
     console.print(question, end="", markup=False)
-    return input()
+    try:
+        return input()
+    except Interrupted:
+        console.print()  # what is said next is not on the question's line
+        raise
 
 
 def input_ended() -> bool:

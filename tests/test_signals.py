@@ -14,6 +14,7 @@ import termios
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Self
 
 import pytest
 
@@ -78,14 +79,21 @@ class Started:
 
     def __init__(self, folder: Path, words: str, **options: object) -> None:
         self.temporary = folder / "temporary"
-        self.temporary.mkdir(exist_ok=True)
-        (folder / "work").mkdir(exist_ok=True)
+        self.temporary.mkdir(parents=True)
+        (folder / "work").mkdir()
         self.folder = folder / "work"
         self.process = subprocess.Popen(
             [sys.executable, "-m", "aolink", *shlex.split(words)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True, cwd=self.folder,
             env={**os.environ, "TMPDIR": str(self.temporary), "PYTHONUNBUFFERED": "1"}, **options,  # type: ignore[call-overload]
         )  # fmt: skip
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate()
 
     def wait_until(self, true: Callable[[], bool]) -> bool:
         """Whether it came true before the process ended."""
@@ -127,10 +135,10 @@ def test_a_signal_ends_a_command_that_has_just_begun(
     tmp_path: Path, places: dict[str, str], command: str, number: signal.Signals
 ) -> None:
     """From the instant on in which it hears them: most of it is not even loaded then."""
-    started = Started(tmp_path, COMMANDS[command].format(**places))
-    assert started.wait_until(started.hears_signals)
-    assert started.end(number) == (SIGNALS[number], f"aolink: interrupted by {number.name}\n")
-    started.assert_nothing_half_is_left()
+    with Started(tmp_path, COMMANDS[command].format(**places)) as started:
+        assert started.wait_until(started.hears_signals)
+        assert started.end(number) == (SIGNALS[number], f"aolink: interrupted by {number.name}\n")
+        started.assert_nothing_half_is_left()
 
 
 MIDST: dict[str, Callable[[Started], bool]] = {
@@ -149,43 +157,46 @@ MIDST: dict[str, Callable[[Started], bool]] = {
 @pytest.mark.parametrize("command", MIDST)
 def test_a_signal_in_the_midst_leaves_nothing_half(tmp_path: Path, places: dict[str, str], command: str) -> None:
     for number in range(8):  # a short job may be done before the signal comes
-        started = Started(tmp_path / str(number), COMMANDS[command].format(**places))
-        begun = started.wait_until(lambda: MIDST[command](started))  # noqa: B023 (it is called here only)
-        code, errors = started.end(signal.SIGTERM)
-        started.assert_nothing_half_is_left()
-        if code == 0:
-            continue
-        assert begun
-        assert code == 143
-        assert errors.strip().splitlines()[-1].startswith("aolink: interrupted by SIGTERM")
-        assert errors.count("\n") == 1
-        return
+        with Started(tmp_path / str(number), COMMANDS[command].format(**places)) as started:
+            begun = started.wait_until(lambda: MIDST[command](started))
+            code, errors = started.end(signal.SIGTERM)
+            started.assert_nothing_half_is_left()
+            if code == 0:
+                continue
+            assert begun
+            assert code == 143
+            # A rig in real time may have been late; and the question that calibrate has put may be half read.
+            said = [line for line in errors.splitlines() if line.startswith("aolink: ") and "warning" not in line]
+            assert len(said) == 1, errors
+            assert "Traceback" not in errors
+            assert said[0].startswith("aolink: interrupted by SIGTERM")
+            return
     pytest.fail("it was done before the signal each time")
 
 
 def test_a_demo_that_ends_after_recording_says_where_the_recording_is(tmp_path: Path, places: dict[str, str]) -> None:
-    started = Started(tmp_path, COMMANDS["demo"])
-    assert started.wait_until(lambda: MIDST["demo"](started))
-    code, errors = started.end(signal.SIGINT)
-    (folder,) = started.folder.iterdir()
-    assert code == 130
-    assert errors == f"aolink: interrupted by SIGINT; what was made until then is in {folder.name}\n"
-    assert sorted(each.name for each in folder.iterdir()) == ["rig.toml", "session.mcap"]
-    started.assert_nothing_half_is_left()
+    with Started(tmp_path, COMMANDS["demo"]) as started:
+        assert started.wait_until(lambda: MIDST["demo"](started))
+        code, errors = started.end(signal.SIGINT)
+        (folder,) = started.folder.iterdir()
+        assert code == 130
+        assert errors == f"aolink: interrupted by SIGINT; what was made until then is in {folder.name}\n"
+        assert sorted(each.name for each in folder.iterdir()) == ["rig.toml", "session.mcap"]
+        started.assert_nothing_half_is_left()
 
 
 def test_a_batch_ends_in_good_order_with_its_processes(tmp_path: Path, places: dict[str, str]) -> None:
     models = ",".join(str(1 + k) for k in range(200))
-    started = Started(
+    with Started(
         tmp_path, f"estimate {places['session']} -e o1 --set plant.process_noise={models} --jobs 2 -o out"
-    )
-    assert started.wait_until(lambda: bool([*started.folder.glob("out/*.mcap")]))
-    code, errors = started.end(signal.SIGTERM)
-    assert (code, errors) == (143, "aolink: interrupted by SIGTERM\n")
-    started.assert_nothing_half_is_left()
-    results = [*started.folder.glob("out/*.mcap")]
-    assert 0 < len(results) < 200
-    assert {path.with_suffix(".json") for path in results} == {*started.folder.glob("out/*.json")}
+    ) as started:
+        assert started.wait_until(lambda: bool([*started.folder.glob("out/*.mcap")]))
+        code, errors = started.end(signal.SIGTERM)
+        assert (code, errors) == (143, "aolink: interrupted by SIGTERM\n")
+        started.assert_nothing_half_is_left()
+        results = [*started.folder.glob("out/*.mcap")]
+        assert 0 < len(results) < 200
+        assert {path.with_suffix(".json") for path in results} == {*started.folder.glob("out/*.json")}
 
 
 def test_a_terminal_that_closes_ends_a_command(tmp_path: Path) -> None:
@@ -210,9 +221,9 @@ def test_a_terminal_that_closes_ends_a_command(tmp_path: Path) -> None:
 
 def test_nohup_is_respected(tmp_path: Path, places: dict[str, str]) -> None:
     ignore = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)}
-    started = Started(tmp_path, COMMANDS["record"].format(**places), **ignore)
-    assert started.wait_until(lambda: MIDST["record"](started))
-    started.process.send_signal(signal.SIGHUP)
-    size = (started.folder / "a.mcap").stat().st_size
-    assert started.wait_until(lambda: (started.folder / "a.mcap").stat().st_size > size + 30_000), "it goes on"
-    assert started.end(signal.SIGTERM) == (143, "aolink: interrupted by SIGTERM\n")
+    with Started(tmp_path, COMMANDS["record"].format(**places), **ignore) as started:
+        assert started.wait_until(lambda: MIDST["record"](started))
+        started.process.send_signal(signal.SIGHUP)
+        size = (started.folder / "a.mcap").stat().st_size
+        assert started.wait_until(lambda: (started.folder / "a.mcap").stat().st_size > size + 30_000), "it goes on"
+        assert started.end(signal.SIGTERM) == (143, "aolink: interrupted by SIGTERM\n")
