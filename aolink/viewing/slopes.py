@@ -74,11 +74,12 @@ def lenslet_map(result: FrameSlopes) -> NDArray[np.float64]:
     middles = reference.node_positions(reference.nodes)
     low, high = middles.min(axis=0) - reference.pitch, middles.max(axis=0) + reference.pitch
     x, y = (np.arange(start, stop, step) for start, stop in zip(low, high, strict=True))
-    # The cell of a node is all that is nearer to it than to any other node, whether those have spots or not.
-    nodes = result.positions_px.reshape(-1, 2)
-    away, nearest = cKDTree(nodes).query(np.stack(np.meshgrid(x, y), axis=-1))
-    values = result.wavefront.ravel()[np.asarray(nearest)]
-    return np.where(np.asarray(away) < 0.75 * reference.pitch, values, np.nan)
+    # The cell of a node is all that is nearer to it than to any other node, with a spot or without.
+    rows, columns = result.wavefront.shape
+    nodes = np.stack(np.meshgrid(np.arange(-1, columns + 1), np.arange(-1, rows + 1)), axis=-1)
+    tree = cKDTree(reference.node_positions(nodes).reshape(-1, 2))
+    nearest = tree.query(np.stack(np.meshgrid(x, y), axis=-1))[1]
+    return np.asarray(np.pad(result.wavefront, 1, constant_values=np.nan).ravel()[nearest])
 
 
 def _coloured(wavefront: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -144,7 +144,7 @@ def test_kinds_are_not_matched_with_one_another():
     square, hexagonal = (
         find_lattice(spots_frame(256, nodes_and_places(kind, 16, 0, 256, 100)[1] + 128, 1.6)) for kind in ANGLES
     )
-    with pytest.raises(FrameError, match="hexagonal.* is not the reference's .square"):
+    with pytest.raises(FrameError, match=r"hexagonal.* is not the reference's \(square"):
         match(hexagonal, square)
 
 
