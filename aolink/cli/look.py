@@ -56,14 +56,17 @@ def slopes(
     reference: Annotated[Path, typer.Option(metavar="FILE", help="A frame of the same camera with a flat wavefront.")],
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.npz", help="Write all of it.")] = None,
     rrd: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write a picture of it for Rerun.")] = None,
-    pitch_m: Annotated[float | None, typer.Option(min=1e-9, help="Side of a lenslet, m.")] = None,
+    pitch_m: Annotated[
+        float | None, typer.Option(min=1e-9, help="From a lenslet's middle to the next one's, m.")
+    ] = None,
     focal_m: Annotated[float | None, typer.Option(min=1e-9, help="Focal length of a lenslet, m.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the lenslets' spots on a frame and on its reference: slopes and wavefront between them.
+    """Find the lenslets' spots on a frame and on its reference: slopes, wavefront and Zernike modes between them.
 
-    Nothing about the grid need be known. Without --pitch-m and --focal-m slopes are in pixels.
+    The grid is square or hexagonal, turned by any angle; kind, pitch and turn are found, whatever spots are missing.
+    Without --pitch-m and --focal-m slopes are in pixels.
     """
     from aolink import slopes as job
     from aolink import tables

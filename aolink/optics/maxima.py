@@ -157,7 +157,10 @@ def refine(flat: FloatArray, places: FloatArray, pitch: float) -> FloatArray:
 
 
 def likeness(flat: FloatArray, places: FloatArray, models: FloatArray, pitch: float) -> FloatArray:
-    """Correlation of what is at each place with the median spot of the models' places, (n,), 1 for the same shape."""
+    """Correlation of what is at each place with the median spot of the models' places, (n,), 1 for the same shape.
+
+    The largest one over shifts by a pixel, not below zero.
+    """
     sd = spot_sd(flat, models, pitch)
     half = min(math.ceil(3 * sd), _half(pitch))
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
@@ -167,9 +170,14 @@ def likeness(flat: FloatArray, places: FloatArray, models: FloatArray, pitch: fl
     def even(windows: FloatArray) -> FloatArray:
         return np.asarray(windows - (weight * windows).sum(axis=(-2, -1), keepdims=True))
 
-    model, windows = even(_median_spot(cut_windows(flat, models, half)[0])), even(cut_windows(flat, places, half)[0])
-    power = (weight * windows**2).sum(axis=(1, 2)) * (weight * model**2).sum()
-    return np.asarray((weight * windows * model).sum(axis=(1, 2)) / np.sqrt(np.maximum(power, _TINY)))
+    model = even(_median_spot(cut_windows(flat, models, half)[0]))
+    best = np.zeros(len(places))
+    # A spot between two pixels may be in either one's window: the models' is the pixel beside it, perhaps.
+    for shift in np.ndindex(3, 3):
+        windows = even(cut_windows(flat, places + np.array(shift) - 1, half)[0])
+        power = (weight * windows**2).sum(axis=(1, 2)) * (weight * model**2).sum()
+        best = np.maximum(best, (weight * windows * model).sum(axis=(1, 2)) / np.sqrt(np.maximum(power, _TINY)))
+    return best
 
 
 def _median_spot(windows: FloatArray) -> FloatArray:

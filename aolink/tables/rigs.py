@@ -105,6 +105,7 @@ def slopes_as_json(result: FrameSlopes) -> dict[str, Any]:
     """What `aolink slopes` says of a frame."""
     lattice, reference = result.lattice, result.reference
     return {
+        "grid": reference.kind,
         "spots": len(lattice.spots),
         "reference_spots": len(reference.spots),
         "pitch_px": lattice.pitch,
@@ -114,6 +115,11 @@ def slopes_as_json(result: FrameSlopes) -> dict[str, Any]:
         "displacement_rms_px": float(np.sqrt(np.nanmean(result.displacements_px**2))),
         "wavefront_rms": result.rms,
         "wavefront_peak_to_valley": result.peak_to_valley,
+        "pieces": int(result.pieces.max()) + 1,
+        "zernikes": {
+            f"Z{index}": float(value)
+            for index, value in zip(result.zernikes.indices, result.zernikes.coefficients, strict=True)
+        },
         "wavefront_unit": "m" if result.in_metres else "px x pitch",
     }
 
@@ -124,13 +130,24 @@ def slopes(result: FrameSlopes) -> Table:
     unit, factor = ("nm", 1e9) if result.in_metres else ("px x pitch", 1.0)
     grid = Table.grid(padding=(0, 2))
     x, y = said["shift_px"]
+    # Tilt is the shift, whose whole pitches are not known.
+    modes = [(i, c * factor) for i, c in zip(result.zernikes.indices, result.zernikes.coefficients, strict=True)]
+    zernikes = ", ".join(f"Z{i} {c:+.4g}" for i, c in modes if 3 < i < 12)
+    pieces = said["pieces"]
     for name, value in (
+        ("grid", said["grid"]),
         ("spots", f"{said['spots']}, the reference has {said['reference_spots']}"),
         ("pitch", f"{said['pitch_px']:.3f} px, the reference's {said['reference_pitch_px']:.3f} px"),
         ("grid turned by", f"{said['turn_deg']:.2f} degrees"),
         ("shift", f"{x:+.2f}, {y:+.2f} px along x and y, up to whole pitches"),
         ("displacements", f"{said['displacement_rms_px']:.3f} px rms, without the shift"),
         ("wavefront", f"{result.rms * factor:.4g} {unit} rms, {result.peak_to_valley * factor:.4g} peak to valley"),
+        *(
+            [("", f"in {pieces} pieces that do not touch: the steps between them are not known, each has mean zero")]
+            if pieces > 1
+            else []
+        ),
+        ("Zernike modes", f"{zernikes or 'too few spots'} {unit} rms (Noll's order)"),
     ):
         grid.add_row(name, value)
     return grid

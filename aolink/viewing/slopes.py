@@ -8,12 +8,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from aolink.slopes import FrameSlopes
 from aolink.viewing.rrd_file import new_rrd
 
 _ARROW = 5.0
 """How much longer than the displacements the arrows are."""
+_CELL = 12
+"""Points of the wavefront's picture from a lenslet to the next one."""
 _DARK = (40, 40, 40)
 """Of a lenslet without a spot."""
 
@@ -24,6 +27,7 @@ def save_slopes(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> 
     grey = (np.clip((result.frame - low) / max(high - low, 1e-12), 0, 1) ** 0.7 * 255).astype(np.uint8)
     lattice = result.lattice
     column, row = lattice.nodes.T
+    cells = lenslet_map(result)
     arrows = _ARROW * result.displacements_px[row, column]
     middle = 0.5  # Rerun counts a picture from its first pixel's corner
     with new_rrd("aolink_slopes", path, overwrite=overwrite) as stream:
@@ -36,13 +40,33 @@ def save_slopes(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> 
             stream.log(f"frame/{name}", points, static=True)
         drawn = rr.Arrows2D(origins=lattice.spots + middle, vectors=arrows, colors=(0, 230, 60), radii=0.4)
         stream.log("frame/slopes", drawn, static=True)
-        stream.log("wavefront", rr.Image(_coloured(result.wavefront)), static=True)
+        stream.log("wavefront", rr.Image(_coloured(cells)), static=True)
         views = [
             rrb.Spatial2DView(origin="frame", name=f"frame; displacements x {_ARROW:g}, less their mean"),
             rrb.Spatial2DView(origin="wavefront", name="wavefront: red ahead, blue behind"),
         ]
         panels = rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed")
         stream.send_blueprint(rrb.Blueprint(rrb.Horizontal(contents=views), *panels, rrb.TimePanel(state="hidden")))
+
+
+def lenslet_map(result: FrameSlopes) -> NDArray[np.float64]:
+    """The wavefront as the frame lies, each lenslet a square or a hexagon, turned as the lattice is.
+
+    Returns
+    -------
+    (rows, columns) of some `_CELL` points a pitch over the reference's lenslets; NaN where there is no spot.
+    """
+    reference = result.reference
+    step = reference.pitch / _CELL
+    middles = reference.node_positions(reference.nodes)
+    low, high = middles.min(axis=0) - reference.pitch, middles.max(axis=0) + reference.pitch
+    x, y = (np.arange(start, stop, step) for start, stop in zip(low, high, strict=True))
+    # The cell of a node is all that is nearer to it than to any other node, with a spot or without.
+    rows, columns = result.wavefront.shape
+    nodes = np.stack(np.meshgrid(np.arange(-1, columns + 1), np.arange(-1, rows + 1)), axis=-1)
+    tree = cKDTree(reference.node_positions(nodes).reshape(-1, 2))
+    nearest = tree.query(np.stack(np.meshgrid(x, y), axis=-1))[1]
+    return np.asarray(np.pad(result.wavefront, 1, constant_values=np.nan).ravel()[nearest])
 
 
 def _coloured(wavefront: NDArray[np.float64]) -> NDArray[np.uint8]:

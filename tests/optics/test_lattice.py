@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aolink.errors import FrameError
 from aolink.optics.lattice import find_lattice, match
 from aolink.optics.maxima import cut_windows
+from aolink.optics.synthesis import Psi, spot_windows
+from tests.spot_frames import ANGLES, as_dtype, nodes_and_places, spots_frame
 
 
 def synthetic(pitch=18.3, turn=2.0, shape=(9, 11), missing=0.0, seed=0, noise=5.0, side=256, jitter=0.0, sd=1.5):
@@ -29,6 +31,7 @@ def synthetic(pitch=18.3, turn=2.0, shape=(9, 11), missing=0.0, seed=0, noise=5.
 
 
 @given(pitch=st.floats(12, 24), turn=st.floats(-20, 20), missing=st.floats(0, 0.2), seed=st.integers(0, 99))
+@example(pitch=12, turn=0, missing=0.1875, seed=87)  # what is missing parts the spots in two groups
 @settings(max_examples=15, deadline=None)
 def test_spots_are_found_and_numbered_whatever_is_missing(pitch, turn, missing, seed):
     frame, places, nodes = synthetic(pitch, turn, (7, 8), missing, seed)
@@ -42,6 +45,107 @@ def test_spots_are_found_and_numbered_whatever_is_missing(pitch, turn, missing, 
     assert np.median(distance.min(axis=1)) < 0.05
     offset = lattice.nodes - nodes[nearest]
     assert (offset == offset[0]).all()
+
+
+def check(lattice, kind, pitch, turn, nodes, places, most_missed=0.05):
+    """The lattice is the one that the frame was made with: its nodes, counted from anywhere, along any of its rows."""
+    assert lattice.kind == kind
+    assert lattice.pitch == pytest.approx(pitch, rel=0.01)
+    fold = np.rad2deg(ANGLES[kind])
+    assert abs((lattice.turn_deg - turn + fold / 2) % fold - fold / 2) < 1
+    distance = np.linalg.norm(lattice.spots[:, None] - places, axis=-1)
+    nearest = distance.argmin(axis=1)
+    assert distance.min(axis=1).max() < 0.3 * pitch
+    assert len(set(nearest)) == len(lattice.spots) >= (1 - most_missed) * len(places)
+    assert np.median(distance.min(axis=1)) < 0.1 * max(1, pitch / 20)
+    design = np.column_stack([nodes[nearest], np.ones(len(nearest))])
+    counted, *_ = np.linalg.lstsq(design, lattice.nodes, rcond=None)
+    np.testing.assert_allclose(design @ counted, lattice.nodes, atol=1e-6)
+    assert abs(np.linalg.det(counted[:2])) == pytest.approx(1)
+
+
+@given(
+    kind=st.sampled_from(["square", "hexagonal"]),
+    pitch=st.floats(8, 30),
+    turn=st.floats(-180, 180),
+    width=st.floats(0.09, 0.16),
+    pupil=st.sampled_from(["round", "square", "annular", "wedge", "halves"]),
+    missing=st.sampled_from([0, 0.1, 0.25]),
+    brightness=st.sampled_from([1, 3, 10]),
+    dtype=st.sampled_from(["uint8", "uint16", "float32", "float64"]),
+    seed=st.integers(0, 2**32 - 1),
+)
+@settings(max_examples=25, deadline=None)
+def test_lattices_of_any_kind_turn_and_pupil_are_found(
+    kind, pitch, turn, width, pupil, missing, brightness, dtype, seed
+):
+    rng = np.random.default_rng(seed)
+    side = int(min(11 * pitch, 320))
+    nodes, places = nodes_and_places(kind, pitch, turn, side, side / 2 - 1.5 * pitch, pupil)
+    lit = rng.random(len(nodes)) >= missing
+    nodes, places = nodes[lit], places[lit] + side / 2 + rng.uniform(-0.5, 0.5, 2)
+    places = places + rng.normal(0, 0.02 * pitch, places.shape)
+    heights = np.exp(rng.uniform(-np.log(brightness), 0, len(places)))
+    frame = 0.2 + spots_frame(side, places, max(0.9, width * pitch), heights)
+    frame += rng.normal(0, 0.02 / brightness**0.5, frame.shape)
+    check(find_lattice(as_dtype(frame, dtype)), kind, pitch, turn, nodes, places)
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_lattices_of_diffraction_spots_are_found(kind):
+    # Our own synthesis: sinc^2 spots, whose rings are maxima as well, with a background and photo-electrons.
+    rng, side, half = np.random.default_rng(3), 256, 12
+    nodes, places = nodes_and_places(kind, 17, 11, side, 105)
+    places = places + side / 2 + rng.normal(0, 0.3, places.shape)
+    corners = np.rint(places).astype(int) - half
+    windows = spot_windows(Psi(shape="sinc2", zero_px=3.0), 2 * half + 1, (places - corners)[..., None])
+    frame = np.full((side, side), 20.0)
+    for window, (x, y) in zip(windows, corners, strict=True):
+        frame[y : y + 2 * half + 1, x : x + 2 * half + 1] += 40_000 * window
+    check(find_lattice(rng.poisson(frame).astype(np.uint16)), kind, 17, 11, nodes, places, 0)
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_a_bent_lattice_is_followed_further_than_a_straight_one_reaches(kind):
+    # Coma moves the spots at the edge by half a pitch, and those beside them nearly as much.
+    nodes, places = nodes_and_places(kind, 16, 5, 320, 130)
+    x, y = places.T / 130
+    moved = places + 160 + 2.6 * np.stack([2 * x * y, x**2 + 3 * y**2], axis=1)
+    lattice = find_lattice(100 + 50 * spots_frame(320, moved, 1.6))
+    assert np.linalg.norm(lattice.displacements, axis=1).max() > 0.25 * 16
+    check(lattice, kind, lattice.pitch, 5, nodes, moved, 0)
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_large_spots_and_small_ones_are_found(kind):
+    for pitch, sd, side in ((6, 0.8, 96), (40, 6.0, 400)):
+        nodes, places = nodes_and_places(kind, pitch, 8, side, side / 2 - 1.5 * pitch)
+        frame = spots_frame(side, places + side / 2, sd) + np.random.default_rng(1).normal(0, 0.03, (side, side))
+        check(find_lattice(frame), kind, pitch, 8, nodes, places + side / 2, 0)
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_a_frame_is_matched_though_its_rows_are_called_otherwise(kind):
+    # Just this side and that side of the angle at which another direction of the lattice is nearer to the frame's rows.
+    fold = np.rad2deg(ANGLES[kind]) / 2
+    pair = []
+    for turn in (fold - 0.5, fold + 0.5):
+        nodes, places = nodes_and_places(kind, 16, turn, 256, 100)
+        pair.append((find_lattice(50 + 100 * spots_frame(256, places + 128, 1.6)), nodes, places + 128))
+    (reference, *_), (lattice, nodes, places) = pair
+    assert abs(lattice.turn_deg - reference.turn_deg) > fold
+    matched = match(lattice, reference)
+    check(matched, kind, 16, matched.turn_deg, nodes, places, 0.1)
+    assert matched.turn_deg == pytest.approx(fold + 0.5, abs=0.1)
+    assert np.abs(matched.displacements).max() < 0.1
+
+
+def test_kinds_are_not_matched_with_one_another():
+    square, hexagonal = (
+        find_lattice(spots_frame(256, nodes_and_places(kind, 16, 0, 256, 100)[1] + 128, 1.6)) for kind in ANGLES
+    )
+    with pytest.raises(FrameError, match=r"hexagonal.* is not the reference's \(square"):
+        match(hexagonal, square)
 
 
 def test_displacements_are_from_the_lattice():
@@ -94,7 +198,14 @@ RNG = np.random.default_rng(7)
     ("frame", "says"),
     [
         (RNG.normal(1000, 10, (128, 128)), "no usable spots"),
-        (np.zeros((64, 64)), "no usable spots"),
+        (np.zeros((64, 64)), "every pixel is 0"),
+        (np.full((64, 64), 255, dtype=np.uint8), "every pixel is 255"),
+        (np.zeros((64, 64, 3)), "is needed, found"),
+        (np.zeros((0, 0)), "is needed, found"),
+        (np.zeros((64, 64), dtype=complex), "is needed, found"),
+        (spots_frame(64, np.array([[30.0, 30.0]]), 1.5), "no usable spots: 1 "),
+        (spots_frame(64, np.array([[30.0, 30.0], [40.0, 30.0]]), 1.5), "no usable spots: 2 "),
+        (spots_frame(256, np.stack([np.arange(20, 230, 14.0), np.full(15, 128.0)], axis=1), 1.5), "no grid"),
         (np.full((64, 64), np.nan), "not numbers"),
         (np.zeros((5, 64)), "is needed, found"),
         (np.zeros(64), "is needed, found"),

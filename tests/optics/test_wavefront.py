@@ -7,14 +7,17 @@ import pytest
 from aolink.optics.lenslets import Lenslets
 from aolink.optics.turbulence import FrozenFlow, Layer
 from aolink.optics.wavefront import (
+    SpotReconstructor,
     ZonalReconstructor,
     kolmogorov_variances,
     modal_reconstructor,
     residual_rms,
     strehl,
     zernike_modes,
+    zernike_slopes,
 )
 from aolink.optics.zernike import zernike, zernike_gradient
+from tests.spot_frames import nodes_and_places
 
 ROUND = Lenslets(grid=(14, 14), pitch_m=0.1, focal_length_m=1.0, pupil_diameter_m=1.4, obstruction=0.3)
 LIT = (ROUND.light > 0.5).reshape(ROUND.grid)
@@ -79,6 +82,107 @@ def test_zonal_finds_turbulence_but_for_what_lenslets_cannot_resolve(geometry):
     # Fitting and aliasing together, some 0.3 to 0.5 (d/r0)^(5/3) rad^2.
     assert unresolved**2 < 0.5 * (pitch / layer.r0_m) ** (5 / 3)
     assert residual_rms(true) * 2 * np.pi / layer.wavelength_m > 8 * unresolved
+
+
+def lattice_of(kind, pitch=1.0, radius=8.2, turn=13.0):
+    """Positions of a round pupil's lenslets and the pairs that are a pitch apart, found by their distance alone."""
+    positions = nodes_and_places(kind, pitch, turn, None, radius)[1]
+    distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    return positions, np.argwhere(np.triu(abs(distance - pitch) < 0.01 * pitch))
+
+
+def smooth_waves(seed, shortest):
+    """A random smooth wavefront as a sum of plane waves: its value and its exact gradient at points (..., 2)."""
+    rng = np.random.default_rng(seed)
+    k = 2 * np.pi / shortest * rng.uniform(-0.7, 0.7, (12, 2))
+    phase, height = rng.uniform(0, 2 * np.pi, 12), rng.standard_normal(12)
+    return (
+        lambda p: np.cos(p @ k.T + phase) @ height,
+        lambda p: (-np.sin(p @ k.T + phase) * height) @ k,
+    )
+
+
+def cell_means(gradient, positions, kind, pitch, turn):
+    """Mean of a gradient over each square or hexagon, by random points of the cell, that is nearest to its middle."""
+    points = np.random.default_rng(0).uniform(-pitch, pitch, (4000, 2))
+    around = nodes_and_places(kind, pitch, turn, None, 1.9 * pitch)[1]
+    points = points[np.linalg.norm(points[:, None] - around, axis=-1).min(axis=1) >= np.hypot(*points.T) - 1e-12]
+    return np.stack([gradient(p + points).mean(axis=0) for p in positions])
+
+
+def test_spots_on_a_square_grid_are_southwells_geometry():
+    rng, (y, x) = np.random.default_rng(6), np.nonzero(LIT)
+    weights, slopes = rng.uniform(0.3, 1, LIT.shape), rng.standard_normal((*LIT.shape, 2))
+    positions = 0.1 * np.stack([x, y], axis=1)
+    edges = np.argwhere(np.triu(abs(np.linalg.norm(positions[:, None] - positions, axis=-1) - 0.1) < 1e-9))
+    found = SpotReconstructor(positions, edges, weights[LIT])(slopes[LIT])
+    np.testing.assert_allclose(found, ZonalReconstructor(LIT, 0.1, weights=weights)(slopes)[LIT], atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_spots_are_exact_for_focus_astigmatism_and_tilt_however_the_lattice_is_turned(kind):
+    positions, edges = lattice_of(kind)
+    A, tilt = np.array([[0.5, 0.2], [0.2, -0.1]]), np.array([0.3, -0.4])
+    found = SpotReconstructor(positions, edges)(positions @ (2 * A) + tilt)
+    true = np.einsum("ni,ij,nj->n", positions, A, positions) + positions @ tilt
+    np.testing.assert_allclose(found, true - true.mean(), atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_spots_find_a_smooth_wavefront_to_a_thirtieth(kind, seed):
+    positions, edges = lattice_of(kind)
+    value, gradient = smooth_waves(seed, shortest=10.0)  # ten lenslets
+    slopes = cell_means(gradient, positions, kind, 1.0, 13.0)
+    true = value(positions)
+    assert residual_rms(SpotReconstructor(positions, edges)(slopes) - true) < residual_rms(true) / 30
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_parts_that_do_not_touch_have_mean_zero_each_and_are_told(kind):
+    positions, edges = lattice_of(kind)
+    side = np.where(abs(positions[:, 0]) > 1.2, np.sign(positions[:, 0]), 0)
+    lone = np.argmin(np.hypot(*(positions - [0, 0]).T))
+    kept = (side != 0) | (np.arange(len(positions)) == lone)  # two halves, and one lenslet between them by itself
+    number = np.cumsum(kept) - 1
+    inner = edges[kept[edges].all(axis=1)]
+    focus = (positions**2).sum(axis=1)[kept]
+    reconstruct = SpotReconstructor(positions[kept], number[inner])
+    found = reconstruct(2 * positions[kept])
+    assert reconstruct.parts.max() == 2
+    for part in range(3):
+        mine = reconstruct.parts == part
+        np.testing.assert_allclose(found[mine], focus[mine] - focus[mine].mean(), atol=1e-10)
+        assert len(set(side[kept][mine])) == 1
+    # Modes go on across the gap: they have all of it.
+    modes = zernike_slopes(positions[kept], tuple(range(2, 11)), 9.0)
+    modal = modal_reconstructor(modes, np.ones(kept.sum())) @ (2 * positions[kept]).ravel()
+    assert modal[2] == pytest.approx(81 / (2 * np.sqrt(3)))
+    np.testing.assert_allclose(np.delete(modal, 2), 0, atol=1e-9)
+
+
+def test_spots_without_slopes_of_their_own_are_refused():
+    positions, edges = lattice_of("hexagonal", radius=3)
+    with pytest.raises(ValueError, match="expected"):
+        SpotReconstructor(positions, edges)(np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="not a number"):
+        SpotReconstructor(positions, edges)(np.full((len(positions), 2), np.nan))
+    with pytest.raises(ValueError, match="no spots"):
+        SpotReconstructor(np.zeros((0, 2)), np.zeros((0, 2), dtype=int))
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+def test_modes_come_back_from_means_over_the_lenslets(kind):
+    positions, _ = lattice_of(kind, radius=5.2)
+    true = np.random.default_rng(8).standard_normal(14)
+    radius = 6.0
+
+    def gradient(points):
+        return sum(c * zernike_gradient(i, points / radius) / radius for i, c in enumerate(true, 2))
+
+    slopes = cell_means(gradient, positions, kind, 1.0, 13.0)
+    middle = modal_reconstructor(zernike_slopes(positions, tuple(range(2, 16)), radius), np.ones(len(positions)))
+    np.testing.assert_allclose(middle @ slopes.ravel(), true, atol=0.15)
 
 
 def test_many_frames_at_once_are_each_by_itself_and_bad_slopes_are_refused():
