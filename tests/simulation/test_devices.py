@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from aolink.rig import load_rig
 from aolink.simulation.devices import Line, SimulatedDevices
 from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import MAX_PAYLOAD
 
 RIG = load_rig("section-vi")
 QUEUE = RIG.mirror.queue_steps
@@ -170,3 +171,100 @@ def test_every_step_is_reported_once_and_in_order(blocks: list[tuple[int, int]],
     assert steps == ([] if first is None else list(range(first, device.step)))
     assert all(len(r.u) == r.n_steps for r in reports)
     assert all((r.block_id == 0) == (r.source == pb.Applied.PARKED) for r in reports)
+
+
+def query(device: SimulatedDevices, first: int, end: int) -> list[tuple[int, int, int, int]]:
+    """Ask again; gives block, source, first step and end of each answer."""
+    device.handle("mirror", pb.AppliedQuery(first_step=first, n_steps=end - first), 0)
+    answers = [o.message for o in device.outbox if isinstance(o.message, pb.Applied)]
+    device.outbox.clear()
+    return [(a.block_id, a.source, a.first_step, a.first_step + a.n_steps) for a in answers]
+
+
+def test_what_was_held_can_be_asked_for_again() -> None:
+    device = devices()
+    ask(device, block(1, 10))
+    reports = applied(device, 100)
+    assert query(device, 0, 100) == [(0, pb.Applied.PARKED, 0, 10)]
+    assert query(device, 10, 100) == [(1, pb.Applied.COMMAND, 10, 60)]
+    assert query(device, 30, 40) == [(1, pb.Applied.COMMAND, 30, 40)]
+    assert query(device, 90, 200) == [(0, pb.Applied.PARKED, 90, 100)]
+    assert query(device, 100, 200) == query(device, 2**63, 2**63 + 50) == []  # has not gone by
+    device.handle("mirror", pb.AppliedQuery(first_step=10, n_steps=50), 0)
+    assert device.outbox[0].message in reports
+
+
+def test_what_is_no_longer_remembered_is_not_reported_and_the_rest_comes_with_it() -> None:
+    device = devices()
+    history = ask(device, pb.Identify()).mirror.history_steps
+    device.advance_to(history + 100)
+    assert query(device, 0, 50) == [(0, pb.Applied.NOT_REPORTED, 0, 50)]
+    (forgotten, known) = query(device, 50, history)
+    assert forgotten == (0, pb.Applied.NOT_REPORTED, 50, 100)
+    assert known[:3] == (0, pb.Applied.PARKED, 100)
+
+
+@given(st.integers(0, 600), st.integers(1, 600))
+def test_an_answer_is_one_packet_and_goes_on_where_it_is_asked(first: int, n_steps: int) -> None:
+    device = devices()
+    for k in range(4):
+        ask(device, block(k + 1, 100 * k, 60))
+    device.advance_to(700)
+    device.outbox.clear()
+    step = first
+    while step < first + n_steps:
+        device.handle("mirror", pb.AppliedQuery(first_step=step, n_steps=first + n_steps - step), 0)
+        answers = [o.message for o in device.outbox]
+        device.outbox.clear()
+        if not answers:
+            assert step >= device.step
+            break
+        (answer,) = answers
+        assert isinstance(answer, pb.Applied)
+        assert len(answer.SerializeToString()) <= MAX_PAYLOAD
+        assert answer.first_step == step
+        assert answer.n_steps > 0
+        assert {answer.block_id} == {
+            k // 100 + 1 if k < 400 and k % 100 < 60 else 0 for k in range(step, step + answer.n_steps)
+        }
+        step += answer.n_steps
+
+
+def test_the_watchdog_latches_until_it_is_told_to_go_on() -> None:
+    device = devices()
+    ask(device, block(1, 0))
+    device.advance_to(20)
+    device.outbox.clear()
+    device.watchdog_expires()
+    (event,) = (o.message for o in device.outbox)
+    assert isinstance(event, pb.Event)
+    assert event.text == "mirror parked by its watchdog: no valid packet for 1 s"
+    device.outbox.clear()
+    for message in (block(2, 30), pb.Park(), block(3, 30), pb.Identify(nonce=1), block(1, 30)):
+        answer = ask(device, message)
+        if isinstance(answer, pb.CommandAck):
+            assert answer.code == pb.LATCHED
+        if isinstance(answer, pb.Identity):
+            assert (answer.mirror.parked, answer.mirror.latched) == (True, True)
+    device.advance_to(60)
+    device.outbox.clear()
+    assert query(device, 20, 60) == [(0, pb.Applied.WATCHDOG, 20, 60)]
+    assert ask(device, pb.Rearm(), sequence=7) == pb.Ack(sequence=7, step=60)
+    assert ask(device, pb.Rearm(), sequence=8) == pb.Ack(sequence=8, step=60)  # the first answer was lost
+    assert ask(device, block(4, 60)).code == pb.OK
+    assert not ask(device, pb.Identify(nonce=2)).mirror.latched
+
+
+def test_the_watchdog_is_at_rest_while_nothing_was_commanded() -> None:
+    device = devices()
+    device.watchdog_expires()
+    ask(device, block(1, 0))
+    ask(device, pb.Park())
+    device.watchdog_expires()
+    assert not device.outbox
+    assert not device.latched
+
+
+def test_an_answer_says_which_try_it_answers() -> None:
+    device = devices()
+    assert [ask(device, block(1, 0), sequence=k).sequence for k in (5, 9)] == [5, 9]
