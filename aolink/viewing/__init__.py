@@ -6,11 +6,12 @@ calls them with a whole recording, `LiveView` with one exposure after the other.
 
 from aolink.viewing.live import Decimating, LiveView, live_viewer
 from aolink.viewing.save import save_rrd, send_recording
-from aolink.viewing.viewer import open_viewer, screenshot, serve_web
+from aolink.viewing.viewer import check_display, open_viewer, screenshot, serve_web
 
 __all__ = [
     "Decimating",
     "LiveView",
+    "check_display",
     "live_viewer",
     "open_viewer",
     "save_rrd",
