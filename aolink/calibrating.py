@@ -18,7 +18,7 @@ from aolink.files import check_target
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
-from aolink.session import record
+from aolink.session import open_devices, record
 
 _ASKED = (
     ("dark", "dark", "cover the camera"),
@@ -99,7 +99,7 @@ def record_frames(
     stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
     progress: Callable[[], AbstractContextManager[Callable[[str, int], None]]],
 ) -> list[Path]:
-    """Ask for each kind of light in turn and record it.
+    """Try both ports, and then ask for each kind of light in turn and record it.
 
     Parameters
     ----------
@@ -126,6 +126,8 @@ def record_frames(
         raise AolinkError(f"cannot create {folder}: {(error.strerror or '').lower()}; give another --keep") from None
     for name, _, _ in _ASKED:
         check_target(folder / f"{name}.mcap", overwrite=overwrite)
+    with open_devices(rig, camera, mirror):
+        pass  # nobody is asked to do anything for devices that are not there
     paths: list[Path] = []
     skipped = ""
     for name, kind, what in _ASKED:

@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import FileArgument, JsonOption, OverwriteOption, app, open_recording, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, stdout
 from aolink.errors import FrameError, ViewerError
 from aolink.files import check_target
 
 
 @app.command(epilog="Example: aolink view session.mcap --screenshot session.png")
 def view(
-    file: FileArgument,
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that --save has written.")
+    ],
     save: Annotated[
         Path | None, typer.Option(metavar="X.rrd", help="Write a Rerun file instead of opening the viewer.")
     ] = None,
@@ -27,7 +29,7 @@ def view(
     ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Look at a recording in Rerun."""
+    """Look at a recording in Rerun, or at a file that was written for it."""
     import tempfile
 
     from aolink import viewing
@@ -35,10 +37,16 @@ def view(
     for target, suffix in ((save, ".rrd"), (screenshot, ".png")):
         if target is not None:
             check_target(target, overwrite=overwrite, sources=[file], suffix=suffix)
-    recording = open_recording(file)
+    recording = None if file.suffix == ".rrd" else open_recording(file)
+    if recording is None and save is not None:
+        raise typer.BadParameter(f"{file} is a Rerun file already: --save is for a recording")
+    if not (web or save or screenshot):
+        viewing.check_display()  # before the recording is read, which may take minutes
     with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
-        rrd = save or Path(folder) / f"{file.stem}.rrd"
-        viewing.save_rrd(recording, rrd, overwrite=overwrite)
+        rrd = file
+        if recording is not None:
+            rrd = save or Path(folder) / f"{file.stem}.rrd"
+            viewing.save_rrd(recording, rrd, overwrite=overwrite)
         if save is not None:
             stdout.print(f"written: {save}", markup=False)
         if screenshot is not None:

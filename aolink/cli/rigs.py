@@ -405,7 +405,8 @@ def calibrate(
 
     From recordings of dark, flat and still light; or with --camera and --mirror, asking for each in turn.
     """
-    from tempfile import TemporaryDirectory
+    from shutil import rmtree
+    from tempfile import mkdtemp
 
     from aolink import calibrating, tables
     from aolink.rig import load_rig
@@ -414,13 +415,23 @@ def calibrate(
     if bool(files) == bool(camera) or bool(camera) != bool(mirror):
         raise typer.BadParameter("give recordings, or --camera and --mirror")
     check_target(output, overwrite=overwrite, sources=files or [])
-    with TemporaryDirectory(prefix="aolink-") as temporary:
+    folder = keep or Path(mkdtemp(prefix="aolink-"))
+    try:
         if camera and mirror:
             files = calibrating.record_frames(
-                loaded, camera, mirror, keep or Path(temporary), frames=frames, overwrite=overwrite,
+                loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
             )  # fmt: skip
         result = calibrating.calibrate_recordings(loaded, calibrating.rig_text(rig, loaded), files or [])
+    except AolinkError as error:
+        # Somebody has covered and lit the camera for them.
+        if not keep and (made := sorted(map(str, folder.glob("*.mcap")))):
+            keep = folder
+            raise type(error)(f"{error}; `aolink calibrate` takes what was recorded: {' '.join(made)}") from None
+        raise
+    finally:
+        if not keep:
+            rmtree(folder, ignore_errors=True)
     with writing(output, overwrite=overwrite, sources=files or []) as unfinished:
         unfinished.write_text(result.text, newline="")  # with the line ends that the rig file had
     if as_json:

@@ -46,6 +46,12 @@ class Unused:
     first_frame: int
     """Frame of the first."""
 
+    def text(self, estimated: int) -> str:
+        """The same in words, for a series of ``estimated`` exposures."""
+        what = self.status.lower().replace("_", " ")
+        first = "" if self.exposures == 1 else ", the first"
+        return f"{self.exposures} of {estimated} exposures {what}: {self.reason} (frame {self.first_frame}{first})"
+
 
 class UnusedCounter:
     """Counts estimates that could not use their exposure, by status and reason."""

@@ -101,6 +101,14 @@ def _true_scene(rig: Rig, camera: NativeCamera) -> dict[str, bytes]:
     return {topics.TRUE_SCENE_ATTACHMENT: data.getvalue()}
 
 
+def _saved(report: Report, paths: Sequence[Path]) -> str:
+    """What a session that an error ended has left, in words."""
+    where = str(paths[-1]) if len(paths) == 1 else f"{len(paths)} files, the last of them {paths[-1]}"
+    if not report.exposures:
+        return f"no exposure had come by then, {where} holds none"
+    return f"the {report.exposures} exposure(s) that had come by then are saved in {where}"
+
+
 def record(
     rig: Rig,
     camera_port: str,
@@ -213,6 +221,8 @@ def record(
             if not (stop() and isinstance(error, PortError | DeviceError)):
                 with contextlib.suppress(AolinkError):
                     writer.close(report.counts())
+                if isinstance(error, PortError | DeviceError):
+                    raise type(error)(f"{error}; {_saved(report, writer.paths)}") from None
                 raise
             # It was to end anyway: that a device no longer answers is a warning.
             report.ended = "interrupted"

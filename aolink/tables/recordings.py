@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,13 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from aolink.estimation import Status
+from aolink.estimation.score import Unused, UnusedCounter
 from aolink.recording import topics
+from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
+from aolink.recording.schemas_pb2 import ExposureInfo
 from aolink.tables.json import without_nan
+from aolink.units import duration, with_unit
 
 if TYPE_CHECKING:
     from aolink.recording.compare import TopicComparison
@@ -32,11 +38,14 @@ _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported"
 def recording_facts(recording: Recording) -> dict[str, Any]:
     """What `aolink info` says of a recording."""
     duration_s = (recording.end_ns - recording.start_ns) / 1e9
+    gaps, estimates = _gaps_and_estimates(recording)
     return {
         "file": str(recording.path),
         "bytes": recording.path.stat().st_size,
         "complete": recording.complete,
         "damage": recording.damage,
+        "start_ns": recording.start_ns,
+        "start_utc": _date(recording.start_ns),
         "duration_s": duration_s,
         "messages": dict(sorted(recording.counts.items())),
         "rates_per_s": {
@@ -44,7 +53,8 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
             for topic, count in sorted(recording.counts.items())
             if duration_s and count > 1
         },
-        "gaps": _gaps(recording),
+        "gaps": gaps,
+        "estimates": estimates,
         "commands": {
             end: int(steps) for end in _ENDS if (steps := recording.end_metadata.get(f"steps_{end}", "")).isdigit()
         },
@@ -56,15 +66,35 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _gaps(recording: Recording) -> dict[str, float]:
-    """Where the camera's frames are further apart than their period: how often, and the longest, in fast steps."""
+def _date(time_ns: int) -> str | None:
+    """A time on the host's clock as a date, ISO 8601; None for one that no calendar has."""
+    try:
+        return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="seconds")
+    except (OverflowError, ValueError, OSError):
+        return None
+
+
+def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[str, Any]]:
+    """Where the camera's frames are further apart than their period: how often, and the longest, in fast steps.
+
+    And for each estimator how many estimates there are, and why some could not use their exposure.
+    """
     period, last, gaps = recording.rig.timing.frame_period_steps, None, []
-    for recorded in recording.messages(topics.EXPOSURE):
-        first = recorded.message.first_step  # type: ignore[attr-defined]
-        if last is not None and first - last != period:
-            gaps.append(first - last - period)
-        last = first
-    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}
+    names = recording.estimators
+    counts, unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
+    for recorded in recording.messages(topics.EXPOSURE, *map(topics.estimate_topic, names)):
+        message = recorded.message
+        if isinstance(message, ExposureInfo):
+            if last is not None and message.first_step - last != period:
+                gaps.append(message.first_step - last - period)
+            last = message.first_step
+        elif isinstance(message, EstimateMessage):
+            name = recorded.topic.removeprefix(topics.ESTIMATE)
+            counts[name] += 1
+            with contextlib.suppress(ValueError):  # a status that a later aolink has
+                unused[name].add(Status(message.status), message.reason, message.frame_id)
+    estimates = {name: {"count": n, "unused": [asdict(u) for u in unused[name].result()]} for name, n in counts.items()}
+    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}, estimates
 
 
 def _losses(recording: Recording) -> dict[str, int]:
@@ -92,20 +122,42 @@ def _typed(name: str, value: str) -> Any:
 
 
 def facts(values: Mapping[str, Any]) -> Table:
-    """Name and value, line by line."""
+    """Name and value, line by line, in the units that people read; `recording_facts` has the numbers."""
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    flat = {name: value for name, value in values.items() if name != "session"} | values["session"]
-    for name, value in flat.items():
+    virtual = " (the rig's own time)" if values["session"].get("virtual_time") is True else ""
+    begun = (values["start_utc"] or f"{values['start_ns']} ns since 1970").replace("T", " ").replace("+00:00", " UTC")
+    readable = {
+        "file": values["file"], "size": with_unit(values["bytes"], "B"), "recorded": f"{begun}{virtual}",
+        "duration": duration(values["duration_s"]),
+    }  # fmt: skip
+    left_out = {"bytes", "start_ns", "start_utc", "duration_s", "session", "estimators", "estimates"}
+    flat = readable | {name: value for name, value in values.items() if name not in left_out}
+    flat["estimates"] = ", ".join(f"{name} {each['count']}" for name, each in values["estimates"].items()) or "none"
+    for name, value in (flat | {k: v for k, v in values["session"].items() if k != "estimators"}).items():
         if name in ("damage", "warnings", "commands") and not value:
             continue
         if isinstance(value, Mapping):
-            value = ", ".join(f"{key} {count}" for key, count in value.items())
+            value = ", ".join(f"{key} {count}" for key, count in value.items()) or "none"
         elif isinstance(value, list):
             value = " ".join(value) or "none"
-        table.add_row(name, escape(str(value)))
+        table.add_row(*map(escape, _readable(name, value)))
+        for line in _unused(values["estimates"]) if name == "estimates" else ():
+            table.add_row("", escape(line))
     return table
+
+
+def _readable(name: str, value: Any) -> tuple[str, str]:
+    """A number whose name ends in its unit, with a unit that makes it short."""
+    for ending, unit, factor in (("_ns", "s", 1e-9), ("_s", "s", 1.0), ("_ppm", "ppm", 1.0)):
+        if name.endswith(ending) and isinstance(value, int | float):
+            return name.removesuffix(ending), f"{value:.4g} ppm" if unit == "ppm" else with_unit(factor * value, unit)
+    return name, str(value)
+
+
+def _unused(estimates: Mapping[str, Any]) -> list[str]:
+    return [f"{name}: {Unused(**each).text(of['count'])}" for name, of in estimates.items() for each in of["unused"]]
 
 
 def batch(rows: Sequence[Mapping[str, Any]]) -> Table:

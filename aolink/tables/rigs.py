@@ -11,7 +11,6 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
-from aolink.calibration.rig_text import written
 from aolink.tables.json import without_nan
 
 if TYPE_CHECKING:
@@ -67,6 +66,8 @@ def _calibration_facts(result: Calibrated) -> list[str]:
 
 def calibration_as_json(result: Calibrated) -> dict[str, Any]:
     """The same for scripts; what is not known is null."""
+    from aolink.calibration.rig_text import written  # with scipy.stats, half of what `aolink info` took to start
+
     found, sensor = result.calibration, result.rig.sensor
     before = {
         "sensor.black_level": sensor.black_level,

@@ -75,13 +75,7 @@ def unused_lines(by_name: Mapping[str, Score]) -> list[str]:
     """How many exposures each estimator could not use and why, in words; empty where all used all."""
     lines = []
     for name, each in by_name.items():
-        for unused in each.unused[:_MOST_REASONS]:
-            what = unused.status.lower().replace("_", " ")
-            first = "" if unused.exposures == 1 else ", the first"
-            lines.append(
-                f"{name}: {unused.exposures} of {each.estimated} exposures {what}: {unused.reason}"
-                f" (frame {unused.first_frame}{first})"
-            )
+        lines += [f"{name}: {unused.text(each.estimated)}" for unused in each.unused[:_MOST_REASONS]]
         more = len(each.unused) - _MOST_REASONS
         if more > 0:
             lines.append(f"{name}: and {more} other reasons, which --json has")

@@ -10,13 +10,13 @@ import numpy as np
 from rich.table import Table
 
 from aolink.recording import schemas_pb2 as pb
-from aolink.session import EstimatorReport, Report
 from aolink.tables.json import without_nan
 from aolink.tables.scores import unused_lines
 
 if TYPE_CHECKING:
     from aolink.demo import DemoResult
     from aolink.recording.deblur import Summary
+    from aolink.session import EstimatorReport, Report
 
 _LATENCY_STEPS = (
     ("exposure end to first byte", "exposure_end_ns", "first_byte_ns"),

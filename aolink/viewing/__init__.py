@@ -7,10 +7,11 @@ calls them with a whole recording, `LiveView` with one exposure after the other.
 from aolink.viewing.figure import draw_session
 from aolink.viewing.live import LiveView, live_viewer
 from aolink.viewing.save import save_rrd, send_recording
-from aolink.viewing.viewer import open_viewer, screenshot, serve_web
+from aolink.viewing.viewer import check_display, open_viewer, screenshot, serve_web
 
 __all__ = [
     "LiveView",
+    "check_display",
     "draw_session",
     "live_viewer",
     "open_viewer",

@@ -33,6 +33,8 @@ from aolink.viewing.timebase import FAST_STEP
 from aolink.viewing.vulkan import has_vulkan
 
 HOST = "127.0.0.1"
+WEB_PORT = 9090
+"""Of the web viewer's page, where nothing else uses it."""
 PICTURE_SIZE = (1920, 1200)
 """Of a screenshot, pixels."""
 
@@ -52,6 +54,9 @@ _LEAST_COLOURS = 50
 
 _LAST_WORDS_S = 2.0
 """How long a viewer that has failed may take to end."""
+_MAGIC = b"RRF"
+"""What every Rerun file begins with; the version of the format follows."""
+
 _NO_DRIVER = (
     "this machine has no Vulkan driver, which the Rerun viewer needs to draw;"
     " on Debian: apt-get install mesa-vulkan-drivers"
@@ -149,28 +154,37 @@ def settled_picture(client: ViewerClient, view_id: str | None = None) -> NDArray
     return pixels
 
 
+def check_display() -> None:
+    """Raise `ViewerError` where a window cannot be opened."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
+
+
 def open_viewer(rrd_path: str | Path) -> None:
     """Open the native viewer and wait until its window is closed. Raises `ViewerError` where there is no display."""
     path = _existing(rrd_path)
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
+    check_display()
     with tempfile.TemporaryFile() as said, running_rerun([str(path), "--port", "auto"], said) as process:
         if process.wait() != 0:
             raise _why_it_ended(said)
 
 
-def serve_web(rrd_path: str | Path, port: int = 9090, *, on_ready: Callable[[str], None] | None = None) -> None:
+def serve_web(
+    rrd_path: str | Path, port: int | None = None, *, on_ready: Callable[[str], None] | None = None
+) -> None:  # fmt: skip
     """Serve a file with the web viewer on this machine's loopback until interrupted.
 
     Parameters
     ----------
     port:
-        Of the page; the data goes over a second, free one.
+        Of the page; by default `WEB_PORT`, or a free one where that is in use. The data goes over a second, free one.
     on_ready:
         Called once with the address to open.
     """
     path = _existing(rrd_path)
-    if not _is_free(port):
+    if port is None:
+        port = WEB_PORT if _is_free(WEB_PORT) else free_port()
+    elif not _is_free(port):
         raise ViewerError(f"port {port} is in use: stop what uses it or choose another one")
     data_port = free_port()
     options = [str(path), "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
@@ -297,6 +311,13 @@ def _existing(path: str | Path) -> Path:
     path = Path(path)
     if not path.is_file():
         raise ViewerError(f"there is no file {path}: `aolink view RECORDING --save FILE.rrd` writes one")
+    try:
+        with path.open("rb") as file:
+            magic = file.read(len(_MAGIC))
+    except OSError as error:
+        raise ViewerError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
+    if magic != _MAGIC:
+        raise ViewerError(f"{path} is not a Rerun file: `aolink view RECORDING --save FILE.rrd` writes one")
     return path.resolve()
 
 

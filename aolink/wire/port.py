@@ -12,6 +12,7 @@ import stat
 import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
+from urllib.parse import urlsplit
 
 import serial
 
@@ -48,15 +49,17 @@ class SerialPort:
     def __init__(self, url: str, baud_rate: int = BAUD_RATE, *, stop: Callable[[], bool] = lambda: False) -> None:
         self.url = url
         self._stop = stop
+        _check_address(url)
         try:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud_rate, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
-        except (OSError, ValueError) as error:  # SerialException is an OSError
+        except Exception as error:  # pyserial lets through whatever it meets in an address that it cannot read
             raise _open_error(url, error) from None
         try:
             self._serial.fileno()
         except (OSError, AttributeError):
+            self._serial.close()
             raise PortError(
                 f"{url} is a port that cannot be waited on: use a device path or socket://host:port"
             ) from None
@@ -122,21 +125,55 @@ def is_local(transport: Transport) -> bool:
     return False
 
 
+_FORMS = "a port is a device path such as /dev/ttyACM0, or an address such as socket://192.168.1.5:5000"
+
+
+def _check_address(url: str) -> None:
+    """Raise PortError for what cannot be a port: an address without host or number, a folder, a file of data."""
+    scheme, slashes, _ = url.partition("://")
+    if not slashes:
+        try:
+            mode = os.stat(url).st_mode
+        except (OSError, ValueError):  # opening it will say why
+            return
+        if not stat.S_ISCHR(mode):
+            what = "a folder" if stat.S_ISDIR(mode) else "a file, not a device"
+            raise PortError(f"{url} is {what}: `aolink devices` lists the ports of this machine; {_FORMS}")
+        return
+    if scheme not in ("socket", "rfc2217"):
+        return
+    try:
+        parts = urlsplit(url)
+        host, number = parts.hostname, parts.port
+    except ValueError:  # a number that is none, or above 65535
+        host, number = "", None
+    if not host or not number:
+        raise PortError(
+            f"{url} is not an address: expected {scheme}://HOST:PORT with a number from 1 to 65535; {_FORMS}"
+        )
+
+
 def _open_error(url: str, error: Exception) -> PortError:
-    number = getattr(error, "errno", None)
-    if number is None and isinstance(error.__context__, OSError):
-        number = error.__context__.errno
+    cause = error.__context__ if isinstance(error.__context__, OSError) else error
+    number = getattr(error, "errno", None) or getattr(cause, "errno", None)
+    if isinstance(cause, socket.gaierror):  # its numbers are not those of errno
+        return PortError(f"there is no host of the name in {url}: give its IP address, or check the spelling")
+    if isinstance(cause, TimeoutError) or number in (errno.EHOSTUNREACH, errno.ENETUNREACH):
+        return PortError(f"nothing answers at {url}: is that machine on, and in this network?")
     if "exclusively lock" in str(error) or number in (errno.EBUSY, errno.EWOULDBLOCK):
         return PortError(f"port {url} is in use by another program: close that one, or give another port")
+    if number == errno.ENOTTY or "Inappropriate ioctl" in str(error):
+        return PortError(f"{url} is a device, but no serial port: `aolink devices` lists those of this machine")
     if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV) or isinstance(error, ValueError):
         return PortError(
-            f"there is no port {url}: `aolink devices` lists those of this machine;"
-            " a port is a device path or an address such as socket://host:port"
+            f"there is no port {url or 'without a name'}: `aolink devices` lists those of this machine; {_FORMS}"
         )
     if number in (errno.EACCES, errno.EPERM):
         return PortError(f"no permission to open {url}: on Debian, add yourself to the group dialout and log in again")
     if number == errno.ECONNREFUSED or "refused" in str(error):
         return PortError(f"nothing listens at {url}: start the device or its server first")
+    if "://" in url and number is None:
+        return PortError(f"{url} is not an address that pyserial can open ({_plain(error)}); {_FORMS}")
     return PortError(f"cannot open {url}: {_plain(error)}")
 
 

@@ -2,12 +2,15 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import socket
+import subprocess
 import time
 import urllib.parse
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -221,3 +224,45 @@ def test_a_port_in_use_is_one_clear_error(rrd: Path) -> None:
         port = other.getsockname()[1]
         with pytest.raises(ViewerError, match=f"port {port} is in use"):
             serve_web(rrd, port)
+
+
+def test_a_page_moves_where_its_usual_port_is_taken(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[str] = []
+
+    def look(address: str) -> None:
+        with urllib.request.urlopen(address) as page:
+            seen.append(page.read().decode())
+        seen.append(address)
+        raise KeyboardInterrupt
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = other.getsockname()[1]
+        monkeypatch.setattr("aolink.viewing.viewer.WEB_PORT", taken)
+        with pytest.raises(KeyboardInterrupt):
+            serve_web(rrd, on_ready=look)
+    assert "<canvas" in seen[0]
+    assert urllib.parse.urlsplit(seen[1]).port != taken
+
+
+def test_a_rerun_file_is_shown_as_it_is(rrd: Path, start_aolink: Callable[..., subprocess.Popen[str]]) -> None:
+    """The command serves it without making a recording of it first; Ctrl-C ends it."""
+    serving = start_aolink("view", rrd, "--web")
+    assert serving.stdout is not None
+    with urllib.request.urlopen(serving.stdout.readline().strip()) as page:
+        assert b"<canvas" in page.read()
+    serving.send_signal(signal.SIGINT)
+    serving.communicate(timeout=60)
+    assert serving.returncode == 130
+
+
+def test_what_is_no_rerun_file_is_one_clear_error(aolink: Callable[..., Any], rrd: Path, tmp_path: Path) -> None:
+    (tmp_path / "text.rrd").write_text("hello")
+    for name, message in (("text.rrd", "text.rrd is not a Rerun file"), ("none.rrd", "there is no file none.rrd")):
+        result = aolink("view", name, "--web")
+        assert result.returncode == 7
+        assert result.stderr.startswith(f"aolink: {message}")
+    result = aolink("view", rrd, "--save", "again.rrd")
+    assert result.returncode == 2
+    assert "is a Rerun file already" in " ".join(result.stderr.replace("│", " ").split())
