@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import itertools
 import os
 import subprocess
@@ -256,11 +257,12 @@ def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path:
 
 
 def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A write that blocks: a FIFO whose reader has stopped reading stands for the disk."""
+    """A write that blocks: a pipe whose reader has stopped reading stands for the disk."""
     monkeypatch.setattr("aolink.recording.writer._STALL_S", 0.2)
-    os.mkfifo(fifo := tmp_path / "disk")
-    reader = os.open(fifo, os.O_RDONLY | os.O_NONBLOCK)
-    writer = RecordingWriter(fifo, load_rig("section-vi"), {}, 0, overwrite=True)
+    reader, disk = os.pipe()
+    monkeypatch.setattr("aolink.files.create", lambda *_, **__: disk)  # which refuses a pipe that has a name
+    fcntl.fcntl(disk, fcntl.F_SETPIPE_SZ, 1 << 20)  # for what a recording begins with
+    writer = RecordingWriter(tmp_path / "a.mcap", load_rig("section-vi"), {}, 0)
     os.read(reader, 1 << 20)
 
     def record_much() -> None:
