@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import re
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -12,8 +11,8 @@ import pytest
 
 README = Path(__file__).parents[1] / "README.md"
 COLUMNS = ("RMSE start", "RMSE end", "RMSE path", "NIS", "NEES start", "NEES end")
-ITERATED = ("profile", "mixture")
-"""They amplify the last bit's rounding, which is another one on another processor."""
+ELSEWHERE = {"profile": (0.01, 0.03), "mixture": (0.01, 0.03)}
+"""By what share figures may differ on processors other than x86-64, as README says: RMSE, and NIS and NEES."""
 
 Rows = dict[str, list[str]]
 
@@ -40,29 +39,29 @@ def readme() -> Rows:
 def printed(tmp_path_factory: pytest.TempPathFactory) -> Rows:
     out = tmp_path_factory.mktemp("demo")
     command = [sys.executable, "-m", "aolink", "demo", "--rig", "section-vi-lively", "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stderr
     return table(done.stdout)
 
 
-def tolerances() -> tuple[float, float]:
-    """By what share README says that figures of `profile` and `mixture` may differ: RMSE, and NIS and NEES."""
-    text = " ".join(README.read_text().split())
-    match = re.search(r"`profile` and `mixture` within (\d+) % \(NIS and NEES: (\d+) %\)", text)
-    assert match, "README no longer says to how many digits the figures hold"
-    return int(match[1]) / 100, int(match[2]) / 100
-
-
 @pytest.mark.long
 def test_the_demo_prints_what_readme_says(readme: Rows, printed: Rows) -> None:
+    """To a unit of the last digit on x86-64, whatever its vector units are."""
     assert list(readme) == list(printed)
-    of_rmse, of_squares = tolerances()
+    tried = platform.machine().lower() in ("x86_64", "amd64")
     for name, figures in readme.items():
         for column, there, here in zip(COLUMNS, figures, printed[name], strict=True):
             if there == "-":
                 assert here == "-"
                 continue
-            digits = len(there.partition(".")[2])
-            share = (of_rmse if column.startswith("RMSE") else of_squares) if name in ITERATED else 0.0
-            allowed = max(share * float(there), 10.0**-digits) + 1e-9
-            assert math.isclose(float(here), float(there), rel_tol=0, abs_tol=allowed), (name, column, there, here)
+            of_rmse, of_squares = (0.0, 0.0) if tried else ELSEWHERE.get(name, (0.0, 0.0))
+            share = of_rmse if column.startswith("RMSE") else of_squares
+            unit = 10.0 ** -len(there.partition(".")[2])
+            allowed = max(share * float(there), unit) + 1e-9
+            assert abs(float(here) - float(there)) <= allowed, (name, column, there, here)
+
+
+def test_readme_says_so() -> None:
+    text = " ".join(README.read_text().split())
+    assert "on x86-64 your figures are these to a unit of the last digit" in text
+    assert "allow `profile` and `mixture` 1 % (NIS and NEES 3 %)" in text
