@@ -59,8 +59,11 @@ class Device(Protocol):
 class Camera(Device, Protocol):
     """Takes frames, each integrated over a run of fast steps."""
 
-    def start(self, first_step: int, exposures: int) -> None:
-        """Take ``exposures`` frames (0: until stopped), the first from ``first_step``. Raises DeviceError."""
+    def start(self, first_step: int, exposures: int) -> bool:
+        """Take ``exposures`` frames (0: until stopped), the first from ``first_step``; False if that has gone by.
+
+        Raises DeviceError.
+        """
 
     def stop(self) -> None:
         """Take no more frames. Raises DeviceError."""

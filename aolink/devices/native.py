@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import count
 
@@ -32,6 +33,9 @@ _PATIENCE_WATCHDOGS = 2.0
 """A mirror that answers nothing for so many times its watchdog has parked itself, and the session ends."""
 _LEAST_TRIES = 5
 """It is not given up before so many tries: a host that was held up has not read the answers yet."""
+_START_ANSWER_S = 0.05
+"""A camera is told to start at a step that is near: the next try must not wait for long."""
+_START_TRIES = 60
 _MAX_QUERIES = 32
 
 
@@ -63,12 +67,22 @@ class _NativeDevice:
         accepted = usable and self.clock.add(exchange)
         return [ClockSampled(exchange, accepted, self.clock.step if self.clock.step is not before else None)]
 
-    def _request(self, message: pb.CameraControl | pb.Park | pb.Rearm, what: str, answer_s: float = ANSWER_S) -> pb.Ack:
-        ack = self._hub.request(self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s)
+    def _request(
+        self,
+        message: pb.CameraControl | pb.Park | pb.Rearm,
+        what: str,
+        answer_s: float = ANSWER_S,
+        tries: int = TRIES,
+        codes: Sequence[int] = (pb.OK,),
+    ) -> pb.Ack:
+        """Send a request until it is answered; gives the answer. Raises DeviceError if its code is not of ``codes``."""
+        ack = self._hub.request(
+            self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s, tries
+        )
         if ack is None:
             raise DeviceError(f"the {self.link.name} did not answer when told to {what}: is it still connected?")
         self._gate.passes(self.link, ack, self._hub.now_ns())
-        if ack.code != pb.OK:
+        if ack.code not in codes:
             raise DeviceError(f"the {self.link.name} refused to {what}: {_reason(ack)}")
         return ack
 
@@ -85,8 +99,10 @@ class NativeCamera(_NativeDevice):
         self._frames = PlanesReassembly(shapes, identity.fast_step_ns)
         self._truths = TruthReassembly()
 
-    def start(self, first_step: int, exposures: int) -> None:
-        self._request(pb.CameraControl(run=True, first_step=first_step, exposures=exposures), "start")
+    def start(self, first_step: int, exposures: int) -> bool:
+        message = pb.CameraControl(run=True, first_step=first_step, exposures=exposures)
+        ack = self._request(message, "start", _START_ANSWER_S, _START_TRIES, (pb.OK, pb.TOO_LATE))
+        return ack.code == pb.OK
 
     def stop(self) -> None:
         self._request(pb.CameraControl(run=False), "stop")

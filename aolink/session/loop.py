@@ -39,6 +39,7 @@ LEAD_BLOCKS = 3
 _ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
 """Real time: from the first command to its first step."""
+_START_TRIES = 5
 _LINK_PERIOD_S = 1.0
 _ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
@@ -127,10 +128,9 @@ class SessionLoop:
         timing, hub = self._rig.timing, self._hub
         if self._mirror.latched:
             self._rearm("in a session before")
-        self._first_step = self._queued_until = self._choose_first_step()
+        self._first_step = self._queued_until = self._start_camera(exposures)
         if exposures:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
-        self._camera.start(self._first_step, exposures)
         self._send_commands(self._first_step)  # queued before the first step is due
         self._receive(0.0)
         self._last_frame_ns = hub.now_ns()
@@ -206,12 +206,21 @@ class SessionLoop:
         suspected = self._camera.clock.suspected or self._mirror.clock.suspected
         return self._last_query_ns + round((SUSPICION_PERIOD_S if suspected else QUERY_PERIOD_S) / 2 * 1e9)
 
-    def _choose_first_step(self) -> int:
-        if self._hub.virtual:
-            return self._mirror.identity.next_step
-        step = self._device_step()
-        self._mirror.check_step(step, self._hub.now_ns())
-        return step + round(_START_DELAY_S * 1e9) // self._step_ns
+    def _start_camera(self, exposures: int) -> int:
+        """Start the camera; gives the first fast step of the session."""
+        for _ in range(_START_TRIES):
+            if self._hub.virtual:
+                first_step = self._mirror.identity.next_step
+            else:
+                step = self._device_step()
+                self._mirror.check_step(step, self._hub.now_ns())
+                first_step = step + round(_START_DELAY_S * 1e9) // self._step_ns
+            if self._camera.start(first_step, exposures):
+                return first_step
+        raise DeviceError(
+            f"the camera was told {_START_TRIES} times to start {_START_DELAY_S:g} s later, and each time it heard of it"
+            " too late: is the line or this machine so slow, do both devices count the same fast steps?"
+        )
 
     def _device_step(self) -> int:
         """The fast step that the device is in: by its clock, or on virtual time the one that it waits at."""

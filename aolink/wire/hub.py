@@ -147,17 +147,19 @@ class Hub:
         answers: type[AnyMessage],
         is_it: Callable[[AnyMessage, int], bool],
         answer_s: float = ANSWER_S,
+        tries: int = TRIES,
     ) -> AnyMessage | None:
         """Send a request until its answer comes; None if it never does. Other messages wait for `wait`.
 
-        ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number. Each of the
-        `TRIES` tries waits for ``answer_s``.
+        ``is_it(answer, sequence)`` tells whether an answer belongs to the request of that sequence number: of the last
+        try or of one before. Each of the ``tries`` waits for ``answer_s``.
         """
         before = self._memory_bytes()
-        for attempt in range(TRIES):
+        sequences: list[int] = []
+        for attempt in range(tries):
             if attempt and (self._hurried or self._stop()):
                 break
-            sequence = link.send(request)
+            sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)
             while True:
                 kept = self._pending
@@ -165,7 +167,12 @@ class Hub:
                 answer = None
                 for source, received in self.wait((deadline_ns - self.now_ns()) / 1e9):
                     message = received.message
-                    if answer is None and source is link and isinstance(message, answers) and is_it(message, sequence):
+                    if (
+                        answer is None
+                        and source is link
+                        and isinstance(message, answers)
+                        and any(is_it(message, sequence) for sequence in sequences)
+                    ):
                         answer = message
                     else:
                         kept.append((source, received))
