@@ -487,7 +487,7 @@ def test_nobody_is_asked_for_anything_before_the_ports_are_tried(aolink: Run, tm
     with simulated_rig("section-vi") as (camera, mirror):
         for ports, message in (
             ((camera, "/dev/nowhere"), "there is no port /dev/nowhere"),
-            ((mirror, camera), "the camera port is a mirror"),
+            ((mirror, camera), "the device on the camera port is a mirror"),
         ):
             result = aolink(
                 "calibrate", "--camera", ports[0], "--mirror", ports[1], *arguments, input="\n", env=own_tmp
