@@ -108,6 +108,9 @@ def read_psf(path: Path) -> NDArray[np.float64]:
 
 def _load(path: Path, what: str) -> NDArray[Any]:
     try:
-        return np.asarray(np.load(path, allow_pickle=False))
+        values = np.asarray(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError) as error:
         raise RestorationError(f"{path} cannot be read as a {what} ({error})") from error
+    if not values.size:
+        raise RestorationError(f"{path} cannot be read as a {what}: it holds an array of shape {values.shape}")
+    return values

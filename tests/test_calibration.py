@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import subprocess
 import tomllib
 from collections.abc import Callable
@@ -451,20 +452,49 @@ def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path
         result = aolink("calibrate", *devices, *common, "-o", "out.toml", input="\ns\n\n")
         assert result.returncode == 0, result.stderr
         assert "40 dark, 0 flat, 40 still" in result.stdout
-        alone = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n")
+        (tmp_path / "tmp").mkdir()
+        own_tmp = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+        alone = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n", env=own_tmp)
         assert (alone.returncode, "nobody answers: run `aolink calibrate` on a terminal" in alone.stderr) == (8, True)
         few = aolink("calibrate", *devices, *common[:2], "-o", "b.toml", "--frames", "3", input="\n\n\n\n")
         assert (few.returncode, "--frames 3 is too few: at least 10" in few.stderr) == (8, True)
-        unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n")
+        unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n", env=own_tmp)
         assert unlit.returncode == 8
-        assert unlit.stderr.endswith(
+        refused, _, kept = unlit.stderr.rpartition("; `aolink calibrate` takes what was recorded: ")
+        assert refused.endswith(
             "aolink: flat-1.mcap is said to be flat, but is no brighter than the dark frames:"
-            " is the light on? Record both again\n"
+            " is the light on? Record both again"
         )
+        # Whoever covered and lit the camera need not do it again.
+        assert sorted(Path(each).name for each in kept.split()) == [
+            "dark.mcap",
+            "flat-1.mcap",
+            "flat-2.mcap",
+            "still.mcap",
+        ]
+        again = aolink("calibrate", kept.split()[0], *common[:2], "-o", "dark.toml")
+        assert again.returncode == 0, again.stderr
     nowhere = aolink("calibrate", "--camera", "x", "--mirror", "x", *common, "-o", "no/b.toml")
     assert (nowhere.returncode, "there is no folder no; make it" in nowhere.stderr) == (1, True)
     assert not (tmp_path / "b.toml").exists()
     assert aolink("calibrate", *common[:2], "-o", "b.toml").returncode == 2
+
+
+def test_nobody_is_asked_for_anything_before_the_ports_are_tried(aolink: Run, tmp_path: Path) -> None:
+    (tmp_path / "tmp").mkdir()
+    own_tmp = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+    arguments = ["--rig", "section-vi", "-o", "out.toml"]
+    with simulated_rig("section-vi") as (camera, mirror):
+        for ports, message in (
+            ((camera, "/dev/nowhere"), "there is no port /dev/nowhere"),
+            ((mirror, camera), "the device on the camera port is a mirror"),
+        ):
+            result = aolink(
+                "calibrate", "--camera", ports[0], "--mirror", ports[1], *arguments, input="\n", env=own_tmp
+            )
+            assert result.returncode in (3, 4)
+            assert result.stderr.startswith(f"aolink: {message}"), result.stderr
+    assert not list((tmp_path / "tmp").iterdir())
 
 
 def test_frames_are_recorded_apart_and_marked(aolink: Run, tmp_path: Path) -> None:

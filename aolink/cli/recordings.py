@@ -180,19 +180,24 @@ def _estimate_one(
     check_has_exposures(recording)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     total, known = recording.counts.get("/camera/image", 0), recording.damage
-    get_ready(recording.rig, names)
-    with progress_bar(stderr, total) as tell:
-        if output is not None:
-            write_reestimated(
-                recording, names, output,
-                only=only, overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
-            )  # fmt: skip
-            written = Recording(output)
-            each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
-            series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
-        else:
-            series = reestimated(recording, names, lambda n: tell("estimate", n), engine.value)
-        scores, differences = scored_and_compared(recording, series, names)
+    try:
+        get_ready(recording.rig, names)
+        with progress_bar(stderr, total) as tell:
+            if output is not None:
+                write_reestimated(
+                    recording, names, output,
+                    only=only, overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
+                )  # fmt: skip
+                written = Recording(output)
+                each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
+                series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
+            else:
+                series = reestimated(recording, names, lambda n: tell("estimate", n), engine.value)
+            scores, differences = scored_and_compared(recording, series, names)
+    except (ArithmeticError, ValueError) as error:
+        if recording.rig_is_recorded:
+            raise
+        raise EstimatorError(f"{file} cannot be estimated with this rig: {error!r}; are its numbers meant?") from None
     if recording.damage != known:
         stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
     if as_json:

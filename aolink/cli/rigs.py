@@ -203,7 +203,7 @@ def record(
         bool, typer.Option("--view", help="Show it in Rerun as it goes on; the viewer skips what it has no time for.")
     ] = False,
     split_mib: Annotated[
-        float, typer.Option(min=0, metavar="MIB", help="Begin another file at this size; 0 for one file.")
+        float, typer.Option(min=0, max=2**30, metavar="MIB", help="Begin another file at this size; 0 for one file.")
     ] = 0.0,
     split_s: Annotated[
         float, typer.Option(min=0, metavar="S", help="Begin another file after this time; 0 for one file.")
@@ -457,8 +457,8 @@ def demo(
     from aolink.recording.reader import Recording
 
     loaded = load_checked(rig)
-    get_ready(loaded, possible_estimators(loaded))
     folder = new_folder(out)
+    get_ready(loaded, possible_estimators(loaded))
     stop = StopRequest()
     try:
         with progress_bar(stderr, exposures) as tell:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import pty
 import re
 import resource
 import signal
+import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 import tty
@@ -26,7 +29,7 @@ from aolink.cli import app
 from aolink.demo import simulated_rig
 from aolink.devices.interfaces import CommandAnswered
 from aolink.devices.native import NativeCamera
-from aolink.errors import DeviceError, RecordingError
+from aolink.errors import DeviceError, PortError, RecordingError
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
@@ -34,6 +37,7 @@ from aolink.session import open_devices, record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet, schema_hash
 from aolink.wire.port import SerialPort, wait_readable
+from tests.conftest import Session
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -263,8 +267,14 @@ def test_a_rig_killed_in_the_middle(start_aolink: Start, tmp_path: Path) -> None
     rig.communicate()
     _, errors = process.communicate(timeout=30)
     assert process.returncode == 3
-    assert re.fullmatch(r"aolink: lost /dev/pts/\d+: .*; is the device still there\?\n", errors), errors
+    told = re.fullmatch(
+        r"aolink: lost /dev/pts/\d+: .*; is the device still there\?;"
+        r" the (\d+) exposure\(s\) that had come by then are saved in a.mcap\n",
+        errors,
+    )
+    assert told, errors
     recording = Recording(tmp_path / "a.mcap")
+    assert len(list(recording.exposures())) == int(told[1])
     assert recording.complete
     assert recording.metadata["ended"].startswith("error: lost /dev/pts/")
     assert len(recording.estimates("o3")) > 0
@@ -410,6 +420,74 @@ def test_a_port_that_cannot_be_waited_on(aolink: Run) -> None:
     assert "loop:// is a port that cannot be waited on: use a device path or socket://host:port" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("port", "message"),
+    [
+        ("socket://127.0.0.1", r"is not an address: expected socket://HOST:PORT with a number from 1 to 65535"),
+        ("socket://", "is not an address: expected socket://HOST:PORT"),
+        ("socket://127.0.0.1:nine", "is not an address: expected socket://HOST:PORT"),
+        ("socket://127.0.0.1:99999", "is not an address: expected socket://HOST:PORT"),
+        ("socket://127.0.0.1:-5", "is not an address: expected socket://HOST:PORT"),
+        ("socket://[::1:5", "is not an address: expected socket://HOST:PORT"),
+        ("socket://127.0.0.1:5?speed=1", "is not an address that pyserial can open"),
+        ("rfc2217://", "is not an address: expected rfc2217://HOST:PORT"),
+        ("hwgrep://[", "is not an address that pyserial can open"),
+        ("spy://", "there is no port spy://"),
+        ("nonsense://1", "there is no port nonsense://1"),
+        ("", "there is no port without a name"),
+        ("/dev/null", "/dev/null is a device, but no serial port"),
+        (".", r"\. is a folder"),
+        (__file__, "is a file, not a device"),
+        ("n" * 5000, "file name too long"),
+    ],
+)
+def test_what_cannot_be_a_port_is_one_clear_error(port: str, message: str) -> None:
+    with pytest.raises(PortError, match=message) as caught:
+        SerialPort(port)
+    assert "\n" not in str(caught.value)
+    for word in ("Errno", "NoneType", "Traceback", "object"):
+        assert word not in str(caught.value)
+
+
+def test_a_port_where_nobody_listens_and_one_without_permission() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        with pytest.raises(PortError, match=r"nothing listens at socket://127\.0\.0\.1"):
+            SerialPort(f"socket://127.0.0.1:{probe.getsockname()[1]}")
+    master, slave = pty.openpty()
+    path = os.ttyname(slave)
+    os.chmod(path, 0)
+    is_root = os.geteuid() == 0
+    try:
+        if is_root:  # root may open everything: nobody may not
+            os.seteuid(65534)
+        with pytest.raises(PortError, match=f"no permission to open {path}: on Debian, add yourself to the group"):
+            SerialPort(path)
+    finally:
+        if is_root:
+            os.seteuid(0)
+        os.close(master)
+        os.close(slave)
+
+
+def test_a_port_that_somebody_else_has_locked() -> None:
+    """With the lock of a terminal, which is not pyserial's own."""
+    master, slave = pty.openpty()
+    is_root = os.geteuid() == 0
+    try:
+        os.fchmod(slave, 0o666)
+        fcntl.ioctl(slave, termios.TIOCEXCL)
+        if is_root:  # root is let in all the same
+            os.seteuid(65534)
+        with pytest.raises(PortError, match="is in use by another program: close that one"):
+            SerialPort(os.ttyname(slave))
+    finally:
+        if is_root:
+            os.seteuid(0)
+        os.close(master)
+        os.close(slave)
+
+
 def test_a_tcp_port_that_another_host_has(aolink: Run) -> None:
     with simulated_rig("section-vi", "--listen", "127.0.0.1:0") as (camera, _):
         held = SerialPort(camera)
@@ -435,3 +513,20 @@ def test_a_file_that_is_not_a_recording(aolink: Run, tmp_path: Path, content: by
         result = aolink(command, "bad.mcap")
         assert_refused(result, 5, "bad.mcap")
     assert_refused(aolink("info", "missing.mcap"), 5, "cannot read missing.mcap: no such file or directory")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unwanted"),
+    [
+        (["--help"], "numpy|scipy|aolink.rig|numba|rerun"),
+        (["info", "s.mcap"], r"scipy\.stats|scipy\.optimize|numba|rerun"),
+    ],
+)
+def test_a_command_imports_what_it_uses(recorded: Session, tmp_path: Path, arguments: list[str], unwanted: str) -> None:
+    """SciPy's statistics alone take a second of processor time."""
+    (tmp_path / "s.mcap").symlink_to(recorded.path)
+    command = [sys.executable, "-X", "importtime", "-m", "aolink", *arguments]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=120, check=True)
+    imported = {line.rpartition("|")[2].strip() for line in result.stderr.splitlines()}
+    assert "aolink.cli.recordings" in imported
+    assert not [name for name in imported if re.match(rf"({unwanted})(\.|$)", name)]
