@@ -211,15 +211,15 @@ class Hub:
             now = time.monotonic()
             if (total := self._memory_bytes()) != heard:
                 heard, last_heard = total, now
-            if now - last_heard > _VIRTUAL_SILENCE_S:
-                raise DeviceError(
-                    f"the rig on virtual time has said nothing for {now - last_heard:.0f} s: is it stopped?"
-                )
             if self._hurried or self._stop():
                 stop_since = min(stop_since, now)
-            if now - stop_since > self._patience_s:
+            ended = now - stop_since > self._patience_s
+            if ended:
                 self._patience_s = _LAST_PATIENCE_S
-                raise DeviceError(f"the rig on virtual time has not dealt within {ANSWER_S:g} s with what it was sent")
+            if (silence := now - last_heard) > (_LAST_PATIENCE_S if ended else _VIRTUAL_SILENCE_S):
+                raise DeviceError(f"the rig on virtual time has said nothing for {silence:.1f} s: is it stopped?")
+            if ended:
+                raise DeviceError("the rig on virtual time talks without dealing with what it was sent")
             wait_readable(waiting, _SLICE_S)
 
     def _memory_bytes(self) -> int:
