@@ -45,6 +45,13 @@ class Simulated:
     def messages(self, *topics: str) -> list[Any]:
         return []
 
+    @property
+    def counts(self) -> dict[str, int]:
+        return {}
+
+    def skipped(self, name: str) -> frozenset[int]:
+        return frozenset()
+
     def restored(self) -> list[Any]:
         return [deblur(self.rig, self._exposures[0], self._estimates["o1"][0])]
 
