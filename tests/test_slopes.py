@@ -180,7 +180,7 @@ def test_the_picture_has_each_lenslet_where_it_lies():
     y, x = np.nonzero(lit)
     away = np.stack([x - x.mean(), y - y.mean()], axis=1)
     focus = (away**2).sum(axis=1)
-    assert np.corrcoef(picture[lit], focus)[0, 1] > 0.99
+    assert np.corrcoef(picture[lit], focus)[0, 1] > 0.98  # each hexagon has one value
 
 
 def test_the_command_takes_a_hexagonal_sensor(aolink, tmp_path):
