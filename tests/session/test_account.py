@@ -361,7 +361,7 @@ def test_the_account_agrees_with_the_device_whatever_it_is_told(
 
 
 def test_a_piece_of_a_recording_has_the_same_exposures(tmp_path: Path) -> None:
-    """Also where reports were asked for again across its edges. (The first word to start is lost here: it begins later.)"""
+    """Also where reports were asked for again across its edges; the first word to start is lost, so it begins later."""
     rig = rig_with(bit_error_rate=2e-4)
     run = run_session(SimulatedTimeHub(rig, 5), rig, tmp_path / "a.mcap", 30)
     assert run.error is None
