@@ -218,8 +218,8 @@ class SessionLoop:
             if self._camera.start(first_step, exposures):
                 return first_step
         raise DeviceError(
-            f"the camera was told {_START_TRIES} times to start {_START_DELAY_S:g} s later and heard of it too late"
-            " each time: is the line or this machine so slow, do both devices count the same fast steps?"
+            f"the camera was told {_START_TRIES} times to start {_START_DELAY_S:g} s later, and each time it heard that"
+            " too late: is the line or this machine so slow, do both devices count the same fast steps?"
         )
 
     def _device_step(self) -> int:

@@ -361,8 +361,8 @@ def test_the_account_agrees_with_the_device_whatever_it_is_told(
 
 
 def test_a_piece_of_a_recording_has_the_same_exposures(tmp_path: Path) -> None:
-    """Also where reports were asked for again across its edges; the first word to start is lost, so it begins later."""
-    rig = rig_with(bit_error_rate=2e-4)
+    """Also where reports were asked for again across its edges."""
+    rig = rig_with(bit_error_rate=2e-4)  # the first word to start is lost here: the session begins later
     run = run_session(SimulatedTimeHub(rig, 5), rig, tmp_path / "a.mcap", 30)
     assert run.error is None
     whole = {exposure.frame_id: exposure for exposure in Recording(run.path).exposures()}
