@@ -26,7 +26,7 @@ _TINY = float(np.finfo(np.float64).tiny)
 _BRIGHT = 7
 # Background: medians of blocks of so many pixels.
 _BLOCK = 32
-# The number of parts along each side of a frame in which noise is measured, and the fewest dark pixels that a part needs.
+# Noise is measured in this many parts along each side of a frame; a part needs at least this many dark pixels.
 _PARTS, _FEWEST_DARK = 4, 300
 # Standard deviations of the Gaussians that frames are smoothed by, pixels, the usual spots' first.
 _SCALES = (1.5, 3.0, 6.0, 0.75)
