@@ -30,9 +30,8 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Kind = Literal["square", "hexagonal"]
 
-_FEWEST_SPOTS = 7
-# Of which so many must hang together for the others to be found from there.
-_SEED = 4
+# The fewest spots that show a lattice, and the fewest that must be neighbours for the search to start from them.
+_FEWEST_SPOTS, _SEED = 7, 4
 # How far from its node a spot may be to belong to it, in pitches.
 _NEAR = 0.25
 # Steps from a node to half of its neighbours, as (columns, rows); the other half are their opposites. The first
@@ -42,7 +41,8 @@ _MOVES: dict[Kind, IntArray] = {
     "hexagonal": np.array([(1, 0), (0, 1), (-1, 1)]),
 }
 _ANGLE: dict[Kind, float] = {"square": math.pi / 2, "hexagonal": math.pi / 3}
-# Neighbours whose differences are looked at, of so many spots; steps taken from them, and guesses followed up.
+# The search takes differences to this many neighbours, from this many spots, tries this many of the commonest
+# differences as steps, and follows this many of the lattices that they suggest.
 _NEIGHBOURS, _ASKED, _STEPS, _GUESSES = 24, 400, 16, 6
 # How often a lattice is fitted anew to the spots that lie on it, each time further out.
 _ROUNDS = 12
@@ -50,16 +50,16 @@ _ROUNDS = 12
 _ALIKE = 0.15
 # A maximum less bright than this share of the spots' median is a ring or a ghost, no rival that must be explained.
 _RIVAL = 0.25
-# A lattice that explains so much of the maxima is taken at once; otherwise other scales may show a better one.
+# A lattice that explains this share of the maxima is taken at once; below it, other scales may show a better one.
 _CONVINCING = 0.8
-# From so many spots on, the lattice is followed where it bends, so many pitches from spots that are known.
+# A lattice of at least this many spots is followed where it bends, up to this many pitches from the known spots.
 _MANY_SPOTS, _REACH = 40, 2.5
 # How far the two steps may be from those of a regular lattice, and a frame's from its reference's, in pitches.
 _IRREGULAR, _FOREIGN = 0.2, 0.25
-# What is fainter than this share of the brightest spot beside it is that one's ring; and light that is apart from the
-# largest group of spots is a spot if its shape correlates so well with theirs.
+# A maximum fainter than this share of the brightest spot beside it is a ring of that spot. Light apart from the
+# largest group of spots is a spot if its shape has at least this correlation with theirs.
 _RING, _SHAPE = 0.02, 0.7
-# How many pitches from any spot that is known it is dark.
+# The frame is dark further than this from every known spot, pitches.
 _DARK = 1.5
 # Spots that are lower than this share of the light between them, over the darkest part of the frame, are out of focus.
 _VEILED, _DARKEST = 0.5, 0.05
@@ -220,7 +220,7 @@ def _guesses(places: FloatArray) -> list[tuple[Kind, FloatArray]]:
             moves = _MOVES[kind] @ pair
             support = int(np.min(tree.query_ball_point(moves, _ALIKE * np.linalg.norm(step), return_length=True)))
             found.append((support, float(np.linalg.norm(step)), kind, pair))
-            # The step's likes have had their say, and so have those that only the lattice's symmetry makes different.
+            # Differences like this step, or like what the lattice's symmetry makes of it, suggest nothing new.
             for quarter in range(round(2 * math.pi / angle)):
                 votes[tree.query_ball_point(step @ _turned(quarter * angle), radius)] = 0
     most = max((support for support, *_ in found), default=0)

@@ -17,16 +17,16 @@ FloatArray = NDArray[np.float64]
 
 # A spot is a maximum that stands out so many times above the noise of the smoothed frame.
 _SIGNIFICANCE = 8.0
-# And above this share of the brightest spots: where there is hardly any noise, what is fainter are spots' own rings.
+# It must also exceed this share of the brightest spots: without noise, anything fainter is a ring of a spot.
 _FAINTEST = 2e-3
 # A pixel so many times as bright as its neighbours is hot: a spot of sd 0.6 pixels or more makes none such.
 _HOT = 4.0
 _TINY = float(np.finfo(np.float64).tiny)
-# How many bright maxima tell how bright spots are: one alone may be a cosmic ray.
+# The height of the brightest spots is that of the maximum with this rank: a few may be cosmic rays.
 _BRIGHT = 7
 # Background: medians of blocks of so many pixels.
 _BLOCK = 32
-# Noise is measured in so many parts along each side of a frame, from so many dark pixels at least.
+# Noise is measured in this many parts along each side of a frame; a part needs at least this many dark pixels.
 _PARTS, _FEWEST_DARK = 4, 300
 # Standard deviations of the Gaussians that frames are smoothed by, pixels, the usual spots' first.
 _SCALES = (1.5, 3.0, 6.0, 0.75)
