@@ -26,7 +26,7 @@ __all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate", "sm
 
 
 def read(path: str | Path) -> Recording:
-    """Open a recording.
+    """Open a recording: what it gives when iterated over are its exposures, read one after the other.
 
     Raises
     ------
