@@ -41,7 +41,7 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
 
 
 def read(path: str | Path) -> Recording:
-    """Open a recording.
+    """Open a recording: what it gives when iterated over are its exposures, read one after the other.
 
     Raises
     ------

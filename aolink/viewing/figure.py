@@ -92,7 +92,7 @@ def draw_session(recording: Recording, path: str | Path) -> Path:
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         places = figure.add_gridspec(4, 2 * _CLOSE_UPS, height_ratios=[1.25, 1.25, 0.8, 1.15])
         figure.suptitle(f"{recording.rig.name}: {recording.path.name}", x=0.01, ha="left", fontsize=13)
-        _draw_intensity(figure.add_subplot(places[0, :]), session, lines[:1] + lines[-1:])
+        _draw_intensity(figure.add_subplot(places[0, :]), session, list(dict.fromkeys((lines[0], lines[-1]))))
         for k, exposure in enumerate(_close_ups(session, focus)):
             inside, profile = (figure.add_subplot(places[row, 2 * k : 2 * k + 2]) for row in (1, 2))
             _draw_inside(inside, session, lines, exposure)
