@@ -229,7 +229,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
         )
     partly_lit = isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None
-    if name in _OF_PIXELS and partly_lit and not joint:
+    if name in _OF_PIXELS and partly_lit and not (name == "profile" and joint):
         raise EstimatorError(
             f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets: use moments or o3"
         )
