@@ -374,10 +374,13 @@ def test_a_camera_that_dies_ends_an_unlimited_session(tmp_path: Path, monkeypatc
 
 
 def test_a_device_held_up_for_two_seconds_does_not_end_the_session(start_aolink: Start, tmp_path: Path) -> None:
-    rig = start_aolink("rig", "section-vi", "--json", "--real-time", "--listen", "127.0.0.1:0")
+    """As long as twice its watchdog is longer than that."""
+    text = load_rig("section-vi").toml.replace("block_steps = 50", "block_steps = 50\nwatchdog_s = 3")
+    (tmp_path / "rig.toml").write_text(text)
+    rig = start_aolink("rig", "rig.toml", "--json", "--real-time", "--listen", "127.0.0.1:0")
     assert rig.stdout is not None
     ports = json.loads(rig.stdout.readline())
-    process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--exposures", "16"))
+    process = start_aolink(*record_arguments(ports["camera"], ports["mirror"], "--exposures", "16", rig="rig.toml"))
     wait_for_size(tmp_path / "a.mcap", 50_000, process)
     rig.send_signal(signal.SIGSTOP)
     time.sleep(2.0)  # the fault itself, not a wait for something
