@@ -308,7 +308,7 @@ def test_a_report_that_cannot_be_changes_nothing() -> None:
 
 
 def test_reports_that_no_frame_uses_are_not_kept_forever() -> None:
-    history = _InputHistory(1, np.zeros(1))
+    history = _InputHistory(RIG.mirror)
     for k in range(5000):
         history.add_applied(pb.Applied(block_id=k + 1, first_step=50 * k, n_steps=50, u=[0.01] * 50))
     assert history.take(0, 100)[1] == 100  # 200 000 steps ago

@@ -179,8 +179,8 @@ class Recording:
         except DecodeError:
             message = None
         # A report that has not the inputs of its steps would stand for all of these steps.
-        if isinstance(message, Applied) and len(message.u) != message.n_steps * self.rig.n_inputs:
-            message = None
+        if isinstance(message, Applied) and message.source not in (Applied.AWAITED, Applied.NOT_REPORTED):
+            message = message if len(message.u) == message.n_steps * self.rig.n_inputs else None
         if message is None:
             self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
         return message

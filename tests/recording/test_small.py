@@ -104,7 +104,9 @@ def test_without_truth_there_is_a_nis_all_the_same(tmp_path: Path) -> None:
 def test_no_exposure_is_one_clear_error_and_leaves_nothing(command: str, tmp_path: Path) -> None:
     path = write_small(tmp_path / "none.mcap", 0)
     target = {"estimate": ["-o"], "deblur": ["-o"], "view": ["--save"]}.get(command, [])
-    _, error = ran(command, path, *target, *([tmp_path / "out"] if target else []))
+    _, error = ran(
+        command, path, *target, *([tmp_path / ("out.rrd" if command == "view" else "out.mcap")] if target else [])
+    )
     assert isinstance(error, RecordingError | ViewerError)
     assert " no exposure" in str(error)
     assert list(tmp_path.iterdir()) == [path]

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from aolink.devices.gate import Gate
 from aolink.devices.native import NativeCamera, NativeMirror, identify
 from aolink.estimation import Driver
 from aolink.exposure import Exposure
@@ -183,8 +184,11 @@ def run_session(
     """A session from Identify to the end of its account, as `aolink.session.record` makes it; errors are kept."""
     live: list[Exposure] = []
     camera_link, mirror_link = hub.links
-    camera = NativeCamera(hub, camera_link, identify(hub, camera_link, 1))
-    mirror = NativeMirror(hub, mirror_link, identify(hub, mirror_link, 2))
+    asked_ns = hub.now_ns()
+    camera_identity, mirror_identity = identify(hub, camera_link, 1), identify(hub, mirror_link, 2)
+    gate = Gate(rig, hub, (camera_identity, mirror_identity), asked_ns)
+    camera = NativeCamera(hub, camera_link, camera_identity, gate)
+    mirror = NativeMirror(hub, mirror_link, mirror_identity, gate)
     for link in hub.links:
         link.reset_counts()
     with RecordingWriter(path, rig, {}, hub.now_ns(), deterministic=True) as writer:

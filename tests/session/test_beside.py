@@ -261,7 +261,7 @@ def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_
         until(lambda: path.exists() and path.stat().st_size > 20_000)
         os.killpg(process.pid, signal.SIGINT)
         output, errors = process.communicate(timeout=60)
-    assert (process.returncode, errors) == (130, b"")
+    assert (process.returncode, errors) == (130, b"aolink: interrupted by SIGINT\n")
     recording = Recording(path)
     assert recording.complete
     exposures = {each.frame_id for each in recording.exposures()}

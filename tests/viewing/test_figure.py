@@ -78,7 +78,7 @@ def test_a_recording_without_exposures_is_one_clear_error(tmp_path: Path) -> Non
 
 
 def test_where_it_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(ViewerError, match=r"cannot write .*a\.png: no such file"):
+    with pytest.raises(ViewerError, match=r"cannot write .*a\.png: there is no folder"):
         draw_session(StandIn(), tmp_path / "absent" / "a.png")  # type: ignore[arg-type]
 
 
