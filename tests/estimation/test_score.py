@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aolink.estimation import Scorer, make_estimator, run, score
+from aolink.estimation import Scorer, Status, make_estimator, run, score
 from aolink.estimation.score import _Sum
 from aolink.simulation.model import simulate
 
@@ -50,6 +50,14 @@ def test_nothing_measured_is_no_nis(scored):
     result = score(exposures, estimates["open-loop"])
     assert np.isnan(result.nis.mean)
     assert not result.nis.inside
+
+
+def test_gated_exposures_are_counted_with_truth_and_without(scored):
+    exposures, estimates = scored
+    statuses = [Status.GATED, Status.DIVERGED, Status.REINITIALISED, Status.INPUT_INVALID, *[Status.OK] * 8]
+    changed = [dataclasses.replace(e, status=s) for e, s in zip(estimates["o3"], statuses, strict=True)]
+    assert score(exposures, changed).gated == 2
+    assert score([dataclasses.replace(e, truth=None) for e in exposures], changed).gated == 2
 
 
 def test_exposures_without_truth_do_not_count(scored):

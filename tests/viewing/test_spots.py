@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation import run
-from aolink.estimation.estimate import Estimate
+from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure
 from aolink.recording.deblur import deblur
 from aolink.rig import Rig, load_rig
@@ -113,3 +113,15 @@ def test_windows_in_the_dark_have_no_paths(tmp_path: Path) -> None:
     lit = np.argwhere(rig.optics.lenslets.light.reshape(8, 8) >= 0.4)
     where = np.array([np.mean(path, axis=0) for path in strips]) // 16
     np.testing.assert_array_equal(where[:, ::-1], lit)
+
+
+def test_the_session_page_says_how_many_exposures_were_gated(tmp_path: Path) -> None:
+    recording = Simulated(load_rig("sh-4x4"))
+    o1 = recording.estimates("o1")
+    o1[1:3] = [replace(o1[1], status=Status.GATED), replace(o1[2], status=Status.DIVERGED)]
+    entities = read_rrd(save_rrd(recording, tmp_path / "gated.rrd"))  # type: ignore[arg-type] # as above
+    rows = [row.split("|") for row in entities["/session"]["TextDocument:text"][0][0].splitlines() if "|" in row]
+    gated = {row[1].strip(): row[-2].strip() for row in rows}
+    assert gated["estimator"] == "gated"
+    assert gated["o1"] == "2 of 4"
+    assert gated["open-loop"] == "0 of 4"
