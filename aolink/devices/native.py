@@ -150,6 +150,7 @@ class _Flight:
     """When the mirror last said something of the block; before that, when it was sent first."""
     last_ns: int = 0
     """The last try."""
+    timeouts: int = 0
     tries: dict[int, int] = field(default_factory=dict)
     """When each try was sent, by the sequence number of its packet."""
 
@@ -243,12 +244,16 @@ class NativeMirror(_NativeDevice):
             if flight.due_ns(timeout_ns) > now_ns:
                 continue
             silent_s = (now_ns - flight.heard_ns) / 1e9
-            if silent_s > _PATIENCE_WATCHDOGS * self._watchdog_s and len(flight.tries) >= _LEAST_TRIES:
+            if silent_s > _PATIENCE_WATCHDOGS * self._watchdog_s and flight.timeouts >= _LEAST_TRIES:
                 raise DeviceError(
                     f"the mirror has not acknowledged a command for {silent_s:.1f} s, more than twice its watchdog,"
                     f" though it was sent {len(flight.tries)} times: is it still connected?"
                     " (a mirror that hears nothing parks itself)"
                 )
+            flight.timeouts += 1
+            if self.link.transport.unsent():  # on a slow line the try before has not even left
+                flight.last_ns = now_ns
+                continue
             self.retransmits += 1
             self._send(flight, now_ns)
         queries, given_up = self._reports.ask(now_ns, timeout_ns)

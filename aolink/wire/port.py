@@ -1,4 +1,4 @@
-"""Ports: whatever pyserial opens, behind four methods. The one place that knows pyserial."""
+"""Ports: whatever pyserial opens, behind five methods. The one place that knows pyserial."""
 
 from __future__ import annotations
 
@@ -35,6 +35,9 @@ class Transport(Protocol):
 
     def write(self, data: bytes) -> None:
         """Hand over all of ``data``. Raises PortError when the port is lost or takes nothing for 5 s."""
+
+    def unsent(self) -> int:
+        """Bytes of what was written that wait for the line; 0 where the port cannot tell."""
 
     def fileno(self) -> int:
         """For `wait_readable`."""
@@ -93,6 +96,14 @@ class SerialPort:
                 select.select([], [descriptor], [], _SLICE_S)
         except (OSError, TypeError, serial.SerialException) as error:
             raise PortError(f"lost {self.url}: {_plain(error)}; is the device still there?") from None
+
+    def unsent(self) -> int:
+        if not self._is_device:
+            return 0
+        try:
+            return int(self._serial.out_waiting)
+        except (OSError, TypeError):  # a driver that does not know; a port that is lost says so when it is read
+            return 0
 
     def fileno(self) -> int:
         return self._serial.fileno()

@@ -39,14 +39,26 @@ class Way:
     def __init__(self, hub: SimulatedTimeHub) -> None:
         self._hub = hub
         self.latency_ns = 500_000
+        self.bytes_per_s = math.inf
         self.cut = False
         """Nothing gets through."""
         self._bytes: deque[tuple[int, bytes]] = deque()
+        self._free_ns = 0
+        """When the line is free again."""
 
     def write(self, data: bytes) -> int:
+        self._free_ns = max(self._free_ns, self._hub.clock_ns) + round(1e9 * len(data) / self.bytes_per_s)
         if not self.cut:
-            self._bytes.append((self._hub.clock_ns + self.latency_ns, data))
+            self._bytes.append((self._free_ns + self.latency_ns, data))
         return len(data)
+
+    def backlog_ns(self) -> int:
+        """How long the line still takes for what was written."""
+        return max(0, self._free_ns - self._hub.clock_ns)
+
+    def unsent(self) -> int:
+        """Bytes that have not left."""
+        return math.ceil(self.backlog_ns() * self.bytes_per_s / 1e9) if self.backlog_ns() else 0
 
     def read(self) -> bytes:
         data = b""
@@ -66,6 +78,7 @@ class End:
         self.name = name
         self.read = self.read_some = incoming.read
         self._outgoing = outgoing
+        self.unsent = outgoing.unsent
 
     def write(self, data: bytes) -> int:
         return self._outgoing.write(data)

@@ -172,6 +172,22 @@ def test_a_slow_line_is_not_flooded(tmp_path: Path) -> None:
     assert run.mirror.round_trip_s == pytest.approx(0.06, rel=0.02)
 
 
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_a_line_of_921600_baud_carries_what_is_sent_again(loss: float, tmp_path: Path) -> None:
+    """A block takes it 5 ms. While the mirror hears nothing for a while, no more piles up than the line can carry."""
+    rig = rig_with(command_loss_rate=loss)
+    hub, piled_up = SimulatedTimeHub(rig), list[int]()
+    for way in (hub.to_device["mirror"], hub.to_host["mirror"]):
+        way.bytes_per_s = 92_160
+    way = hub.to_device["mirror"]
+    hub.at = [(1_300_000_000, hub.cut), (2_000_000_000, lambda: hub.cut(to_device=False, to_host=False))]
+    run = run_session(hub, rig, tmp_path / "a.mcap", 20, progress=lambda _: piled_up.append(way.backlog_ns()))
+    assert (run.error, run.report.ended) == (None, "complete")
+    check_account(run)
+    assert max(piled_up) < 25_000_000
+    assert run.report.steps_parked == run.report.steps_late < 750
+
+
 def test_a_dead_mirror_line_ends_the_session_within_twice_the_watchdog(tmp_path: Path) -> None:
     """The mirror parks itself, and stays parked until the next session tells it to go on."""
     hub, path = SimulatedTimeHub(RIG), tmp_path / "a.mcap"
