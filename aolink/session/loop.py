@@ -301,6 +301,8 @@ class SessionLoop:
             if self.report.exposures >= exposures or self._device_step() > late_step:
                 return True
         patience_ns = 3 * timing.frame_period_steps * self._step_ns + (_GRACE_S + _START_DELAY_S) * 1e9
+        # A camera and a mirror of one device are held up together, and the mirror is waited for that long.
+        patience_ns = max(patience_ns, _OUTAGE_WATCHDOGS * self._rig.mirror.watchdog_s * 1e9)
         if now - self._last_frame_ns > patience_ns:
             raise DeviceError(
                 f"the camera has sent no frame for {(now - self._last_frame_ns) / 1e9:.1f} s: is it still connected?"
