@@ -23,10 +23,10 @@ from typing import NoReturn
 TIMEOUT_S = 300
 _MODULES = (
     "aolink.cli",
-    "aolink.batch",
-    "aolink.calibrating",
-    "aolink.demo",
-    "aolink.rig_check",
+    "aolink.jobs.batch",
+    "aolink.jobs.calibrate",
+    "aolink.jobs.demo",
+    "aolink.jobs.check_rig",
     "aolink.session",
     "aolink.session.replay",
     "aolink.recording.compare",
@@ -34,11 +34,11 @@ _MODULES = (
     "aolink.recording.editing",
     "aolink.recording.reestimate",
     "aolink.simulation.server",
-    "aolink.slopes",
-    "aolink.tables",
-    "aolink.estimation.hypothesis_filter",
-    "aolink.estimation.pixel_updates",
-    "aolink.estimation.sampled",
+    "aolink.optics.slopes",
+    "aolink.cli.tables",
+    "aolink.estimation.pixels.filter",
+    "aolink.estimation.pixels.updates",
+    "aolink.estimation.pixels.sampled",
 )
 """What most commands load; nothing that starts threads."""
 

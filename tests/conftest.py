@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from aolink.demo import simulated_rig
+from aolink.jobs.demo import simulated_rig
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 from tests.commands import TIMEOUT_S, CommandServer

@@ -24,7 +24,7 @@ import typer
 from PIL import Image
 
 from aolink.cli.common import app
-from aolink.demo import simulated_rig
+from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record

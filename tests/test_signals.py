@@ -19,7 +19,7 @@ from typing import Self
 import pytest
 
 from aolink.cli import app
-from aolink.demo import simulated_rig
+from aolink.jobs.demo import simulated_rig
 from aolink.recording.editing import cut
 from aolink.recording.reader import Recording
 from tests.conftest import Session

@@ -13,8 +13,8 @@ from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
 from aolink.optics.frame import spot_windows
+from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
-from aolink.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
 

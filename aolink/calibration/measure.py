@@ -19,7 +19,8 @@ from scipy import stats
 
 from aolink.calibration.spot import Spot, check_at_rest, fit_spots
 from aolink.errors import CalibrationError
-from aolink.rig import Rig, Sensor
+from aolink.optics.sensor import Sensor
+from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -13,7 +13,7 @@ from scipy import optimize, stats
 
 from aolink.errors import CalibrationError
 from aolink.optics.kernel import pixel_mass, pixel_mass_slope
-from aolink.rig import Kernel, Sensor
+from aolink.optics.sensor import Kernel, Sensor
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -40,8 +40,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts
 
 def load_checked(path_or_name: str) -> Rig:
     """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
+    from aolink.jobs.check_rig import check_rig
     from aolink.rig import load_rig
-    from aolink.rig_check import check_rig
 
     loaded = load_rig(path_or_name)
     for finding in check_rig(loaded):

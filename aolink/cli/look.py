@@ -76,8 +76,8 @@ def slopes(
     The grid is square or hexagonal, turned by any angle; kind, pitch and turn are found, whatever spots are missing.
     Without --pitch-m and --focal-m slopes are in pixels.
     """
-    from aolink import slopes as job
-    from aolink import tables
+    from aolink.cli import tables
+    from aolink.optics import slopes as job
 
     if (pitch_m is None) != (focal_m is None):
         raise typer.BadParameter("give --pitch-m and --focal-m, or neither")

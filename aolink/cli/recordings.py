@@ -24,17 +24,17 @@ from aolink.cli.common import (
     stderr,
     stdout,
 )
+from aolink.cli.terminal import progress_bar
 from aolink.errors import AolinkError, EstimatorError, RecordingError
 from aolink.files import writing
 from aolink.signals import StopRequest
-from aolink.terminal import progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from aolink.batch import Model
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
+    from aolink.jobs.batch import Model
     from aolink.recording.editing import Edited
 
 
@@ -52,7 +52,7 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Say what a recording holds. Exit code 1 if a part of it cannot be read."""
-    from aolink import tables
+    from aolink.cli import tables
 
     recording = open_recording(file, check=check)
     facts = tables.recording_facts(recording)
@@ -105,7 +105,8 @@ def estimate(
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
     if only and output is None:
         raise typer.BadParameter("--only is about the copy that -o writes: give -o too")
-    from aolink import batch, tables
+    from aolink.cli import tables
+    from aolink.jobs import batch
     from aolink.rig import load_rig
 
     models = batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
@@ -151,7 +152,7 @@ def estimate(
 
 
 def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    from aolink.plotting import batch_picture
+    from aolink.cli.plotting import batch_picture
 
     try:
         batch_picture(rows, path)
@@ -165,7 +166,7 @@ def _estimate_one(
     file: Path, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
     only: bool, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    from aolink import tables
+    from aolink.cli import tables
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
         check_has_exposures,
@@ -242,7 +243,7 @@ def compare(
     """Say field by field what differs between two recordings. Exit code 1 if something does."""
     from tempfile import TemporaryDirectory
 
-    from aolink import tables
+    from aolink.cli import tables
     from aolink.recording.compare import compare as compare_recordings
     from aolink.recording.reestimate import write_reestimated
 

@@ -11,9 +11,9 @@ from typing import Annotated
 import typer
 
 from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, stderr, stdout
+from aolink.cli.terminal import progress_bar
 from aolink.errors import RestorationError
 from aolink.files import check_target
-from aolink.terminal import progress_bar
 
 
 @app.command(
@@ -69,7 +69,7 @@ def deblur(
 def _deblur_recording(
     file: Path, out: Path, estimator: str, method: str, *, overwrite: bool, as_json: bool
 ) -> None:  # fmt: skip
-    from aolink import tables
+    from aolink.cli import tables
     from aolink.recording.deblur import write_deblurred
     from aolink.restoration import checked_method
 
@@ -93,7 +93,7 @@ def _deblur_picture(
 ) -> None:
     import numpy as np
 
-    from aolink.pictures import finite_pixels, read_picture, read_psf, write_picture
+    from aolink.optics.pictures import finite_pixels, read_picture, read_psf, write_picture
     from aolink.restoration import checked_method, restore
 
     check_target(out, overwrite=overwrite, sources=[image, psf], error=RestorationError)

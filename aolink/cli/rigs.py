@@ -30,10 +30,10 @@ from aolink.cli.common import (
     stderr,
     stdout,
 )
+from aolink.cli.terminal import ask, input_ended, progress_bar
 from aolink.errors import AolinkError, EstimatorError, RigError
 from aolink.files import check_target, writing
 from aolink.signals import Interrupted, StopRequest, stop_after
-from aolink.terminal import ask, input_ended, progress_bar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -118,7 +118,7 @@ def rig(
 
 
 def _print_scan(loaded: Rig, as_json: bool) -> None:
-    from aolink import tables
+    from aolink.cli import tables
     from aolink.estimation.exposure_scan import best, exposure_scan
 
     errors = exposure_scan(loaded)
@@ -131,7 +131,7 @@ def _print_scan(loaded: Rig, as_json: bool) -> None:
 
 
 def _print_findings(loaded: Rig, as_json: bool) -> None:
-    from aolink.rig_check import check_rig
+    from aolink.jobs.check_rig import check_rig
 
     findings = check_rig(loaded)
     if as_json:
@@ -258,7 +258,7 @@ def record(
 
 
 def _print_session(report: Report, output: Path, as_json: bool) -> None:
-    from aolink import tables
+    from aolink.cli import tables
 
     for warning in report.warnings:
         stderr.print(f"aolink: warning: {escape(warning)}")
@@ -324,7 +324,8 @@ def replay(
         raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
     from contextlib import nullcontext
 
-    from aolink import tables, viewing
+    from aolink import viewing
+    from aolink.cli import tables
     from aolink.estimation import Scorer
     from aolink.session.replay import replay as replay_recording
 
@@ -361,7 +362,8 @@ def _replay_to_rig(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    from aolink import session, tables
+    from aolink import session
+    from aolink.cli import tables
     from aolink.recording.compare import compare
     from aolink.recording.reader import Recording
     from aolink.session.replay import RecordedCommands
@@ -408,7 +410,8 @@ def calibrate(
     from shutil import rmtree
     from tempfile import mkdtemp
 
-    from aolink import calibrating, tables
+    from aolink.cli import tables
+    from aolink.jobs import calibrate
     from aolink.rig import load_rig
 
     loaded = load_rig(rig)
@@ -418,11 +421,11 @@ def calibrate(
     folder = keep or Path(mkdtemp(prefix="aolink-"))
     try:
         if camera and mirror:
-            files = calibrating.record_frames(
+            files = calibrate.record_frames(
                 loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
             )  # fmt: skip
-        result = calibrating.calibrate_recordings(loaded, calibrating.rig_text(rig, loaded), files or [])
+        result = calibrate.calibrate_recordings(loaded, calibrate.rig_text(rig, loaded), files or [])
     except AolinkError as error:
         # Somebody has covered and lit the camera for them.
         if not keep and (made := sorted(map(str, folder.glob("*.mcap")))):
@@ -452,8 +455,8 @@ def demo(
     real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock and measure latencies.")] = False,
 ) -> None:
     """Do the main job with a simulated rig: record, estimate, estimate again, compare, draw."""
-    from aolink import tables
-    from aolink.demo import new_folder, possible_estimators, run_demo
+    from aolink.cli import tables
+    from aolink.jobs.demo import new_folder, possible_estimators, run_demo
     from aolink.recording.reader import Recording
 
     loaded = load_checked(rig)

@@ -2,17 +2,17 @@
 
 from aolink.estimation.driver import Driver, run
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.estimators import ESTIMATOR_NAMES, Estimator, make_estimator
-from aolink.estimation.exposure_model import ExposureModel, exposure_model, path_from_coefficients
-from aolink.estimation.filter import BlurFilter
-from aolink.estimation.moments import Measurement, measure_moments
-from aolink.estimation.moments2d import measure_moments_2d
-from aolink.estimation.observation import PathMoments
+from aolink.estimation.frames.moments import Measurement, measure_moments
+from aolink.estimation.frames.plane_moments import measure_moments_2d
+from aolink.estimation.kalman.filter import BlurFilter
+from aolink.estimation.kalman.observation import PathMoments
+from aolink.estimation.model.exposure_model import ExposureModel, exposure_model, path_from_coefficients
+from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
+from aolink.estimation.moments.windowed import Profile, WindowedMoments
 from aolink.estimation.options import Engine, Options
+from aolink.estimation.registry import ESTIMATOR_NAMES, Estimator, make_estimator
 from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.smoother import smooth
-from aolink.estimation.windowed import Profile, WindowedMoments
-from aolink.estimation.windowed_spots import SpotWindows, WindowedSpots
 
 __all__ = [
     "ESTIMATOR_NAMES",

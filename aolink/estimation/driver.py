@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.block import Block, blocks
+from aolink.estimation.batch import Block, blocks
 from aolink.estimation.estimate import Estimate
-from aolink.estimation.estimators import Estimator, make_estimator
 from aolink.estimation.options import Engine
+from aolink.estimation.registry import Estimator, make_estimator
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.exposure_model import ExposureModel, path_from_coefficients
+from aolink.estimation.model.exposure_model import ExposureModel, path_from_coefficients
 from aolink.estimation.motion import coefficient_roots, motion
 from aolink.plain import plain_data
 

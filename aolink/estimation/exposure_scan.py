@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.errors import EstimatorError
-from aolink.estimation.centroids import centroid_covariance
-from aolink.estimation.exposure_model import exposure_model
-from aolink.estimation.filter import added_noise
-from aolink.estimation.observation import steady_gain
-from aolink.plant import MANY_STATES, lift, psd_root
+from aolink.estimation.frames.centroid_noise import centroid_covariance
+from aolink.estimation.kalman.filter import added_noise
+from aolink.estimation.kalman.observation import steady_gain
+from aolink.estimation.model.exposure_model import exposure_model
+from aolink.numerics.covariance import psd_root
+from aolink.plant.alike import MANY_STATES
+from aolink.plant.lifting import lift
 from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]

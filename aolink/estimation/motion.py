@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.plant import psd_root
+from aolink.numerics.covariance import psd_root
 
 if TYPE_CHECKING:
     from aolink.estimation.estimate import Estimate

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from aolink.estimation.filter import Noise
-from aolink.estimation.moments import Flux
-from aolink.estimation.windowed import Basis
+from aolink.estimation.frames.moments import Flux
+from aolink.estimation.kalman.filter import Noise
+from aolink.estimation.moments.windowed import Basis
 
 Engine = Literal["aolink", "filterpy"]
 

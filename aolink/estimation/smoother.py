@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
-from aolink.estimation import stacked
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.exposure_model import by_axis
+from aolink.estimation.model.exposure_model import by_axis
 from aolink.exposure import Exposure
-from aolink.plant import input_response, lift
+from aolink.numerics import batched
+from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
 
 FloatArray = NDArray[np.float64]
@@ -71,20 +71,20 @@ def _corrected(
     end, P_end = estimate.end_state, estimate.end_covariance
     E = model.transition if z.shape[1] == plant.n_states else model.end_rows
     transition, noise, kick = _gap(plant, exposure, next_exposure)
-    predicted = stacked.matvec(transition, end) + kick
-    spread = stacked.symmetric(stacked.congruence(transition, P_end) + noise)
+    predicted = batched.matvec(transition, end) + kick
+    spread = batched.symmetric(batched.congruence(transition, P_end) + noise)
     innovation, change = later.start_state - predicted, later.start_covariance - spread
     # A state that is known for certain has no inverse, and needs none.
     inverse: FloatArray = np.linalg.pinv(spread, hermitian=True).astype(np.float64)
 
     def corrected(mean: FloatArray, covariance: FloatArray, with_next: FloatArray) -> tuple[FloatArray, FloatArray]:
-        gain = stacked.matmul(with_next, inverse)
-        after = stacked.symmetric(covariance + stacked.congruence(gain, change))
-        return mean + stacked.matvec(gain, innovation), _without_negative(after)
+        gain = batched.matmul(with_next, inverse)
+        after = batched.symmetric(covariance + batched.congruence(gain, change))
+        return mean + batched.matvec(gain, innovation), _without_negative(after)
 
-    to_next = stacked.transpose(transition @ E)
-    z, P = corrected(z, P, stacked.matmul(P, np.broadcast_to(to_next, (len(P), *to_next.shape))))
-    end, P_end = corrected(end, P_end, stacked.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)))
+    to_next = batched.transpose(transition @ E)
+    z, P = corrected(z, P, batched.matmul(P, np.broadcast_to(to_next, (len(P), *to_next.shape))))
+    end, P_end = corrected(end, P_end, batched.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)))
     n = plant.n_states
     return replace(
         estimate, start_state=z[:, :n], start_covariance=P[:, :n, :n], end_state=end, end_covariance=P_end,
@@ -107,4 +107,4 @@ def _gap(plant: Plant, before: Exposure, after: Exposure) -> tuple[FloatArray, F
 def _without_negative(covariance: FloatArray) -> FloatArray:
     """The same without the negative variances that rounding makes where much was known before."""
     values, vectors = np.linalg.eigh(covariance)
-    return stacked.symmetric(stacked.matmul(vectors * np.maximum(values, 0.0)[:, None], stacked.transpose(vectors)))
+    return batched.symmetric(batched.matmul(vectors * np.maximum(values, 0.0)[:, None], batched.transpose(vectors)))

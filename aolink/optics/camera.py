@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.sensor import BaseSensor
+from aolink.optics.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 

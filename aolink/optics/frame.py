@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.optics.plane import exposure_density_2d
-from aolink.sensor import BaseSensor, Kernel, Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, Kernel, Sensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
 Scalar = TypeVar("Scalar", bound=np.generic)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.sensor import Kernel
+from aolink.optics.sensor import Kernel
 
 FloatArray = NDArray[np.float64]
 

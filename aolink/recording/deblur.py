@@ -22,16 +22,16 @@ from aolink.estimation import Estimate, Scorer
 from aolink.estimation.motion import coefficient_roots, motion
 from aolink.exposure import Exposure, step_shares
 from aolink.files import writing
+from aolink.numerics.workers import processes
 from aolink.optics.camera import is_saturated, to_density
+from aolink.optics.scene import SceneSensor, scene_motion
+from aolink.optics.sensor import Kernel, SpotSensor
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.reader import RawMessage, Recording, RestoredPictures
 from aolink.recording.reestimate import check_has_exposures, recorded_estimates, reestimated
 from aolink.restoration import Method, Psf, Restored, motion_psf_by_root, restore
 from aolink.rig import Rig
-from aolink.scene import SceneSensor, scene_motion
-from aolink.sensor import Kernel, SpotSensor
-from aolink.workers import processes
 
 FloatArray = NDArray[np.float64]
 

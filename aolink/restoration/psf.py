@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import erf
 
 from aolink.errors import RestorationError
-from aolink.plant import psd_root
-from aolink.sensor import Kernel
+from aolink.numerics.covariance import psd_root
+from aolink.optics.sensor import Kernel
 
 FloatArray = NDArray[np.float64]
 

@@ -19,11 +19,12 @@ from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig,
 from aolink.errors import AolinkError, DeviceError, PortError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
+from aolink.optics.scene import framed
 from aolink.recording import topics
 from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
-from aolink.scene import framed, read_scene_picture
+from aolink.rig.scene_table import read_scene_picture
 from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
 from aolink.session.report import EstimatorReport, Report

@@ -25,12 +25,12 @@ from aolink.errors import EstimatorError
 from aolink.estimation import Driver, Estimate, exposure_model
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
+from aolink.numerics.workers import THREAD_VARIABLES
 from aolink.recording import convert
 from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
 from aolink.session.estimator_process import LENGTH, READY, packed
 from aolink.session.waiting import Waiting, most_waiting
-from aolink.workers import THREAD_VARIABLES
 
 _SLICE_S = 0.1
 """Longest wait for processes that begin: a request to stop is seen that soon."""

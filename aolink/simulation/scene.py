@@ -7,9 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.optics.scene import framed, framed_columns, framed_rows, scene_motion
+from aolink.optics.sensor import Kernel
 from aolink.rig import Rig
-from aolink.scene import framed, framed_columns, framed_rows, read_scene_picture, scene_motion
-from aolink.sensor import Kernel
+from aolink.rig.scene_table import read_scene_picture
 
 FloatArray = NDArray[np.float64]
 

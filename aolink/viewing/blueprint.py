@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import rerun.blueprint as rrb
 
-from aolink.rig import Rig, SpotSensor
+from aolink.optics.sensor import SpotSensor
+from aolink.rig import Rig
 from aolink.viewing.camera import HISTORY, profile_bounds
 from aolink.viewing.motion import BAND, NIS_COVERAGE
 from aolink.viewing.scene import RESTORED_SCENE, RESTORED_SPOTS, SCENE, TRUE_SCENE

@@ -16,7 +16,7 @@ from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.files import writing
 from aolink.optics.kernel import exposure_density
-from aolink.sensor import Sensor
+from aolink.optics.sensor import Sensor
 from aolink.viewing.camera import density, density_top, first_profiles
 from aolink.viewing.motion import BAND
 from aolink.viewing.palette import by_rank, estimator_colour

@@ -14,7 +14,8 @@ from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
 from aolink.exposure import Exposure
-from aolink.rig import Rig, SpotSensor
+from aolink.optics.sensor import SpotSensor
+from aolink.rig import Rig
 from aolink.viewing import camera, devices, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.palette import by_rank

@@ -12,8 +12,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
+from aolink.optics.scene import SceneSensor
 from aolink.recording.reader import RestoredPictures
-from aolink.scene import SceneSensor
 from aolink.viewing.palette import MISSING
 from aolink.viewing.timebase import Timebase
 

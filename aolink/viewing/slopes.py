@@ -10,7 +10,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from aolink.slopes import FrameSlopes
+from aolink.optics.slopes import FrameSlopes
 from aolink.viewing.rrd_file import new_rrd
 
 _ARROW = 5.0

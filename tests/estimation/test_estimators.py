@@ -17,10 +17,10 @@ from aolink.estimation import (
     score,
 )
 from aolink.estimation.estimate import COMPARED
-from aolink.estimation.measuring import measure
-from aolink.estimation.observation import PathMoments
+from aolink.estimation.frames.measure import measure
+from aolink.estimation.kalman.observation import PathMoments
 from aolink.estimation.options import Options
-from aolink.plant import lift
+from aolink.plant.lifting import lift
 from aolink.recording.reestimate import first_difference
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate

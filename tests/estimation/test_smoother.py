@@ -10,9 +10,9 @@ from scipy import linalg
 import aolink
 from aolink.errors import EstimatorError
 from aolink.estimation import exposure_model, make_estimator, run, score, smooth
-from aolink.estimation.moments import known_flux_covariance, measure_moments, noise_integrals
+from aolink.estimation.frames.moments import known_flux_covariance, measure_moments, noise_integrals
 from aolink.optics.camera import effective_noise_density
-from aolink.plant import input_response, lift
+from aolink.plant.lifting import input_response, lift
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 

@@ -9,9 +9,9 @@ import hashlib
 import dataclasses
 import numpy as np
 from aolink.estimation import ESTIMATOR_NAMES, exposure_model, joint_profile, run
-from aolink.estimation.filter import BlurFilter
-from aolink.estimation.spots import measure_spots
-from aolink.estimation.windowed import Profile, WindowedMoments
+from aolink.estimation.kalman.filter import BlurFilter
+from aolink.estimation.frames.spots import measure_spots
+from aolink.estimation.moments.windowed import Profile, WindowedMoments
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 

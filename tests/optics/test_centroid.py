@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from aolink.optics.centroid import centre_of_gravity, correlation_centroid, weighted_centroid
 from aolink.optics.kernel import pixel_mass
-from aolink.sensor import Kernel
+from aolink.optics.sensor import Kernel
 
 PLACES = np.random.default_rng(1).uniform(5.5, 10.5, (40, 2))
 

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from aolink.optics.frame import frame_density, spots_density
 from aolink.optics.kernel import exposure_density, pixel_mass
-from aolink.rig import Kernel, load_rig
+from aolink.optics.sensor import Kernel
+from aolink.rig import load_rig
 
 EDGES = np.linspace(-1, 1, 17)
 WIDTH = 0.125

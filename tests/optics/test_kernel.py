@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.optics.kernel import exposure_density, kernel_moments, pixel_mass, pixel_mass_slope
-from aolink.rig import Kernel
+from aolink.optics.sensor import Kernel
 
 EDGES = np.linspace(-1, 1, 41)
 WIDTH = 0.05

@@ -5,7 +5,7 @@ import pytest
 
 from aolink.optics.kernel import pixel_mass
 from aolink.optics.plane import kernel_covariance, kernel_moments_2d, pixel_mass_2d
-from aolink.rig import Kernel
+from aolink.optics.sensor import Kernel
 
 SIGMA = np.array([[0.12, 0.03], [0.03, 0.08]])
 X, Y = np.linspace(-1, 1, 21), np.linspace(-0.8, 0.8, 17)

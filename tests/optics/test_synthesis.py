@@ -6,8 +6,8 @@ from scipy import integrate
 
 from aolink.errors import FrameError
 from aolink.optics.kernel import pixel_mass
+from aolink.optics.sensor import Kernel
 from aolink.optics.synthesis import Detector, Psi, spot_windows
-from aolink.sensor import Kernel
 
 RNG = np.random.default_rng(1)
 PATHS = 5.5 + RNG.uniform(-1.5, 1.5, (20, 2, 1)) + np.cumsum(RNG.normal(0, 0.05, (20, 2, 100)), axis=2)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.demo import simulated_rig
 from aolink.estimation import run
 from aolink.estimation.motion import coefficient_roots, motion
+from aolink.jobs.demo import simulated_rig
 from aolink.recording import convert
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from aolink.cli import app
 from aolink.errors import RestorationError
-from aolink.pictures import read_picture, read_psf, write_picture
+from aolink.optics.pictures import read_picture, read_psf, write_picture
 from aolink.restoration import restore
 from tests.restoration.scenes import UNIFORM, blocks, blurred
 

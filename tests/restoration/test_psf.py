@@ -14,9 +14,9 @@ from aolink.errors import RestorationError
 from aolink.exposure import step_shares
 from aolink.optics.kernel import pixel_mass
 from aolink.optics.plane import pixel_mass_2d
+from aolink.optics.sensor import Kernel
 from aolink.restoration import Psf, motion_psf, motion_psf_by_root
 from aolink.restoration.psf import along_line, as_psf
-from aolink.sensor import Kernel
 
 KERNEL = Kernel(shape="gaussian", sigma=0.05)
 SCALE = 0.04

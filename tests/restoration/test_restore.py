@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from aolink.errors import RestorationError
+from aolink.optics.sensor import Kernel
 from aolink.restoration import METHODS, Psf, first_order, from_correlation, measured_correlation, motion_psf, restore
-from aolink.sensor import Kernel
 from tests.restoration.scenes import DECAYING, UNIFORM, blocks, blurred, psnr
 
 FloatArray = NDArray[np.float64]

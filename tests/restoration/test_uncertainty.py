@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from aolink.optics.sensor import Kernel
 from aolink.restoration import Psf, first_order, motion_psf, restore
 from aolink.restoration.psf import line_matrix
 from aolink.restoration.uncertainty import line_variance, plane_variance
-from aolink.sensor import Kernel
 from tests.restoration.scenes import blocks, blurred, psnr
 
 KERNEL = Kernel(shape="gaussian", sigma=0.3)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aolink.cli.tables import recording_facts
 from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.recording import topics
@@ -19,7 +20,6 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session.account import Account
 from aolink.session.report import Report
 from aolink.simulation import devices
-from aolink.tables import recording_facts
 from aolink.wire import messages_pb2 as pb
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 

@@ -26,10 +26,10 @@ import pytest
 from typer.testing import CliRunner
 
 from aolink.cli import app
-from aolink.demo import simulated_rig
 from aolink.devices.interfaces import CommandAnswered
 from aolink.devices.native import NativeCamera
 from aolink.errors import DeviceError, PortError, RecordingError
+from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
@@ -394,7 +394,7 @@ def test_a_device_held_up_for_two_seconds_does_not_end_the_session(start_aolink:
 
 def test_a_killed_parent_takes_its_rig_along(tmp_path: Path) -> None:
     code = (
-        "import sys\nfrom aolink.demo import simulated_rig\n"
+        "import sys\nfrom aolink.jobs.demo import simulated_rig\n"
         "with simulated_rig('section-vi') as ports: print(*ports, flush=True); sys.stdin.read()"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stdin=subprocess.PIPE, text=True)

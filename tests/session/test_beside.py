@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.demo import simulated_rig
 from aolink.errors import EstimatorError
 from aolink.estimation import Driver, make_estimator
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
+from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from aolink.demo import simulated_rig
 from aolink.errors import DeviceError
+from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from aolink.demo import simulated_rig
 from aolink.estimation import Driver
+from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig

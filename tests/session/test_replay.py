@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.demo import simulated_rig
 from aolink.errors import RecordingError
+from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording

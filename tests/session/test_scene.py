@@ -16,11 +16,13 @@ from typer.testing import CliRunner
 
 import aolink
 from aolink.cli import app
-from aolink.demo import simulated_rig
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
 from aolink.estimation.motion import coefficient_roots, motion
 from aolink.exposure import Exposure
+from aolink.jobs.demo import simulated_rig
 from aolink.optics.camera import to_density
+from aolink.optics.scene import framed
+from aolink.optics.sensor import SpotSensor
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.deblur import (
@@ -36,8 +38,7 @@ from aolink.recording.reestimate import first_difference, reestimate, write_rees
 from aolink.recording.writer import RecordingWriter
 from aolink.restoration import motion_psf, motion_psf_by_root, restore
 from aolink.rig import load_rig
-from aolink.scene import framed, read_scene_picture
-from aolink.sensor import SpotSensor
+from aolink.rig.scene_table import read_scene_picture
 from aolink.session import Report, record
 from aolink.viewing import LiveView, save_rrd
 from tests.session.test_session import FAULTY

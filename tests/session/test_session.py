@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import aolink
-from aolink.demo import simulated_rig
 from aolink.estimation import Driver, run, score
+from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import aolink
-from aolink.demo import simulated_rig
 from aolink.estimation.estimate import Status
 from aolink.estimation.score import score
+from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig

@@ -8,7 +8,7 @@ import socket
 import subprocess
 from collections.abc import Callable
 
-from aolink.demo import simulated_rig
+from aolink.jobs.demo import simulated_rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import encode_message
 

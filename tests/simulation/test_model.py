@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from aolink.optics.camera import pixel_noise_variance, to_density
 from aolink.optics.kernel import exposure_density
-from aolink.plant import lift
+from aolink.plant.lifting import lift
 from aolink.rig import load_rig, parse_light
 from aolink.simulation.model import CameraFrame, RigModel, simulate
 

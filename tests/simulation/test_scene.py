@@ -11,10 +11,11 @@ from PIL import Image
 from scipy import ndimage
 
 from aolink.errors import RigError
+from aolink.optics.scene import SceneSensor, framed
+from aolink.optics.sensor import Kernel
 from aolink.restoration import motion_psf
 from aolink.rig import Rig, load_rig, parse_rig
-from aolink.scene import SceneSensor, framed, read_scene_picture
-from aolink.sensor import Kernel
+from aolink.rig.scene_table import read_scene_picture
 from aolink.simulation.model import RigModel, simulate
 from aolink.simulation.scene import SceneCamera
 

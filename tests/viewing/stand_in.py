@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from scipy.signal import lfilter
 
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.exposure_model import exposure_model
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.plain import plain_data

@@ -39,10 +39,10 @@ def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
 
 def o3_step(effort: Effort) -> Row:
     """One exposure of 1800 axes, given their moments: correction and prediction."""
-    from aolink.estimation.exposure_model import exposure_model
-    from aolink.estimation.filter import BlurFilter
-    from aolink.estimation.moments import Measurement
-    from aolink.estimation.observation import PathMoments
+    from aolink.estimation.frames.moments import Measurement
+    from aolink.estimation.kalman.filter import BlurFilter
+    from aolink.estimation.kalman.observation import PathMoments
+    from aolink.estimation.model.exposure_model import exposure_model
 
     axes, sample = 1800, effort.of(100)
     rig = load_rig("section-vi-lively")
@@ -86,7 +86,7 @@ def many_lenslets() -> Rig:
 def frame_moments_and_o3(effort: Effort) -> Row:
     """Moments and o3 of a frame of 900 spots: against one matrix product for the moments and filterpy's loop."""
     from aolink.estimation import make_estimator
-    from aolink.estimation.exposure_model import exposure_model
+    from aolink.estimation.model.exposure_model import exposure_model
     from aolink.simulation.model import simulate
 
     rig, sample = many_lenslets(), effort.of(100)
@@ -197,7 +197,7 @@ def mixture_of_many_axes(effort: Effort) -> Row:
 def spots_under_turbulence(effort: Effort) -> list[Row]:
     """An exposure of sh-8x8, 48 spots whose slopes the membrane cannot all make, and `moments` beside o1 there."""
     from aolink.estimation import run, score
-    from aolink.estimation.estimators import make_estimator
+    from aolink.estimation.registry import make_estimator
     from aolink.simulation.model import simulate
 
     rig = load_rig("sh-8x8")
@@ -222,7 +222,7 @@ def spots_under_turbulence(effort: Effort) -> list[Row]:
 def membrane_in_real_time(effort: Effort) -> list[Row]:
     """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and what memory it takes."""
     from aolink.estimation import ExposureModel, make_estimator
-    from aolink.plant import alike_systems
+    from aolink.plant.alike import alike_systems
     from aolink.simulation.model import simulate
 
     rig = load_rig("membrane-12x12")

@@ -12,7 +12,7 @@ def frame_synthesis(effort: Effort) -> Row:
     """Exposures of 30 x 30 spots on 16 x 16 pixels over 200 fast steps, against error functions at every step."""
     from aolink.optics.frame import spots_density
     from aolink.optics.kernel import pixel_mass
-    from aolink.rig import Kernel
+    from aolink.optics.sensor import Kernel
 
     kernel, edges = Kernel(shape="gaussian", sigma=0.1), np.linspace(-1, 1, 17)
     path = np.cumsum(0.01 * np.random.default_rng(1).standard_normal((900, 2, 200)), axis=2)

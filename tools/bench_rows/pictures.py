@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage import color, data, transform
 
+from aolink.optics.sensor import Kernel
 from aolink.restoration import Psf, motion_psf
 from aolink.rig import load_rig
-from aolink.sensor import Kernel
 from bench_rows.row import Effort
 
 FloatArray = NDArray[np.float64]

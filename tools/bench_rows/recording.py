@@ -263,7 +263,7 @@ def memory_of_an_hour(effort: Effort) -> Row:
 
 def batch_workers(effort: Effort) -> Row:
     """Eight recordings estimated again with moments on two processes, against one."""
-    from aolink import batch
+    from aolink.jobs import batch
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -24,11 +24,11 @@ _SLOW_EXPOSURES = 400
 
 def link_throughput(effort: Effort) -> Row:
     """Frames over a pseudo terminal, from bytes to messages, against plain reads of the same bytes."""
+    from aolink.numerics.workers import end_with_parent
     from aolink.wire import messages_pb2 as pb
     from aolink.wire.link import Link
     from aolink.wire.packet import encode_message
     from aolink.wire.port import SerialPort, wait_readable
-    from aolink.workers import end_with_parent
 
     data = np.random.default_rng(1).integers(0, 256, 4096, dtype=np.uint8).tobytes()
     count = effort.of(4000)
@@ -78,7 +78,7 @@ def link_throughput(effort: Effort) -> Row:
 
 def commands_at_1_khz(effort: Effort) -> Row:
     """A minute in real time with a simulated rig as a process of its own: steps that came late or not at all."""
-    from aolink.demo import simulated_rig
+    from aolink.jobs.demo import simulated_rig
     from aolink.rig import load_rig
     from aolink.session import record
 
@@ -97,7 +97,7 @@ def commands_at_1_khz(effort: Effort) -> Row:
 
 def slow_estimator(effort: Effort) -> Row:
     """A session in real time with an estimator that is slower than the camera, and one without: what else it costs."""
-    from aolink.demo import simulated_rig
+    from aolink.jobs.demo import simulated_rig
     from aolink.rig import load_rig, parse_rig
     from aolink.session import record
 

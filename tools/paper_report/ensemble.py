@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from aolink.estimation import Estimate, run
 from aolink.exposure import Exposure
 from aolink.optics.camera import pixel_noise_sd, to_counts, to_density
-from aolink.rig import Rig, Sensor
+from aolink.optics.sensor import Sensor
+from aolink.rig import Rig
 from aolink.simulation.model import simulate
 
 FloatArray = NDArray[np.float64]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import aolink
 from aolink.estimation import Estimate, make_estimator, run
-from aolink.estimation.moments import measure_moments
+from aolink.estimation.frames.moments import measure_moments
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
 from aolink.rig import Rig

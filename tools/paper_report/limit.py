@@ -14,7 +14,8 @@ from scipy import special
 
 from aolink.estimation import Estimate, make_estimator
 from aolink.exposure import Exposure
-from aolink.rig import Rig, SpotSensor, load_rig
+from aolink.optics.sensor import SpotSensor
+from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
 from paper_report.blocks import Block, Heading, Picture, Table, Text
 from paper_report.ensemble import Measured, measure_errors, ratio, side_by_side, variant, with_pixel_noise

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from scipy import integrate
 
 from aolink.estimation import ESTIMATOR_NAMES, exposure_model, run
-from aolink.estimation.moments import measure_moments
+from aolink.estimation.frames.moments import measure_moments
 from aolink.exposure import Exposure
 from aolink.optics.camera import pixel_noise_sd, to_counts
 from aolink.optics.kernel import exposure_density
-from aolink.plant import input_response, lift, observability
+from aolink.plant.lifting import input_response, lift
+from aolink.plant.observability import observability
 from aolink.rig import Plant, Rig
 from paper_report.ensemble import Measured, ensemble, mean, measure_errors, ratio, rms, variant
 from paper_report.printed import FORMS, output_errors

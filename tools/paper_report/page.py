@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aolink.plant import lift, observability
+from aolink.plant.lifting import lift
+from aolink.plant.observability import observability
 from aolink.rig import Rig
 from paper_report import figures
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text

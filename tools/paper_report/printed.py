@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.exposure_model import ExposureModel, exposure_model
-from aolink.estimation.moments import measure_moments
+from aolink.estimation.frames.moments import measure_moments
+from aolink.estimation.model.exposure_model import ExposureModel, exposure_model
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 

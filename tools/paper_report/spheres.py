@@ -16,7 +16,8 @@ from aolink.estimation import ESTIMATOR_NAMES, make_estimator
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_counts
 from aolink.optics.kernel import pixel_mass
-from aolink.rig import Kernel, Rig, Sensor, load_rig
+from aolink.optics.sensor import Kernel, Sensor
+from aolink.rig import Rig, load_rig
 from paper_report.blocks import Block, Heading, Table, Text
 from paper_report.ensemble import Measured, SensorRows, ratio, rms
 from paper_report.numbers import Effort

@@ -1,9 +1,9 @@
 """Loops over axes, hypotheses and pixels, compiled by Numba: of line sensors, and of many spots of one plant.
 
 What a whole-array call would do for thousands of axes at once runs through memory again and again; these keep one axis
-in the processor's cache. Each of a line sensor has a twin in NumPy that tests hold it to: those of
-`aolink.estimation.modes` and `aolink.estimation.importance`, which spots on a plane still use; those of one plant's
-spots are held to the dense view of the same pixels. They hold no lock, so axes are shared among threads;
+in the processor's cache. Each of a line sensor has a twin in NumPy that tests hold it to: those of `pixels.modes` and
+`pixels.importance`, which spots on a plane still use; those of one plant's spots are held to the dense view of the same
+pixels. They hold no lock, so axes are shared among threads;
 what comes out for one axis does not depend on how many are beside it, bit for bit. Machine code is kept beside the
 source or in the user's cache, and made when an estimator is made, not in the session that it is made for.
 """

@@ -218,7 +218,7 @@ def importance_corrected(
 ) -> None:  # fmt: skip
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
-    As `aolink.estimation.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds,
+    As `aolink.estimation.pixels.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds,
     points, n) are the points' random numbers. Points lie along the last dimension of every array here, for they are
     what there are many of.
     """

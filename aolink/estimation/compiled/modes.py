@@ -23,7 +23,7 @@ def spread_starts(
 ) -> None:  # fmt: skip
     """Starts about broad Gaussians, (rows, 1 + 2 directions, n), in coordinates in which the priors are N(0, I).
 
-    As `aolink.estimation.modes.spread_starts`; ``squares`` are (rows, n).
+    As `aolink.estimation.pixels.modes.spread_starts`; ``squares`` are (rows, n).
     """
     rows, count, n = starts.shape
     root, wide, product, turned = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
@@ -54,7 +54,7 @@ def innovations(
     line: Line, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float, value: FloatArray,
     information: FloatArray, nis: FloatArray, square: FloatArray,
 ) -> None:  # fmt: skip
-    """Of points t (rows, n), as `aolink.estimation.modes.innovation`, in so many directions as there is room for.
+    """Of points t (rows, n), as `pixels.modes.innovation`, in so many directions as there is room for.
 
     ``value`` and ``information`` are (rows, k); ``square`` is the sum of score^2 / I.
     """
@@ -99,7 +99,7 @@ def find_modes(
 ) -> None:  # fmt: skip
     """Where the first ``of_row`` (rows,) of starts (rows, starts, n), whitened, lead, and after them reversals.
 
-    As `aolink.estimation.modes.modes_of`; ``mean`` and ``covariance`` are the prior's. Results have room for three more
+    As `pixels.modes.modes_of`; ``mean`` and ``covariance`` are the prior's. Results have room for three more
     than there are starts if ``reversed_precision`` is not zero. Of starts that are not there, or lead where an earlier
     one did, they are left as they come.
     """

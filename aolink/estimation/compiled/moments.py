@@ -1,4 +1,4 @@
-"""Windowed moments of a line sensor, and what they make of a prior: as `aolink.estimation.windowed`."""
+"""Windowed moments of a line sensor, and what they make of a prior: as `aolink.estimation.moments.windowed`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def broad(
 ) -> None:  # fmt: skip
     """Priors (rows, n) and (rows, n, n) corrected with windowed moments, linearised about what came before.
 
-    As `aolink.estimation.modes.broad` with `WindowedMoments` of orders 0 to 3.
+    As `aolink.estimation.pixels.modes.broad` with `WindowedMoments` of orders 0 to 3.
     """
     n, nodes = line.basis.shape
     path, spread, CB = np.empty(nodes), np.empty((nodes, nodes)), np.empty((n, nodes))
@@ -171,7 +171,7 @@ def _corrected(
     mean: FloatArray, covariance: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray,
     out_mean: FloatArray, out_covariance: FloatArray,
 ) -> None:  # fmt: skip
-    """A Kalman correction in Joseph's form: as `aolink.estimation.observation.corrected`."""
+    """A Kalman correction in Joseph's form: as `aolink.estimation.kalman.observation.corrected`."""
     m, n = H.shape
     PH, S, root = np.empty((n, m)), np.empty((m, m)), np.empty((m, m))
     for i in range(n):

@@ -45,7 +45,7 @@ _ROUNDING = 1e-28
 def cholesky(a: FloatArray, root: FloatArray) -> None:
     """A lower triangular root, (n, n), of what may be singular, from its lower half.
 
-    As `aolink.estimation.hypotheses.cholesky`.
+    As `aolink.estimation.pixels.gaussian_mixture.cholesky`.
     """
     n = len(a)
     largest = 0.0

@@ -1,0 +1,167 @@
+"""What came of a session, of restored pictures and of the demo."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from aolink.cli.tables.json import without_nan
+from aolink.cli.tables.scores import unused_lines
+from aolink.recording import schemas_pb2 as pb
+
+if TYPE_CHECKING:
+    from aolink.jobs.demo import DemoResult
+    from aolink.recording.deblur import Summary
+    from aolink.session import EstimatorReport, Report
+
+_LATENCY_STEPS = (
+    ("exposure end to first byte", "exposure_end_ns", "first_byte_ns"),
+    ("first byte to frame complete", "first_byte_ns", "complete_ns"),
+    ("frame complete to estimated", "complete_ns", "estimated_ns"),
+    ("estimated to next command sent", "estimated_ns", "command_sent_ns"),
+    ("command sent to acknowledged", "command_sent_ns", "command_acknowledged_ns"),
+    ("command sent to applied", "command_sent_ns", "command_applied_ns"),
+)
+
+
+def session_as_json(report: Report) -> dict[str, Any]:
+    """What `session` says, for scripts."""
+    facts = asdict(replace(report, latencies=[]))
+    del facts["latencies"]
+    for each in facts["estimation"].values():
+        took_ms = each.pop("took_ms")
+        each["ms"] = dict(zip(("p50", "p99"), np.percentile(took_ms, [50, 99]), strict=True)) if took_ms else {}
+    facts["latency_ms"] = {
+        name: dict(zip(("p50", "p99"), values, strict=True))
+        for name, since, until in _LATENCY_STEPS
+        if (values := _latency_ms(report.latencies, since, until)[1:])
+    }
+    return dict(without_nan(facts))
+
+
+def session(report: Report) -> Table:
+    """Frames, commands, link, clock and latencies of a session."""
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_row(
+        "frames",
+        f"{report.frames_received} received, of them {report.frames_incomplete} with chunks missing;"
+        f" {report.frames_lost} lost whole",
+    )
+    table.add_row(
+        "link",
+        f"packets thrown away: {report.packets_bad_crc} for their checksum, {report.packets_bad_framing} for their"
+        f" framing, {report.packets_bad_payload} for their content; {report.packets_duplicate} came twice;"
+        f" {report.packets_missing} missing by their numbers",
+    )
+    table.add_row(
+        "commands",
+        f"{report.steps_commanded} steps commanded: {report.steps_applied} applied ({report.steps_clipped} of them"
+        f" clipped), {report.steps_superseded} superseded, {report.steps_late} late, {report.steps_refused} refused,"
+        f" {report.steps_not_reported} not reported",
+    )
+    table.add_row(
+        "mirror",
+        f"parked in {report.steps_parked} steps of the session, {report.rearmed} times told to go on after its watchdog"
+        f" had parked it; {report.blocks_retransmitted} blocks sent again; missing reports asked for"
+        f" {report.reports_asked} times",
+    )
+    table.add_row(
+        "clock",
+        f"device minus host {report.clock_offset_ns / 1e9:.6f} s, {report.clock_frequency_ppm:+.2f} ppm,"
+        f" standard deviation {report.clock_sigma_ns / 1e3:.0f} us",
+    )
+    for name, each in report.estimation.items():
+        table.add_row("estimates", f"{name}: {_estimation(each)}")
+    if report.unwatched:
+        table.add_row("view", f"no time to show {report.unwatched} exposures")
+    if report.virtual_time:
+        table.add_row("latency", "n/a on virtual time")
+    for name, since, until in () if report.virtual_time else _LATENCY_STEPS:
+        table.add_row("latency", f"{name}: {_percentiles(report.latencies, since, until)}")
+    return table
+
+
+def _estimation(report: EstimatorReport) -> str:
+    text = f"{report.estimated} of {report.estimated + report.skipped} exposures"
+    if report.skipped:
+        text += f", {report.skipped} skipped" + (": it failed" if report.failed else " for want of time")
+    if report.took_ms:
+        p50, p99 = np.percentile(report.took_ms, [50, 99])
+        text += f"; one takes p50 {p50:.2f} ms, p99 {p99:.2f} ms"
+    return text
+
+
+def _percentiles(latencies: Sequence[pb.Latency], since: str, until: str) -> str:
+    count, *percentiles = _latency_ms(latencies, since, until)
+    if not percentiles:
+        return "no sample"
+    return f"p50 {percentiles[0]:.2f} ms, p99 {percentiles[1]:.2f} ms ({count:.0f} frames)"
+
+
+def _latency_ms(latencies: Sequence[pb.Latency], since: str, until: str) -> list[float]:
+    """Number of frames, median and 99th percentile; the number alone where it is zero."""
+    values = [
+        (getattr(each, until) - getattr(each, since)) / 1e6
+        for each in latencies
+        if getattr(each, until) and getattr(each, since)
+    ]
+    return [len(values), *map(float, np.percentile(values, [50, 99]))] if values else [0.0]
+
+
+def deblurred(summary: Summary) -> dict[str, Any]:
+    """What came of restored pictures; PSNRs are means over the scenes, None where the true scene is not known."""
+    blurred, restored = summary.psnr_blurred, summary.psnr_restored
+    return {
+        "exposures": summary.exposures,
+        "exposures_measured": summary.motion.result().measured,
+        "scenes_restored": summary.scenes,
+        "missing": dict(summary.reasons),
+        "psnr_blurred_db": float(np.mean(blurred)) if blurred else None,
+        "psnr_restored_db": float(np.mean(restored)) if restored else None,
+        "psnr_restored_least_db": min(restored) if restored else None,
+    }
+
+
+def deblurred_lines(summary: Summary, estimator: str, method: str) -> list[str]:
+    """The same in words."""
+    facts = deblurred(summary)
+    scenes = f"{facts['scenes_restored']} scenes" if facts["scenes_restored"] else "spots"
+    lines = [f"{scenes} of {facts['exposures']} exposures restored with the path of {estimator}, {method}"]
+    if facts["psnr_blurred_db"] is not None:
+        lines.append(
+            f"PSNR of the scene: {facts['psnr_blurred_db']:.1f} dB as it came (its shift forgiven),"
+            f" {facts['psnr_restored_db']:.1f} dB restored (at least {facts['psnr_restored_least_db']:.1f})"
+        )
+    lines += unused_lines({estimator: summary.motion.result()})
+    return lines + [f"{count} not restored: {reason}" for reason, count in summary.reasons.items()]
+
+
+def demo_summary(result: DemoResult, command: str) -> list[str]:
+    """What came of the demo, and what to run next with ``command``."""
+    if result.rrd is None:
+        return [f"interrupted; what was recorded is in {result.recording}"]
+    if result.differences:
+        lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
+    else:
+        lines = ["online and offline estimates agree bit for bit"]
+    if result.deblurred is not None:
+        lines += deblurred_lines(result.deblurred, result.deblurred_by, "tv")
+    lines.append("times     " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in result.seconds.items()))
+    lines.append(f"recording {result.recording}")
+    if result.deblurred_recording is not None:
+        lines.append(f"deblurred {result.deblurred_recording}")
+    lines.append(f"rerun     {result.rrd}")
+    if not result.not_of_viewer:
+        lines.append(f"picture   {result.picture}")
+    elif result.picture is not None:
+        lines.append(f"picture   {result.picture}, drawn with matplotlib: {result.not_of_viewer}")
+    else:
+        lines.append(f"picture   none: {result.not_of_viewer}")
+    lines.append(f"next      {command} view {result.deblurred_recording or result.recording}")
+    lines.append(f"          {command} info {result.recording}")
+    lines.append(f"          {command} estimate {result.recording} --estimator o3")
+    return lines

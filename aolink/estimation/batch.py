@@ -1,0 +1,61 @@
+"""Exposures one after the other, and of them all at once what does not depend on what came before."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, exposure_model
+from aolink.exposure import Exposure
+from aolink.rig import Rig
+
+# Exposures together, and numbers in them: some megabytes. What a block costs whatever its size is nothing beside them.
+_AT_ONCE = 512
+_NUMBERS_AT_ONCE = 1_000_000
+
+
+class Block:
+    """Some exposures with the responses to their inputs, each to the same bits as alone."""
+
+    def __init__(self, rig: Rig, exposures: Sequence[Exposure]) -> None:
+        self.exposures = exposures
+        self._plant = rig.plant
+        kinds = {(each.n_steps, each.start_offset, each.inputs.shape) for each in exposures}
+        self.model: ExposureModel | None = None
+        """Of all exposures, where they have the same; so much for `responses` and `finite`."""
+        if len(kinds) > 1:
+            return
+        ((n_steps, offset, _),) = kinds
+        inputs = np.array([each.inputs for each in exposures])
+        self.model = exposure_model(rig.plant, n_steps, offset)
+        self.responses = self.model.responses(inputs)
+        """Those of an exposure's axes after those of the one before, (exposures * axes, ...)."""
+        self.finite: list[bool] = np.isfinite(inputs).all(axis=(1, 2)).tolist()
+        """Whether all inputs of an exposure are numbers."""
+
+    def model_of(self, k: int) -> ExposureModel:
+        """The model of one exposure."""
+        each = self.exposures[k]
+        return self.model or exposure_model(self._plant, each.n_steps, each.start_offset)
+
+    def response_to(self, k: int) -> InputResponse:
+        """The response to the inputs of one exposure."""
+        if self.model is None:
+            return self.model_of(k).response(self.exposures[k].inputs)
+        axes = self._plant.axes
+        return self.responses.of(slice(k * axes, (k + 1) * axes))
+
+
+def blocks(rig: Rig, exposures: Iterable[Exposure]) -> Iterator[Block]:
+    """Some exposures at a time, a few megabytes of them."""
+    some: list[Exposure] = []
+    numbers = 0
+    for exposure in exposures:
+        some.append(exposure)
+        numbers += exposure.inputs.size + exposure.pixels.size
+        if len(some) == _AT_ONCE or numbers >= _NUMBERS_AT_ONCE:
+            yield Block(rig, some)
+            some, numbers = [], 0
+    if some:
+        yield Block(rig, some)

@@ -1,0 +1,56 @@
+"""How well a rig's frames will tell the centroids of its spots, by what the rig file says of noise and light."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.frames.moments import known_flux_covariance, noise_integrals
+from aolink.optics.camera import effective_noise_density
+from aolink.optics.sensor import BaseSensor, SpotSensor
+from aolink.rig import Rig
+
+FloatArray = NDArray[np.float64]
+
+
+def centroid_covariance(rig: Rig) -> FloatArray:
+    """Covariance of the centroids, read-out and shot noise, of a spot where the plant's prior has it.
+
+    Returns
+    -------
+    Blocks along the diagonal of each copy of the plant, a spot's slopes in each, (axes, blocks, size, size); of one
+    copy, (1, blocks, size, size), where all have as much light.
+    """
+    sensor, plant = rig.sensor, rig.plant
+    own = _of_whole_spot(sensor, plant.n_outputs)
+    size = len(own)
+    blocks = np.tile(own, (plant.n_outputs // size, 1, 1))
+    light = sensor.spot_light if isinstance(sensor, SpotSensor) else None
+    if light is None:
+        light = np.ones((1, len(blocks)))
+    else:  # an axis with one slope shares its spot with the next
+        light = np.repeat(light, 2 // size).reshape(plant.axes, -1)
+    covariance = blocks / light[..., None, None] ** 2
+    if sensor.photoelectrons:
+        # y_2 / photoelectrons
+        spread = np.diag(plant.C @ plant.initial_covariance @ plant.C.T) + (plant.C @ plant.initial_mean) ** 2
+        shot = (spread + _kernel_variances(sensor, plant.n_outputs)) / sensor.photoelectrons
+        covariance = covariance + shot.reshape(-1, size)[:, :, None] * np.eye(size) / light[..., None, None]
+    return np.asarray(covariance)
+
+
+def _of_whole_spot(sensor: BaseSensor, n_outputs: int) -> FloatArray:
+    """Covariance of one spot's first moments by read-out noise, known flux, (1, 1), or (2, 2) for both directions."""
+    line = sensor.profile
+    own = known_flux_covariance(effective_noise_density(line), noise_integrals(line, 2), [1])
+    if n_outputs == 1:
+        return own
+    other = effective_noise_density(sensor) * noise_integrals(line, 2)[1] ** 2
+    return np.array([[own[0, 0], other], [other, own[0, 0]]])
+
+
+def _kernel_variances(sensor: BaseSensor, n_outputs: int) -> FloatArray:
+    """Variance of the kernel along each output of one copy, (n_outputs,)."""
+    if n_outputs == 1:
+        return np.array([sensor.kernel.variance])
+    return np.tile(np.diag(sensor.kernel.covariance), n_outputs // 2)

@@ -1,0 +1,114 @@
+"""What an observation takes of exposures: their moments, profiles or windows; it does not matter what came before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.frames.moments import Measurement, least_significance, measure_moments, spot_significance
+from aolink.estimation.frames.spots import measure_spots
+from aolink.estimation.kalman.observation import Observation, PathMoments
+from aolink.estimation.moments.joint_moments import JointMoments
+from aolink.estimation.moments.spots import SpotWindows
+from aolink.estimation.moments.windowed import Profile
+from aolink.estimation.options import Options
+from aolink.estimation.pixels.joint_pixels import JointProfile
+from aolink.exposure import Exposure
+from aolink.optics.camera import is_saturated, to_density
+from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.rig import Rig
+
+FloatArray = NDArray[np.float64]
+Measured = tuple[Measurement | Profile | SpotWindows | None, str]
+"""What an observation takes of an exposure, or nothing; and what there is to say about it."""
+
+# Share of the pixels that `moments` can do with; and of the spots, where hundreds of states hang together.
+_LEAST_USABLE = 0.5
+
+
+class Measurements:
+    """What an observation takes of each of some exposures, each to the same bits as alone.
+
+    Frames of a line sensor without a flaw are measured all at once, the others when they are asked for.
+    """
+
+    def __init__(
+        self, rig: Rig, exposures: Sequence[Exposure], observation: Observation[Any] | None, options: Options
+    ) -> None:
+        self._rig, self._exposures, self._observation, self._options = rig, exposures, observation, options
+        self.rows: list[int] = [-1] * len(exposures)
+        """Row of each exposure in ``moments``, -1 where it has none."""
+        self.moments: Measurement | None = None
+        sensor = rig.sensor
+        if not (isinstance(sensor, Sensor) and sensor.shape[0] == 1 and isinstance(observation, PathMoments)):
+            return
+        shape = sensor.shape
+        sized = [k for k, each in enumerate(exposures) if each.pixels.shape == shape == each.mask.shape]
+        if not sized:
+            return
+        pixels = np.concatenate([exposures[k].pixels for k in sized])
+        whole = np.concatenate([exposures[k].mask for k in sized]).all(axis=1)
+        lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
+        good = np.flatnonzero(whole & lit & ~is_saturated(sensor, pixels).any(axis=1))
+        moments = measure_moments(sensor, pixels[good], observation.orders, options.flux) if len(good) else ""
+        if isinstance(moments, Measurement):
+            self.moments = moments
+            for row, k in enumerate(good.tolist()):
+                self.rows[sized[k]] = row
+
+    def __getitem__(self, k: int) -> Measured:
+        """What is taken of exposure k, or nothing; and what there is to say about it."""
+        row = self.rows[k]
+        if self.moments is None or row < 0:
+            return measure(self._rig, self._exposures[k], self._observation, self._options)
+        return self.some(row, row + 1), ""
+
+    def some(self, row: int, end: int) -> Measurement:
+        """Moments in some rows."""
+        assert self.moments is not None
+        return Measurement(value=self.moments.value[row:end], covariance=self.moments.covariance[row:end])
+
+
+def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options) -> Measured:
+    """What an observation takes of an exposure, or nothing; and what there is to say about it."""
+    if observation is None:
+        return None, ""
+    sensor, pixels = rig.sensor, exposure.pixels
+    if pixels.shape != sensor.shape:
+        return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
+    if isinstance(sensor, SpotSensor):
+        orders = observation.orders if isinstance(observation, PathMoments) else None
+        return measure_spots(
+            sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
+            least_usable=_LEAST_USABLE, least_significance=_least_significance(sensor),
+            least_spots=_LEAST_USABLE if isinstance(observation, JointMoments | JointProfile) else 1.0,
+        )  # fmt: skip
+    sensor = sensor.profile
+    saturated = is_saturated(sensor, pixels) & exposure.mask
+    usable = exposure.mask & ~saturated
+    remark = ""
+    if not usable.all():
+        remark = f"{int((~exposure.mask).sum())} of {pixels.size} pixels are missing"
+        if saturated.any():
+            remark = f"{int(saturated.sum())} of {pixels.size} pixels are at an end of the scale"
+        if isinstance(observation, PathMoments) or usable.sum() < _LEAST_USABLE * pixels.size:
+            return None, remark
+        remark += ": left out"
+    density = np.where(usable, to_density(sensor, pixels), 0.0)
+    significance = spot_significance(sensor, density)[0]
+    if significance < least_significance(sensor):
+        return None, f"no spot: the brightest stretch is {significance:.1f} standard deviations of noise"
+    rows = (rig.plant.axes, -1)
+    if not isinstance(observation, PathMoments):
+        return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
+    moments = measure_moments(sensor, pixels.reshape(rows), observation.orders, options.flux)
+    return (None, moments) if isinstance(moments, str) else (moments, "")
+
+
+def _least_significance(sensor: SpotSensor) -> FloatArray:
+    """`least_significance` of each profile, (n_outputs,), or of all."""
+    light = 1.0 if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)
+    return least_significance(sensor.profile, light)

@@ -1,0 +1,260 @@
+"""Spatial moments of an exposure: measured from counts, with the covariance of their noise.
+
+The p-th moment is sum omega^p Y D over the pixels, with omega the pixel's centre, Y its density and D its
+width. The kernel and the pixels' width add to it as independent variables do; that is taken out, so
+that E[y_p] = mean(theta^p). Mishra & Wen (7) to (11).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.numerics import batched
+from aolink.optics.camera import effective_noise_density
+from aolink.optics.kernel import kernel_moments
+from aolink.optics.sensor import Sensor
+
+FloatArray = NDArray[np.float64]
+Counts = NDArray[np.uint16] | FloatArray
+Flux = Literal["known", "measured"]
+
+# Where the flux is measured, its sd must be this many times smaller: a ratio's variance is not finite otherwise.
+LEAST_FLUX = 5.0
+# A smeared spot falls short of the first about once in eighty; a frame without one reaches the second once in 270.
+_LEAST, _ENOUGH = 2.0, 4.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """What was measured in one exposure, with Gaussian noise."""
+
+    value: FloatArray
+    """(axes, n_measurements)"""
+    covariance: FloatArray
+    """(axes, n_measurements, n_measurements), or blocks along its diagonal, (axes, blocks, size, size)."""
+    usable: NDArray[np.bool_] | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
+
+
+def raw_moments(sensor: Sensor, counts: Counts, highest: int) -> FloatArray:
+    """M_p = sum omega^p Y D for p = 0 .. highest, kernel included, (axes, pixels) -> (axes, highest + 1).
+
+    Summed over whole numbers, counts times odd pixel coordinates, which floating point does without
+    rounding for all but huge sensors: so no axis depends on its neighbours, whatever BLAS does.
+    """
+    odd = 2.0 * np.arange(sensor.pixels) + 1 - sensor.pixels  # pixel centres from mid-field, in half pixels
+    powers = odd[:, None] ** np.arange(highest + 1)
+    # Contiguous in memory along the axes, so that what follows is fast for many of them.
+    sums = (powers.T @ counts.T.astype(np.float64, copy=False)).T - sensor.black_level * powers.sum(axis=0)
+    half, centre = sensor.pixel_width / 2, sum(sensor.field) / 2
+    about_centre: FloatArray = sums * (half ** np.arange(highest + 1) * sensor.pixel_width / sensor.counts_per_density)
+    if centre == 0:
+        return about_centre
+    return recombine(about_centre, shift_matrix(centre, highest))
+
+
+def noise_integrals(sensor: Sensor, highest: int) -> FloatArray:
+    """I(n), integral of omega^n over the field, for n = 0 .. highest, (highest + 1,)."""
+    low, high = sensor.field
+    return np.array([(high ** (n + 1) - low ** (n + 1)) / (n + 1) for n in range(highest + 1)])
+
+
+def known_flux_covariance(noise_density: float, integrals: FloatArray, orders: Sequence[int]) -> FloatArray:
+    """Cov(M_p, M_q) = V I(p + q); on [-1, 1]: 2/3 V and 2/5 V for orders 1 and 2, and nothing between them. (11)"""
+    p = np.asarray(orders)
+    return np.asarray(noise_density * integrals[p[:, None] + p])
+
+
+def measured_flux_covariance(
+    noise_density: float, integrals: FloatArray, orders: Sequence[int], ratios: FloatArray, total: FloatArray
+) -> FloatArray:
+    """Cov(y_p, y_q) of y_p = M_p/M_0 to first order.
+
+    V [I(p+q) - y_p I(q) - y_q I(p) + y_p y_q I(0)] / M_0^2
+
+    Parameters
+    ----------
+    integrals:
+        I(n) from n = 0, (n,), or of each axis, (axes, n).
+    ratios:
+        y_p, kernel included, (axes, orders).
+    total:
+        M_0, (axes,).
+    """
+    p = np.asarray(orders)
+    y, first = ratios, integrals[..., p]
+    spread = integrals[..., p[:, None] + p] - y[:, :, None] * first[..., None, :] - first[..., :, None] * y[:, None, :]
+    spread = spread + y[:, :, None] * y[:, None, :] * integrals[..., 0, None, None]
+    return np.asarray(noise_density * spread / total[:, None, None] ** 2)
+
+
+def without_kernel(kernel: FloatArray, highest: int) -> FloatArray:
+    """The matrix that takes the kernel out of moments 0 .. highest, (highest + 1, highest + 1).
+
+    The moments found are M_p = sum_k binom(p, k) kernel_k m_(p-k); this is the inverse of that map.
+    """
+    mixing = np.zeros((highest + 1, highest + 1))
+    for p in range(highest + 1):
+        for k in range(p + 1):
+            mixing[p, p - k] = math.comb(p, k) * kernel[k]
+    return np.asarray(np.linalg.inv(mixing))
+
+
+def measure_moments(
+    sensor: Sensor, counts: Counts, orders: Sequence[int], flux: Flux = "known", light: FloatArray | None = None
+) -> Measurement | str:
+    """Moments of line-sensor frames without the kernel, y_p with E[y_p] = mean(theta^p).
+
+    Parameters
+    ----------
+    counts:
+        One row for each axis, (axes, pixels), none missing or saturated.
+    orders:
+        Which moments, from 1.
+    flux:
+        "known": the total is one, as Mishra & Wen (9) to (11) take it; "measured": divide by it, as (7) does.
+    light:
+        Light of each spot, of the sensor's whole one, (axes,); one where None.
+
+    Returns
+    -------
+    The moments, or why there are none.
+    """
+    highest = max(orders)
+    noise = effective_noise_density(sensor) * noise_integrals(sensor, 2 * highest)
+    if sensor.photoelectrons:
+        noise = with_shot_noise(noise, counts, sensor.black_level, lambda light: _shot_sums(sensor, light, 2 * highest))
+    raw = raw_moments(sensor, counts, highest)
+    if light is not None:
+        raw, noise = raw / light[:, None], noise / light[:, None] ** 2
+    return moments_from_sums(raw, noise, _unmixing(sensor, highest), orders, flux)
+
+
+def with_shot_noise(
+    read: FloatArray, counts: Counts, black_level: float, sums: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Cov(M_p, M_q) by p + q with shot noise of the light as measured, (axes, 2 highest + 1).
+
+    Shot noise adds y_(p+q) / photoelectrons.
+
+    Parameters
+    ----------
+    read:
+        The same by read-out alone, (2 highest + 1,).
+    sums:
+        From counts above the black level, (axes, pixels), what shot noise adds.
+    """
+    light = counts.astype(np.float64) - black_level
+    noise = read + sums(light)
+    # Where noise makes the light so negative that this is no covariance, light is what is above the black level.
+    poor = ~_is_covariance(noise)
+    if poor.any():
+        noise[poor] = read + sums(np.maximum(light[poor], 0.0))
+    return noise
+
+
+def _is_covariance(noise: FloatArray) -> NDArray[np.bool_]:
+    """Whether the matrices with entries noise[p + q] are positive definite, (axes, 2 highest + 1) -> (axes,)."""
+    size = noise.shape[1] // 2 + 1
+    left = [[noise[:, p + q] for q in range(size)] for p in range(size)]
+    good = np.ones(len(noise), dtype=bool)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for k in range(size):
+            good &= left[k][k] > 0
+            for p in range(k + 1, size):
+                for q in range(k + 1, size):
+                    left[p][q] = left[p][q] - left[p][k] * left[k][q] / left[k][k]
+    return good
+
+
+def _shot_sums(sensor: Sensor, light: FloatArray, highest: int) -> FloatArray:
+    powers = sensor.centres[:, None] ** np.arange(highest + 1)
+    scale = sensor.pixel_width / (sensor.counts_per_density * sensor.photoelectrons)
+    # A product for each row: the bits of one for all would depend on their number.
+    return np.asarray((np.ascontiguousarray(light)[:, None] @ powers)[:, 0] * scale)
+
+
+def moments_from_sums(
+    raw: FloatArray, noise: FloatArray, unmix: FloatArray, orders: Sequence[int], flux: Flux
+) -> Measurement | str:
+    """Moments without the kernel from those with it.
+
+    Parameters
+    ----------
+    raw:
+        M_0 and on, (axes, highest + 1).
+    noise:
+        Cov(M_p, M_q) by p + q, (2 highest + 1,) or (axes, 2 highest + 1).
+    unmix:
+        As of `without_kernel`, (highest + 1, highest + 1).
+    """
+    everything = np.arange(raw.shape[1])
+    if flux == "measured":
+        total, sd = raw[:, 0].copy(), np.sqrt(noise[..., 0])
+        if (total < LEAST_FLUX * sd).any():
+            return f"the flux, {total.min():.3g}, is under {LEAST_FLUX:g} of its standard deviations, {sd.max():.3g}"
+        raw = raw / total[:, None]
+        covariance = measured_flux_covariance(1.0, noise, list(everything), raw, total)
+    else:
+        raw = raw.copy()
+        raw[:, 0] = 1.0
+        covariance = np.array(noise[..., everything[:, None] + everything])
+        covariance[..., 0, :] = covariance[..., :, 0] = 0.0
+    unmix = unmix[list(orders)]
+    covariance = batched.congruence(unmix, covariance if covariance.ndim == 3 else covariance[None])
+    return Measurement(
+        value=recombine(raw, unmix), covariance=np.broadcast_to(covariance, (len(raw), *covariance.shape[1:]))
+    )
+
+
+def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
+    """By how many standard deviations the light of each row's brightest stretch stands out, over several lengths.
+
+    Densities (n, pixels) -> (n,).
+    """
+    light = np.zeros((sensor.pixels + 1, len(density)))
+    if len(density) < sensor.pixels:
+        np.cumsum(density.T, axis=0, out=light[1:])
+    else:  # the same sums; NumPy's own are slow across long rows
+        for k in range(sensor.pixels):
+            np.add(light[k], density[:, k], out=light[k + 1])
+    lengths = [2**k for k in range(sensor.pixels.bit_length()) if 2**k <= sensor.pixels]
+    gained = [(light[n:] - light[:-n]).max(axis=0) / math.sqrt(n) for n in lengths]
+    return np.asarray(np.max(gained, axis=0) * math.sqrt(sensor.pixel_width / effective_noise_density(sensor)))
+
+
+def least_significance(sensor: Sensor, light: FloatArray | float = 1.0) -> FloatArray:
+    """What `spot_significance` is to reach in a frame with a spot, however widely it is smeared.
+
+    Light as wide as the field stands out by its total over the total's noise, one less by chance. Where that is
+    much, a frame without a spot hardly ever gets there; where it is little, most do, and their noise speaks for itself.
+    ``light`` is the spot's, of the sensor's whole one.
+    """
+    total = light / math.sqrt(effective_noise_density(sensor) * (sensor.field[1] - sensor.field[0]))
+    return np.clip(total - 1, _LEAST, _ENOUGH)
+
+
+@lru_cache(maxsize=16)
+def _unmixing(sensor: Sensor, highest: int) -> FloatArray:
+    return without_kernel(kernel_moments(sensor.kernel, sensor.pixel_width, highest), highest)
+
+
+def shift_matrix(centre: float, highest: int) -> FloatArray:
+    """Moments about ``centre`` to moments about zero, (highest + 1, highest + 1)."""
+    matrix = np.zeros((highest + 1, highest + 1))
+    for p in range(highest + 1):
+        for k in range(p + 1):
+            matrix[p, k] = math.comb(p, k) * centre ** (p - k)
+    return matrix
+
+
+def recombine(moments: FloatArray, matrix: FloatArray) -> FloatArray:
+    """matrix @ moments for each axis, in elementwise operations."""
+    return np.stack([sum(row[k] * moments[:, k] for k in range(len(row))) for row in matrix]).T

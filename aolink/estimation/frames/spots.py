@@ -1,0 +1,195 @@
+"""Frames of many spots: a profile for each slope of each spot, with its noise, and what is measured of it.
+
+A window's counts summed over its rows are what a line sensor (`BaseSensor.profile`) would see of the slope
+along x, summed over its columns of the one along y; so every estimator of line sensors works on them. A pixel
+that cannot be used takes its whole column out of the one and its whole row out of the other, and nothing else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.frames.moments import (
+    LEAST_FLUX,
+    Flux,
+    Measurement,
+    measure_moments,
+    noise_integrals,
+    raw_moments,
+    spot_significance,
+)
+from aolink.estimation.frames.plane_moments import measure_moments_2d
+from aolink.estimation.moments.spots import SpotWindows
+from aolink.estimation.moments.windowed import Profile
+from aolink.optics.camera import effective_noise_density, is_saturated, to_density
+from aolink.optics.frame import spot_windows
+from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Profiles:
+    """What the frame shows of each output of the rig, as counts of `SpotSensor.profile`."""
+
+    counts: FloatArray
+    """Whole numbers, zero where the mask is, (n_outputs, pixels); contiguous in memory along the outputs."""
+    mask: BoolArray
+    """True where all pixels summed can be used, (n_outputs, pixels), alike."""
+
+
+def profiles(sensor: SpotSensor, pixels: NDArray[np.uint16], usable: BoolArray) -> Profiles:
+    """Sums of each window over its rows (x) and over its columns (y); both arguments are (rows, columns)."""
+    # 256 counts of 16 bits, which a window has at most along a side, make a sum that single precision holds exactly.
+    counts = _summed(sensor, pixels.astype(np.float32))
+    if usable.all():
+        return Profiles(counts=counts, mask=np.ones_like(counts, dtype=bool))
+    mask = _summed(sensor, (~usable).astype(np.float32)) == 0
+    return Profiles(counts=np.where(mask, counts, 0.0), mask=mask)
+
+
+def _summed(sensor: SpotSensor, light: NDArray[np.float32]) -> FloatArray:
+    """Sums of each window over its rows and over its columns, (n_outputs, pixels)."""
+    (rows, columns), (height, width) = sensor.grid, sensor.window
+    sums = np.empty((width, rows, columns, 2))
+    sums[..., 0] = np.add.reduce(light.reshape(rows, height, columns, width), axis=1).transpose(2, 0, 1)
+    # As a product: NumPy takes several times as long to sum over a short last axis.
+    along_rows = light.reshape(-1, width) @ np.ones(width, np.float32)
+    sums[..., 1] = along_rows.reshape(rows, height, columns).transpose(1, 0, 2)
+    if sensor.light is not None:
+        sums = sums.reshape(width, -1, 2)[:, sensor.lit]
+    return sums.reshape(width, -1).T
+
+
+def measure_spots(
+    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, orders: Sequence[int] | None,
+    flux: Flux, *, least_usable: float, least_significance: FloatArray | float, least_spots: float = 1.0,
+) -> tuple[Measurement | Profile | SpotWindows | None, str]:  # fmt: skip
+    """What a frame says of each axis, or nothing; and how many axes it says nothing of, and why.
+
+    Parameters
+    ----------
+    pixels, arrived:
+        The frame and which of it there is, (rows, columns).
+    orders:
+        Of the moments to take, which need whole profiles; None for the profiles themselves, or where a copy
+        of the plant moves whole spots, the windows about them.
+    least_usable:
+        Share of a profile's pixels that the profiles themselves can do with.
+    least_significance:
+        By how many standard deviations of noise a spot must stand out, (n_outputs,) or one for all.
+    least_spots:
+        Share of the spots of one copy of the plant that must be usable; of the others' windows nothing is.
+    """
+    saturated = is_saturated(sensor, pixels) & arrived
+    light = None if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)
+    seen: SpotWindows | None = None
+    if orders is None and plant.n_outputs > 1:
+        seen = _seen(sensor, plant, pixels, arrived & ~saturated)
+        shone = seen.density.reshape(sensor.spots, *sensor.window) * sensor.pixel_width
+        share = np.asarray(np.repeat(seen.mask.reshape(sensor.spots, -1).mean(axis=1), 2))
+        density = np.stack([shone.sum(axis=1), shone.sum(axis=2)], axis=1).reshape(2 * sensor.spots, -1)
+    else:
+        found = profiles(sensor, pixels, arrived & ~saturated)
+        share = np.count_nonzero(found.mask, axis=1) / sensor.profile.pixels
+        density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)
+    whole: BoolArray = share == 1 if orders else share >= least_usable
+    lit = spot_significance(sensor.profile, density) >= least_significance
+    if orders and flux == "measured":
+        lit &= _enough_light(sensor.profile, found.counts)
+    good: BoolArray = np.asarray((whole & lit).reshape(plant.axes, plant.n_outputs))
+    usable: BoolArray = np.asarray(good.all(axis=1))
+    left_out = 0
+    if seen is not None and least_spots < 1:
+        of_spot: BoolArray = np.asarray(good.reshape(plant.axes, -1, 2).all(axis=2))
+        usable = np.asarray(of_spot.mean(axis=1) >= least_spots)
+        left_out = int(np.count_nonzero(~of_spot[usable]))
+        kept = of_spot[:, :, None, None]
+        seen = replace(seen, density=np.where(kept, seen.density, 0.0), mask=seen.mask & kept)
+    reasons = [
+        (np.count_nonzero(spot_windows(sensor, ~arrived)), f"of {pixels.size} pixels are missing"),
+        (np.count_nonzero(spot_windows(sensor, saturated)), f"of {pixels.size} pixels are at an end of the scale"),
+        (np.count_nonzero(whole & ~lit), f"of {len(lit)} profiles show no spot"),
+    ]
+    remark = ", ".join(f"{count} {what}" for count, what in reasons if count)
+    if not usable.all():
+        remark = f"{int((~usable).sum())} of {plant.axes} axes predicted: {remark}"
+    elif left_out:
+        remark = f"{left_out} of {sensor.spots} spots left out: {remark}"
+    elif remark:
+        remark += ": left out"
+    if not usable.any():
+        return None, remark
+    measured: Measurement | Profile | SpotWindows | str
+    if seen is not None:
+        measured = seen.per_light(sensor.spot_light)
+    elif orders is None:
+        # An axis without a measurement needs one that can be computed with.
+        if light is not None:
+            density = density / light[:, None]
+        measured = Profile(density=density, mask=found.mask | ~usable[:, None], light=light)
+    elif plant.n_outputs == 1:
+        counts = found.counts if usable.all() else found.counts[usable]
+        measured = measure_moments(sensor.profile, counts, orders, flux, None if light is None else light[usable])
+    else:
+        measured = _coupled_moments(sensor, plant, pixels, usable, orders, flux)
+    if isinstance(measured, str):
+        return None, measured
+    if not usable.all():
+        measured = replace(_spread(measured, usable), usable=usable)
+    return measured, remark
+
+
+def _seen(sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], good: BoolArray) -> SpotWindows:
+    shape = (plant.axes, plant.n_outputs // 2, *sensor.window)
+    density = np.where(good, to_density(sensor, pixels), 0.0)
+    mask = spot_windows(sensor, good).reshape(shape)
+    return SpotWindows(density=spot_windows(sensor, density).reshape(shape), mask=mask)
+
+
+def _enough_light(line: Sensor, counts: NDArray[Any]) -> BoolArray:
+    """Whether moments can be divided by the light of each profile, (n_outputs,)."""
+    total = raw_moments(line, counts, 0)[:, 0]
+    variance = effective_noise_density(line) * noise_integrals(line, 0)[0]
+    if line.photoelectrons:
+        variance = variance + np.maximum(total, 0.0) / line.photoelectrons
+    return np.asarray(total >= LEAST_FLUX * np.sqrt(variance))
+
+
+def _coupled_moments(
+    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], usable: BoolArray, orders: Sequence[int], flux: Flux
+) -> Measurement | str:
+    """Moments where one copy of the plant moves whole spots: a spot's two slopes share the noise of its pixels."""
+    spots = plant.n_outputs // 2
+    used = np.repeat(usable, spots)
+    density = spot_windows(sensor, to_density(sensor, pixels))[used]
+    light = None if sensor.spot_light is None else sensor.spot_light[used]
+    edges = sensor.profile.edges
+    along = [(p, 0) for p in orders] + [(0, p) for p in orders]
+    noise = effective_noise_density(sensor)
+    found = measure_moments_2d(
+        density, edges, edges, sensor.kernel.covariance, noise, along, flux, light, sensor.photoelectrons
+    )
+    if isinstance(found, str):
+        return found
+    copies, m = len(density) // spots, len(along)
+    value = found.value.reshape(copies, spots * m)
+    return Measurement(value=value, covariance=found.covariance.reshape(copies, spots, m, m))
+
+
+def _spread(measured: Measurement | Profile | SpotWindows, usable: BoolArray) -> Measurement | Profile | SpotWindows:
+    """Moments of the usable axes in the places of these; the others get zero with unit covariance."""
+    if not isinstance(measured, Measurement):
+        return measured
+    value = np.zeros((len(usable), measured.value.shape[1]))
+    *lead, size, _ = measured.covariance.shape[1:]
+    covariance = np.tile(np.eye(size), (len(usable), *lead, 1, 1))
+    value[usable], covariance[usable] = measured.value, measured.covariance
+    return Measurement(value=value, covariance=covariance)

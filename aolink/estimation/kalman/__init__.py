@@ -1,0 +1,1 @@
+"""Kalman filters: prediction and correction, from exposure to exposure."""

@@ -1,0 +1,276 @@
+"""The recursion from exposure to exposure: measurements in, states out. It knows no pixels and no clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.estimation.estimate import Status
+from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.kalman import two_states
+from aolink.estimation.kalman.observation import MOST_COVARIANCES, Belief, Correction, Observation, PathMoments
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis
+from aolink.numerics import batched, entrywise, single_thread
+from aolink.plant.alike import MANY_STATES
+from aolink.plant.lifting import input_response, lift
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+Noise = Literal["lifted", "printed"]
+Predict = Callable[[Belief, FloatArray, FloatArray, FloatArray], Belief]
+
+# A measurement that chi-square makes less likely than this is not used. It is wide: the paper's filters leave the
+# process noise inside an exposure out, and have every right to innovations larger than they expect.
+_GATE_PROBABILITY = 1e-9
+_PATIENCE = 3
+# Relative change of a covariance that is rounding.
+_SETTLED = 1e-13
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Posterior:
+    """What one exposure came to."""
+
+    coefficients: Belief
+    """Of the exposure basis; the start state comes first."""
+    end: Belief
+    status: NDArray[np.int64]
+    """`Status` of each axis, (axes,)."""
+    innovation: FloatArray
+    """(axes, n_measurements)"""
+    innovation_covariance: FloatArray
+    """(axes, n_measurements, n_measurements), or of many measurements its diagonal, (axes, n_measurements)."""
+    nis: FloatArray
+    """(axes,)"""
+    several: NDArray[np.bool_] | None = None
+    """Whether the blur was seen to have more than one reading, (axes,); None where nobody looked for it."""
+
+    @property
+    def start(self) -> Belief:
+        """The state at the exposure's first fast step."""
+        n = self.end.mean.shape[1]
+        return Belief(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
+
+
+def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
+    """What the process noise of one exposure adds to the state's covariance, (n_states, n_states)."""
+    plant = model.plant
+    return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
+
+
+class BlurFilter:
+    """State and prior of all axes, carried from exposure to exposure.
+
+    Timing: an exposure's measurement corrects the state at its start; the state at its end is the
+    prediction through the exposure, and is where the next one begins.
+
+    Parameters
+    ----------
+    observation:
+        How it looks at an exposure; None for prediction only.
+    process_noise:
+        Covariance that one exposure adds: "lifted", what N fast steps do, or "printed", the paper's B_w W B_w'.
+    gate:
+        Whether measurements that are too far from their prediction are left out.
+    predict:
+        Another engine's prediction in the place of `predicted`.
+    """
+
+    def __init__(
+        self, plant: Plant, observation: Observation[Any] | None, *, process_noise: Noise = "lifted",
+        gate: bool = True, predict: Predict | None = None,
+    ) -> None:  # fmt: skip
+        self.plant, self.observation = plant, observation
+        self._process_noise, self._predict = process_noise, predict or predicted
+        prior = Belief(batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes))
+        self.belief = prior
+        # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
+        self._unseen = Belief(prior.mean, prior.covariance[:1])
+        # The transition that no longer changes it.
+        self._settled_under: FloatArray | None = None
+        self._missed = np.zeros(plant.axes, dtype=np.int64)
+        degrees = observation.n_measurements if observation else 0
+        self._written_out = predict is None and plant.axes == 1 and _is_two_states(plant, observation)
+        self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
+
+    def bridge(self, inputs: FloatArray) -> None:
+        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
+        if len(inputs):
+            transition, noise = lift(self.plant, len(inputs))
+            _, kick = input_response(self.plant, by_axis(self.plant, inputs))
+            self.belief = self._predict(self.belief, transition, noise, kick)
+            self._predict_unseen(transition, noise, kick)
+
+    def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
+        """One exposure, with what the observation takes of it, or without."""
+        axes, looks = self.plant.axes, self.observation
+        lost = self._missed >= _PATIENCE
+        prior = _where(lost, self._unseen, self.belief)
+        with_noise = looks is None or looks.models_noise
+        if with_noise:
+            prior = _with_noise(prior, model.n_coefficients)
+        if measured is None or looks is None:
+            done = Correction(prior, np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes))
+            status = np.full(axes, Status.PREDICTED if looks is None else Status.INPUT_INVALID, dtype=np.int64)
+            coefficients = prior
+        else:
+            done = looks.correct(model, response, prior, measured)
+            done = _without(done, measured.usable)
+            coefficients, status = self._trusted(prior, done, lost, measured.usable)
+        if with_noise:
+            self.belief = predicted(coefficients, model.end_rows, model.end_remainder, response.end)
+        else:
+            noise = added_noise(model, self._process_noise)
+            self.belief = self._predict(coefficients, model.transition, noise, response.end)
+        self._predict_unseen(model.transition, model.process_noise, response.end)
+        return Posterior(
+            coefficients=coefficients,
+            end=self.belief,
+            status=status,
+            innovation=_numbers(done.innovation),
+            innovation_covariance=_numbers(_kept(done.innovation_covariance)),
+            nis=_numbers(done.nis),
+        )
+
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
+        """`step` for exposures without a gap between them, all at once and to the same bits, as far as they can be
+        believed; None where that is none.
+
+        Parameters
+        ----------
+        responses, measured:
+            One row for each exposure.
+        """
+        if not self._written_out or self._missed[0]:
+            return None
+        noise, belief = added_noise(model, self._process_noise), self.belief
+        state, covariance = belief.mean[0], belief.covariance[0]
+        done = two_states.run(
+            model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
+        )
+        count = len(done.nis)
+        if not count:
+            return None
+        self.belief = Belief(done.end[-1], done.end_covariance[-1])
+        settled = None if self._settled_under is model.transition else _SETTLED
+        before = self._unseen
+        mean, covariance, is_settled = two_states.unseen(
+            model, before.mean[0], before.covariance[0], responses.end[:count], settled
+        )
+        self._unseen = Belief(mean[None], covariance[None])
+        self._settled_under = model.transition if is_settled else None
+        return done
+
+    def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
+        """Carry on what would be believed without a camera; a covariance that has settled is not computed again."""
+        before = self._unseen
+        if transition is self._settled_under:
+            self._unseen = Belief(_predicted_mean(before.mean, transition, kick), before.covariance)
+            return
+        self._unseen = after = predicted(before, transition, noise, kick)
+        change = np.abs(after.covariance - before.covariance).max()
+        settled = change <= _SETTLED * np.abs(before.covariance).max()
+        self._settled_under = transition if settled else None
+
+    def _trusted(
+        self, prior: Belief, done: Correction, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
+    ) -> tuple[Belief, NDArray[np.int64]]:
+        """The correction where there is one that can be believed, the prior elsewhere; and the status of each axis."""
+        after, missed = done.posterior, self._missed
+        used = done.nis <= self._gate
+        # Sums are finite where all is; those that overflow are looked at again, axis by axis.
+        if not (_has_finite_sum(after.mean) and _has_finite_sum(after.covariance)):
+            used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
+        if usable is None and used.all() and not self._missed.any():
+            return after, np.full(len(used), int(Status.OK), dtype=np.int64)
+        refused = ~used
+        self._missed = np.where(used, 0, np.where(lost, 1, self._missed + 1))
+        status = np.full(len(used), int(Status.OK), dtype=np.int64)
+        status[lost & used] = Status.REINITIALISED
+        status[refused] = Status.GATED
+        status[refused & (self._missed >= _PATIENCE)] = Status.DIVERGED
+        if usable is not None:
+            refused |= ~usable
+            status[~usable] = Status.INPUT_INVALID
+            self._missed = np.where(usable, self._missed, missed)
+        return _where(refused, prior, after), status
+
+
+def _is_two_states(plant: Plant, observation: Observation[Any] | None) -> bool:
+    """Whether it is what `two_states` has written out."""
+    return (
+        type(observation) is PathMoments
+        and (plant.n_states, plant.n_outputs) == (2, 1)
+        and observation.orders == (1, 2)
+        and observation.gain is None
+    )
+
+
+def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
+    """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
+    mean = _predicted_mean(belief.mean, transition, kick)
+    if max(transition.shape) > entrywise.MOST_ROWS:
+        spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence
+        return Belief(mean, batched.symmetric(spread(transition, belief.covariance) + noise))
+    P, Q = entrywise.unpack(belief.covariance), entrywise.unpack(noise)
+    covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
+    return Belief(mean, entrywise.pack(covariance, len(belief.covariance)))
+
+
+def _predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:
+    """x -> A x + d"""
+    if max(transition.shape) > entrywise.MOST_ROWS:
+        return batched.matvec(transition, mean) + kick
+    moved = entrywise.times_vector(entrywise.unpack(transition), entrywise.columns(mean))
+    return entrywise.pack_vector(entrywise.add(moved, entrywise.columns(kick)), len(mean))
+
+
+def _without(done: Correction, usable: NDArray[np.bool_] | None) -> Correction:
+    """Innovations, their covariance and NIS of zero for axes of which nothing was measured."""
+    if usable is None:
+        return done
+    innovation = np.where(usable[:, None], done.innovation, 0.0)
+    covariance = done.innovation_covariance
+    covariance = np.where(usable.reshape(-1, *[1] * (covariance.ndim - 1)), covariance, 0.0)
+    return Correction(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
+
+
+def _kept(covariance: FloatArray) -> FloatArray:
+    """An innovation covariance, or its diagonal where it is large."""
+    if covariance.ndim == 3 and covariance.shape[-1] > MOST_COVARIANCES:
+        return np.array(np.einsum("amm->am", covariance))
+    return covariance
+
+
+def _with_noise(state: Belief, count: int) -> Belief:
+    """The start state and the noise coefficients, which nothing is known of before the exposure: N(0, I)."""
+    axes, n = state.mean.shape
+    mean, covariance = np.zeros((axes, count)), np.tile(np.eye(count), (axes, 1, 1))
+    mean[:, :n], covariance[:, :n, :n] = state.mean, state.covariance
+    return Belief(mean, covariance)
+
+
+def _numbers(values: FloatArray) -> FloatArray:
+    """Zero for what is not a number, the largest one for what is too large."""
+    return values if _has_finite_sum(values) else np.nan_to_num(values)
+
+
+def _has_finite_sum(values: FloatArray) -> bool:
+    return math.isfinite(np.add.reduce(values, axis=None))
+
+
+def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
+    """Axis by axis, the first belief where chosen."""
+    which = np.flatnonzero(chosen)
+    if not len(which):
+        return second
+    mean, covariance = second.mean.copy("K"), second.covariance.copy("K")
+    mean[which] = first.mean[which]
+    covariance[which] = first.covariance[which] if len(first.covariance) > 1 else first.covariance[0]
+    return Belief(mean, covariance)

@@ -1,0 +1,220 @@
+"""All spots of one plant with hundreds of states, as a function of the coefficients of a factored model.
+
+A spot's pixels depend on its own two paths, and these, but for what inputs do, on few numbers each: the shares of the
+courses. So the Jacobian of its pixels is small, (pixels, 2 m), and what the frame tells of all coefficients,
+the information J' R^-1 J, is a sum over spots of small blocks between the rows of two patterns: nothing is as large
+as pixels times coefficients.
+
+Of the noise coefficients, which come with the largest first, those are kept that move the spots by something that the
+kernel does not hide, as in `aolink.estimation.pixels.likelihood`; the rest widens the kernel.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import lru_cache
+from itertools import pairwise
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.kalman import information
+from aolink.estimation.model.exposure_model import InputResponse, exposure_model
+from aolink.estimation.model.factored import FactoredModel
+from aolink.estimation.model.quadrature import Nodes, Quadrature, Resolution, resolution
+from aolink.numerics import single_thread
+from aolink.numerics.covariance import psd_root
+from aolink.optics.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+# Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
+# out, for many spots tell a displacement of all of them more finely.
+_LEFT_OUT = 0.05
+# Of all coefficients, to find the number of nodes.
+_DRAWS = 4
+
+
+class JointPaths:
+    """Paths of all spots at nodes, of the first ``size`` coefficients.
+
+    Parameters
+    ----------
+    sensor:
+        Says how finely the path is to be known.
+    """
+
+    def __init__(self, model: FactoredModel, sensor: SpotSensor) -> None:
+        self.model = model
+        n = model.plant.n_states + model.n_unmodelled
+        variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
+        energy = (model.patterns[:, n:] ** 2).sum(axis=0) * (model.functions**2).mean(axis=0)[model.course_of[n:]]
+        rest = np.append(np.cumsum(energy[::-1])[::-1], 0.0) + model.noise.left_out.sum()
+        enough = np.flatnonzero(rest <= _LEFT_OUT**2 * variance * model.plant.n_outputs)
+        kept = int(enough[0]) if len(enough) else len(energy)
+        self.widening = float(rest[kept]) / model.plant.n_outputs + model.unmodelled_rest
+        """Mean variance of the path that is left out, which the kernel is to be widened by."""
+        self.size = n + kept
+        """Coefficients."""
+        course_of = model.course_of[: self.size]
+        used = int(course_of.max()) + 1
+        self.order = np.argsort(course_of, kind="stable")
+        self.groups = [np.flatnonzero(course_of == c) for c in range(used)]
+        """Coefficients of each course."""
+        self.patterns = np.ascontiguousarray(model.patterns[:, : self.size])
+        """(n_outputs, size)"""
+        self._gram = single_thread.gram(self.patterns)
+        # In the order of courses.
+        self._patterns, self._course_of = np.ascontiguousarray(self.patterns[:, self.order]), course_of[self.order]
+        self._starts = np.cumsum([0] + [len(own) for own in self.groups])
+        self._slices = [slice(start, end) for start, end in pairwise(self._starts.tolist())]
+        self.course_of = course_of
+        self._functions = model.functions[:, :used]
+        self.resolution = self._resolution(variance, sensor)
+        self._quadrature = self.resolution.levels[0]
+        self.functions, self.weights = self._at(self._quadrature)
+        """The courses at the nodes, (nodes, m), and each node's share of the exposure, (nodes,)."""
+        self.inputs = np.zeros((model.plant.n_outputs, len(self.weights)))
+        """The response to the inputs, (n_outputs, nodes)."""
+
+    def _resolution(self, variance: float, sensor: SpotSensor) -> Resolution:
+        """The same whenever in a step an exposure starts."""
+        if not self.model.moved:
+            return resolution(self._unseen(), variance, sensor.profile)
+        model = exposure_model(self.model.plant, self.model.n_steps)
+        assert isinstance(model, FactoredModel)
+        return joint_paths(model, sensor).resolution
+
+    def _unseen(self) -> FloatArray:
+        """Paths of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
+        z = np.random.default_rng(0).standard_normal((_DRAWS, self.size))
+        n = self.model.plant.n_states
+        z[:, :n] = z[:, :n] @ psd_root(self.model.plant.initial_covariance).T
+        return np.concatenate([self.shares(each) @ self._functions.T for each in z])
+
+    def _at(self, q: Quadrature) -> tuple[FloatArray, FloatArray]:
+        """Courses and weights of nodes."""
+        functions, weights, moved = np.ascontiguousarray(q.at(self._functions.T).T), q.weights, self.model.moved
+        if not moved:
+            return functions, weights
+        # So much of the first step is not in the exposure, but in the step after its last.
+        after = self.model.after[: functions.shape[1]]
+        return np.vstack([functions, self._functions[0], after]), np.append(weights, [-moved, moved])
+
+    def foreseen(self, mean: FloatArray, response: InputResponse, axis: int) -> JointPaths:
+        """The same with what the inputs of an exposure do, as fine as paths about this mean ask for.
+
+        Parameters
+        ----------
+        mean:
+            Of the coefficients before the exposure, (size,).
+        """
+        paths, path = copy(self), response.path[axis]
+        expected = self.shares(mean) @ self._functions.T + path
+        paths._quadrature = self.resolution.levels[int(self.resolution.of(expected[None])[0])]
+        paths.functions, paths.weights = self._at(paths._quadrature)
+        paths.inputs = paths._quadrature.at(path)
+        if self.model.moved:
+            late = [path[:, 0], self.model.last_response(response.end)[axis]]
+            paths.inputs = np.concatenate([paths.inputs, np.stack(late, axis=1)], axis=1)
+        return paths
+
+    @property
+    def spots(self) -> int:
+        return len(self.patterns) // 2
+
+    def shares(self, t: FloatArray) -> FloatArray:
+        """The courses' shares of each output's path, (n_outputs, m)."""
+        return np.asarray(np.add.reduceat(self._patterns * t[self.order], self._starts[:-1], axis=1))
+
+    def positions(self, t: FloatArray) -> FloatArray:
+        """Where the spots are at the nodes, (spots, 2, nodes)."""
+        path = single_thread.matmul(self.shares(t), np.ascontiguousarray(self.functions.T)) + self.inputs
+        return path.reshape(self.spots, 2, -1)
+
+    def score(self, of_shares: FloatArray) -> FloatArray:
+        """Derivative by the coefficients from that by the courses' shares, (spots, 2, m) -> (size,)."""
+        return np.asarray((self.patterns * of_shares.reshape(len(self.patterns), -1)[:, self.course_of]).sum(axis=0))
+
+    def information(self, of_shares: FloatArray) -> FloatArray:
+        """Information on the coefficients from that on each spot's shares, (spots, 2, m, 2, m) -> (size, size)."""
+        lower, out = np.empty((self.size, self.size)), np.empty((self.size, self.size))
+        of_shares = np.ascontiguousarray(of_shares)
+        for c, own in enumerate(self._slices):
+            told = np.empty((len(self.patterns), own.stop))
+            compiled_loops().informed(of_shares, self._patterns, self._course_of, c, told)
+            lower[own, : own.stop] = single_thread.matmul(self._patterns[:, own].T, told)
+        compiled_loops().spread_out(lower, self.order, out)
+        return out
+
+    def spread(self, covariance: FloatArray) -> FloatArray:
+        """Covariance of the shares of each spot, from that of the coefficients, (spots, 2, m, 2, m)."""
+        m = len(self.groups)
+        out = np.empty((self.spots, 2, m, 2, m))
+        by_course = self._sorted(covariance)
+        for c, own in enumerate(self._slices):
+            left = single_thread.matmul(self._patterns[:, own], by_course[own, : own.stop])
+            compiled_loops().spread_of(left, self._patterns, self._starts, c, out)
+        return out
+
+    def _sorted(self, matrix: FloatArray) -> FloatArray:
+        """Rows and columns (size, size) in the order of courses."""
+        out = np.empty((self.size, self.size))
+        compiled_loops().taken(np.ascontiguousarray(matrix), self.order, out)
+        return out
+
+    def of_one_spot(self) -> Nodes:
+        """The shares of a spot as coefficients of a basis of its own; each spot is an axis."""
+        nodes, m = self.functions.shape
+        basis = np.zeros((2, nodes, 2, m))
+        basis[0, :, 0] = basis[1, :, 1] = self.functions
+        return Nodes(
+            basis=basis.reshape(2, nodes, 2 * m), weights=self.weights,
+            inputs=self.inputs.reshape(self.spots, 2, nodes), widening=self.model.unmodelled_rest,
+        )  # fmt: skip
+
+    def shares_of_spots(self, t: FloatArray) -> FloatArray:
+        """`shares` of each spot, (spots, 2 m)."""
+        return self.shares(t).reshape(self.spots, -1)
+
+    def spread_of_spots(self, covariance: FloatArray) -> FloatArray:
+        """`spread`, (spots, 2 m, 2 m)."""
+        m = len(self.groups)
+        return self.spread(covariance).reshape(self.spots, 2 * m, 2 * m)
+
+    def rms_spread(self, state_covariance: FloatArray) -> float:
+        """Standard deviation of the paths before the exposure, rms over outputs and nodes."""
+        summed = self._sorted(self._gram * self.prior_covariance(state_covariance))
+        first = self._starts[:-1]
+        own = np.add.reduceat(np.add.reduceat(summed, first, axis=0), first, axis=1)
+        variance = (self.weights * ((self.functions @ own) * self.functions).sum(axis=1)).sum()
+        return float(np.sqrt(max(variance, 0.0) / len(self.patterns)))
+
+    def prior_covariance(self, state_covariance: FloatArray) -> FloatArray:
+        """The coefficients' covariance before the exposure, (size, size)."""
+        n = len(state_covariance)
+        out = np.eye(self.size)
+        out[:n, :n] = state_covariance
+        return out
+
+    def prior_information(self, state_covariance: FloatArray) -> FloatArray:
+        """Inverse of the coefficients' covariance before the exposure, (size, size)."""
+        n = len(state_covariance)
+        out = np.eye(self.size)
+        out[:n, :n] = information.information(state_covariance)
+        return out
+
+
+@lru_cache(maxsize=1)
+def compiled_loops() -> ModuleType:
+    """Loaded when a plant of many alike systems is there: Numba alone takes half a second."""
+    from aolink.estimation.compiled import joint
+
+    return joint
+
+
+@lru_cache(maxsize=16)
+def joint_paths(model: FactoredModel, sensor: SpotSensor) -> JointPaths:
+    """`JointPaths`, made once."""
+    return JointPaths(model, sensor)

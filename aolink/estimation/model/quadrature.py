@@ -1,0 +1,178 @@
+"""Few points in time in the place of an exposure's fast steps.
+
+Blur is a mean over the steps, and paths are smooth: so it is a mean over few nodes as well. Of a spot that moves little
+these are the nodes of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree 2 n - 1
+(zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969)), between two
+steps on a straight line. Of one that goes back and forth they are means over equal blocks of steps. As many are taken
+as show the light of paths like the plant's as right as the noise of the camera asks for; and of an axis whose path is
+foreseen to go further from one to the next than a spot is wide, more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.numerics import batched
+from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.sensor import Sensor
+
+FloatArray = NDArray[np.float64]
+
+# The light of a path at the nodes differs from that at all steps by so many standard deviations of noise, rms.
+_WRONG = 0.05
+_LEAST = 3
+# More than these bring the path no nearer to what all steps say, of a spot that swings by ten widths of the kernel.
+_MOST = 100
+# Paths whose light is seen in the mean by less than this say nothing of how many there should be.
+_LEAST_LIGHT = 0.01
+# From node to node a path that is foreseen goes no further than so many standard deviations of kernel and pixel: a mean
+# over Gaussians at such distances has hardly any ripple, exp(-2 pi^2 / 1.2^2).
+_STRIDE = 1.2
+
+
+@dataclass(frozen=True, eq=False)
+class Quadrature:
+    """What the nodes are of the steps, and what each counts."""
+
+    rows: FloatArray
+    """(nodes, n_steps)"""
+    weights: FloatArray
+    """(nodes,), one in sum."""
+
+    def at(self, steps: FloatArray) -> FloatArray:
+        """At the nodes, what is known at all steps, along the last axis."""
+        return batched.long_matmul(steps.reshape(-1, 1, steps.shape[-1]), self.rows.T).reshape(*steps.shape[:-1], -1)
+
+
+@lru_cache(maxsize=64)
+def blocks(n_steps: int, most: int) -> Quadrature:
+    """Means over equal blocks, no more than ``most`` of them; the last may be shorter."""
+    length = -(-n_steps // most)
+    first = np.arange(0, n_steps, length)
+    sizes = np.diff(np.append(first, n_steps))
+    rows = np.zeros((len(first), n_steps))
+    rows[np.repeat(np.arange(len(first)), sizes), np.arange(n_steps)] = np.repeat(1 / sizes, sizes)
+    return Quadrature(rows, sizes / n_steps)
+
+
+@lru_cache(maxsize=64)
+def gauss(n_steps: int, count: int) -> Quadrature:
+    """Gauss's, of fewer nodes than steps."""
+    k = np.arange(1, count)
+    beside = np.sqrt(k**2 * (n_steps**2 - k**2) / (4 * (4 * k**2 - 1.0)))
+    values, vectors = np.linalg.eigh(np.diag(beside, 1) + np.diag(beside, -1))
+    # In pairs about the middle: a path and its reversal are alike.
+    place = (n_steps - 1) / 2 + (values - values[::-1]) / 2
+    before = np.clip(place.astype(np.intp), 0, n_steps - 2)
+    rows = np.zeros((count, n_steps))
+    rows[np.arange(count), before], rows[np.arange(count), before + 1] = before + 1 - place, place - before
+    share = vectors[0] ** 2
+    return Quadrature(rows, (share + share[::-1]) / 2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Nodes:
+    """Paths at the nodes of an exposure."""
+
+    basis: FloatArray
+    """The exposure basis there, (n_outputs, nodes, n_coefficients)."""
+    weights: FloatArray
+    """Each node's share of the exposure, (nodes,)."""
+    inputs: FloatArray
+    """The response to the inputs, (axes, n_outputs, nodes)."""
+    widening: float = 0.0
+    """Variance of the slopes about each node that no coefficient has, slope units squared."""
+
+    def part(self, axes: slice) -> Nodes:
+        """Of these axes alone."""
+        return replace(self, inputs=self.inputs[axes])
+
+
+def nodes_of(model: ExposureModel, response: InputResponse, q: Quadrature) -> Nodes:
+    """An exposure at its nodes, and at two more where it starts between two steps."""
+    basis, weights = np.ascontiguousarray(q.at(model.basis.swapaxes(1, 2)).swapaxes(1, 2)), q.weights
+    inputs = q.at(response.path)
+    if model.moved:
+        # So much of the first step is not in the exposure, but in the step after its last.
+        ends = (model.basis[:, 0], model.rows_after)
+        late = (response.path[:, :, 0], model.last_response(response.end))
+        basis = np.concatenate([basis, np.stack(ends, axis=1)], axis=1)
+        weights = np.append(weights, [-model.moved, model.moved])
+        inputs = np.concatenate([inputs, np.stack(late, axis=2)], axis=2)
+    return Nodes(basis=basis, weights=weights, inputs=inputs, widening=model.unmodelled_rest)
+
+
+@dataclass(frozen=True, eq=False)
+class Resolution:
+    """How finely the time of an exposure is to be looked at: the coarser, the less a path moves."""
+
+    levels: tuple[Quadrature, ...]
+    """From what does for paths about rest to all steps."""
+    stride: float
+    """How far a path may go from node to node, slope units."""
+
+    def of(self, path: FloatArray) -> NDArray[np.intp]:
+        """The level of each axis by the path that is foreseen, (axes, n_outputs, n_steps) -> (axes,)."""
+        level = np.zeros(len(path), dtype=np.intp)
+        far = np.arange(len(path))
+        for k, q in enumerate(self.levels[:-1]):
+            at = q.at(path[far])
+            far = far[np.abs(np.diff(at, axis=-1)).reshape(len(far), -1).max(axis=1, initial=0.0) > self.stride]
+            level[far] = k + 1
+            if not len(far):
+                break
+        return level
+
+
+def all_steps(n_steps: int) -> Resolution:
+    """Every step is a node."""
+    return Resolution((blocks(n_steps, n_steps),), math.inf)
+
+
+def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution:
+    """The coarsest that shows a spot's light as right as the noise of the pixels asks for.
+
+    Parameters
+    ----------
+    paths:
+        Like the plant's about rest, of one spot each, (paths, n_steps).
+    variance:
+        Of the kernel, slope units squared.
+    sensor:
+        Pixels and their noise.
+    """
+    n_steps = paths.shape[1]
+    paths = paths - paths.mean(axis=1, keepdims=True)
+    edges = (sensor.edges - sensor.edges.mean()) / math.sqrt(2 * variance)
+
+    def light(q: Quadrature) -> FloatArray:
+        left: FloatArray = np.zeros((len(paths), len(edges)))
+        for w, place in zip(q.weights, q.at(paths).T / math.sqrt(2 * variance), strict=True):
+            left += w / 2 * erf(edges - place[:, None])
+        return np.diff(left, axis=1) / sensor.pixel_width
+
+    right = light(blocks(n_steps, n_steps))
+    noise = effective_noise_density(sensor) / sensor.pixel_size + shot_gain(sensor) * np.maximum(right, 0.0)
+    seen = float(right.sum()) * sensor.pixel_width
+
+    def enough(q: Quadrature) -> bool:
+        return float(((light(q) - right) ** 2 / noise).sum()) <= _WRONG**2 * seen
+
+    count, found = _LEAST, blocks(n_steps, _MOST)
+    while count < min(n_steps, _MOST) and seen > _LEAST_LIGHT * len(paths):
+        tried = next((q for q in (gauss(n_steps, count), blocks(n_steps, count)) if enough(q)), None)
+        if tried is not None:
+            found = tried
+            break
+        count += max(1, count // 6)
+    levels = [found]
+    while len(levels[-1].weights) < n_steps:
+        levels.append(blocks(n_steps, min(n_steps, 2 * max(len(levels[-1].weights), 8))))
+    return Resolution(tuple(levels), _STRIDE * math.sqrt(variance + sensor.pixel_width**2 / 12))

@@ -1,0 +1,122 @@
+"""Windowed moments of all spots of one large plant, in information form.
+
+Each spot by itself is what `WindowedSpots` makes of one spot; its coefficients are the courses' shares of its two
+paths. What its sums tell of these is summed over spots (`JointPaths.information`). What a regression leaves out is
+taken as each spot's own: spots that move alike have errors alike, which the dense form knows and this does not, for it
+would take seconds a frame. Where that can be afforded, 36 actuators before 16 lenslets, it makes no difference to be
+seen: path RMSE 0.119 here and 0.121 there, NEES 73 and 74 for 72 states.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.frames.moments import LEAST_FLUX, Flux
+from aolink.estimation.kalman import information
+from aolink.estimation.kalman.observation import Belief, Correction
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.factored import FactoredModel
+from aolink.estimation.model.joint_paths import JointPaths, joint_paths
+from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
+from aolink.estimation.moments.windowed import _NOT_BELIEVED, _PASSES, Basis, Regression, _memory, _slowest
+from aolink.numerics import batched, single_thread
+from aolink.optics.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+# A window without a pixel that can be used has neither moments nor noise.
+_NO_NOISE = 1e-14
+
+
+class JointMoments:
+    """The estimator `moments` of a plant with hundreds of states, as an observation of `BlurFilter`.
+
+    Parameters
+    ----------
+    orders, basis, flux:
+        As of `WindowedSpots`.
+    """
+
+    models_noise = True
+
+    def __init__(
+        self, sensor: SpotSensor, n_outputs: int, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
+        flux: Flux = "known",
+    ) -> None:  # fmt: skip
+        self.sensor = sensor
+        self._spot = WindowedSpots(sensor, 1, orders, basis=basis, flux=flux)
+        self.n_measurements = self._spot.n_measurements * (n_outputs // 2)
+
+    @single_thread.by_one_thread
+    def correct(
+        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
+    ) -> Correction:
+        """Iterated statistical linearisation, copy by copy of the plant."""
+        assert isinstance(model, FactoredModel)
+        paths, n = joint_paths(model, self.sensor), model.plant.n_states
+        mean, covariance, rest = prior.mean.copy(), prior.covariance.copy(), []
+        for axis in range(len(mean)):
+            some = slice(0, paths.size)
+            before = Belief(mean[axis, some], covariance[axis, :n, :n])
+            windows = by_spot(measured, axis)
+            t, P, *told = self.corrected(model, paths.foreseen(mean[axis, some], response, axis), before, windows)
+            mean[axis, some], covariance[axis, some, some] = t, P
+            rest.append(told)
+        new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))
+        return Correction(Belief(mean, covariance), new, S, nis)
+
+    def corrected(
+        self, model: FactoredModel, paths: JointPaths, prior: Belief, windows: SpotWindows
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Of one copy, with a prior of the coefficients' mean and of the state's covariance.
+
+        Returns
+        -------
+        Mean and covariance of the coefficients, innovation, its variance, and the NIS.
+        """
+        nodes = paths.of_one_spot()
+        precision = paths.prior_information(prior.covariance)
+        wide = paths.prior_covariance(prior.covariance)
+        # Of hundreds of states the frames hardly show some, whose errors last as long as the plant remembers.
+        memory = _memory(_slowest(model.transition_of_one[None]))[0]
+        t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
+        spread = first = paths.spread_of_spots(wide)
+        for to_come in reversed(range(_PASSES)):
+            y, noise, fit = self._spot.look(nodes, Belief(paths.shares_of_spots(t), spread), windows)
+            noise = noise + _NO_NOISE * np.eye(noise.shape[-1])
+            light = None
+            if self._spot.flux == "measured":
+                light = (y[lit] / np.sqrt(np.einsum("skk->sk", noise[lit])))[:, 0].min()
+                y, noise, fit = self._spot._ratios(y, noise, fit)
+            new = y - fit.expected - batched.matvec(fit.slope, paths.shares_of_spots(prior.mean - t))
+            H, score = _told(paths, fit, noise + memory * fit.remainder, new)
+            P = information.covariance(precision + H)
+            t = prior.mean + single_thread.matvec(P, score)
+            if to_come:
+                spread = paths.spread_of_spots(P)
+        # The spread to expect of this one innovation is without the memory.
+        own = noise + fit.remainder
+        H, score = _told(paths, fit, own, new)
+        weighted = np.linalg.solve(own, new[..., None])[..., 0]
+        nis = np.asarray((new * weighted).sum() - score @ information.solve(precision + H, score))
+        if light is not None and light < LEAST_FLUX:
+            nis = np.asarray(_NOT_BELIEVED)
+        S = np.einsum("skk->sk", batched.congruence(fit.slope, first) + own)
+        return t, P, new.ravel(), S.ravel(), nis
+
+
+def by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
+    """One copy's spots as if they were copies of a plant with one spot each."""
+    light = None if measured.light is None else measured.light[axis, :, None]
+    return SpotWindows(density=measured.density[axis, :, None], mask=measured.mask[axis, :, None], light=light)
+
+
+def _told(paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What the sums of all spots tell of the coefficients: information and score."""
+    weighted = np.linalg.solve(R, np.concatenate([fit.slope, new[..., None]], axis=2))
+    told = batched.transpose(fit.slope) @ weighted
+    shape = (len(told), 2, len(paths.groups))
+    return paths.information(told[..., :-1].reshape(*shape, *shape[1:])), paths.score(told[..., -1].reshape(shape))

@@ -1,0 +1,372 @@
+"""Moments in a window about the spot, with what noise and motion inside the exposure do to them.
+
+A moment, in any basis and with any window or mask, is a weighted sum of pixels, y = sum_i W_i Y_i D. A
+spot resting at theta makes g(theta) = sum_i W_i (kernel integrated over pixel i) of it, so that
+E[y | path] = mean_k g(theta_k) holds with kernel, pixels, window and mask all in it: there is no bias to remove.
+
+The prior makes theta_k Gaussian, and under a Gaussian the expectations of g and its derivatives are again
+error functions, of a wider kernel. So the linear regression of y on the coefficients is in closed form
+(statistical linearisation), and what it leaves out, Omega, too. It is repeated about the posterior, with the
+window drawn tighter each time.
+
+Omega depends on the state, which hardly changes from frame to frame on a plant that remembers: its errors
+do not average out as independent ones would. It is therefore weighted with (1 + rho)/(1 - rho), as the
+variance of a mean of errors that are correlated by rho. Without that, a filter that follows a resonance
+believes in one of several phases that the blur cannot tell apart. What correlates them is the plant, the
+largest eigenvalue of A^N, where the frames say little; where they say much an error goes on by A^N (I - K H) only,
+as far as that is linear. rho is the geometric mean of both: the first alone wastes what frames say, the
+second is too sure where the blur has several readings.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Generic, Literal, Protocol, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from aolink.estimation.frames.moments import LEAST_FLUX, Flux
+from aolink.estimation.kalman.observation import Belief, Correction, corrected
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.quadrature import Nodes, blocks, nodes_of
+from aolink.numerics import batched
+from aolink.optics.camera import effective_noise_density
+from aolink.optics.sensor import BaseSensor, Sensor
+
+FloatArray = NDArray[np.float64]
+Basis = Literal["monomial", "legendre", "fourier"]
+
+_PASSES = 3
+# Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
+PATH_REACH = 3.0
+KERNEL_REACH = 2.0
+# The path is averaged over blocks of steps so that there are no more than this; a mean over it stays exact.
+_MOST_NODES = 100
+_MOST_MEMORY = 1e3
+# Axes together: more of them do not fit into the processor's cache.
+_AT_ONCE = 8
+# NIS of a ratio to light that is lost in its noise.
+_NOT_BELIEVED = 1e12
+
+
+class Seen(Protocol):
+    """What an exposure shows of each axis; its parts can be taken."""
+
+    def part(self: Self, axes: slice) -> Self:
+        """Of these axes alone."""
+
+
+Light = TypeVar("Light", bound=Seen)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Profile:
+    """Densities of one row of pixels for each axis."""
+
+    density: FloatArray
+    """One over slope units, (axes, pixels)."""
+    mask: NDArray[np.bool_]
+    """True where the pixel can be used, (axes, pixels)."""
+    light: FloatArray | None = None
+    """Light of each spot, of a whole one, which densities are divided by, (axes,); one where None."""
+    usable: NDArray[np.bool_] | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
+
+    def part(self, axes: slice) -> Profile:
+        """Of these axes alone."""
+        light = None if self.light is None else self.light[axes]
+        return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Linear regression of measurements on the coefficients, z being where it was made."""
+
+    expected: FloatArray
+    """E[y], (axes, m)."""
+    slope: FloatArray
+    """H, (axes, m, n_coefficients)."""
+    remainder: FloatArray
+    """Omega, covariance of what is not linear, (axes, m, m)."""
+
+
+class Windowed(ABC, Generic[Light]):
+    """Iterated statistical linearisation: what line sensors and spots on a plane have in common.
+
+    Parameters
+    ----------
+    basis:
+        Of u in [-1, 1] across the window: "monomial" u^p, "legendre" P_p(u), or "fourier", where
+        orders 2q - 1 and 2q are sin(pi q u) and cos(pi q u).
+    flux:
+        "known": the light of a frame sums to one; "measured": all is divided by the light in the window,
+        and order 0 left out.
+    lights:
+        Which of the sums are the light in a window.
+    light_of:
+        The light that belongs to each sum, (sums,).
+    """
+
+    models_noise = True
+    most_nodes = _MOST_NODES
+
+    def __init__(self, basis: Basis, flux: Flux, lights: Sequence[int], light_of: Sequence[int]) -> None:
+        self.basis, self.flux = basis, flux
+        self._lights, self._light_of = list(lights), np.array(light_of)
+        self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
+
+    def correct(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
+        """Iterated statistical linearisation, from the prior to the posterior."""
+        nodes = nodes_of(model, response, blocks(model.n_steps, self.most_nodes))
+        parts = [
+            self._correct(model, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
+            for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
+        ]
+        if len(parts) == 1:
+            return parts[0]
+        joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
+        return Correction(Belief(joined[0], joined[1]), *joined[2:])
+
+    def _correct(self, model: ExposureModel, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
+        about, rho = prior, np.full(len(prior.mean), _slowest(model.transition[None])[0])
+        memory = _memory(rho)
+        for to_come in reversed(range(_PASSES)):
+            y, noise, fit = self.look(nodes, about, measured)
+            if self.flux == "measured":
+                light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, self._lights].min(axis=1)
+                y, noise, fit = self._ratios(y, noise, fit)
+            innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
+            R = noise + memory[:, None, None] * fit.remainder
+            done = corrected(prior, innovation, fit.slope, R)
+            about = done.posterior
+            if to_come:
+                memory = _memory(np.sqrt(rho * _slowest(_closed_loop(model, prior, fit.slope, R))))
+        # The spread to expect of this one innovation is without the memory.
+        HP = batched.matmul(fit.slope, prior.covariance)
+        S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
+        nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
+        if self.flux == "measured":
+            nis = np.where(light < LEAST_FLUX, _NOT_BELIEVED, nis)
+        return Correction(about, innovation, S, nis)
+
+    @abstractmethod
+    def look(self, nodes: Nodes, about: Belief, measured: Light) -> tuple[FloatArray, FloatArray, Regression]:
+        """The sums (axes, sums), their noise (axes, sums, sums), and their regression on the coefficients."""
+
+    def window(
+        self, sensor: Sensor, kernel: float, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]
+    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """u in [-1, 1] across the window about a path, and the pixels that are in it, both (axes, pixels).
+
+        Parameters
+        ----------
+        kernel:
+            Variance of the kernel in this direction, slope units squared.
+        mean, variance:
+            Of the path at its nodes, (axes, nodes).
+        mask:
+            True where a pixel can be used, (axes, pixels).
+        """
+        sd = np.sqrt(np.maximum(variance, 0.0))
+        margin = KERNEL_REACH * math.sqrt(kernel + sensor.pixel_width**2 / 12)
+        # A window needs room on the sensor, wherever the path is believed to be.
+        room = max(margin, 2 * sensor.pixel_width)
+        low = np.minimum((mean - PATH_REACH * sd).min(axis=1) - margin, sensor.field[1] - room)
+        high = np.maximum((mean + PATH_REACH * sd).max(axis=1) + margin, sensor.field[0] + room)
+        low, high = np.maximum(low, sensor.field[0]), np.minimum(high, sensor.field[1])
+        edges = sensor.edges
+        inside = (edges[1:] > low[:, None]) & (edges[:-1] < high[:, None]) & mask
+        return (sensor.centres - (low + high)[:, None] / 2) / ((high - low)[:, None] / 2), inside
+
+    def function(self, order: int, u: FloatArray) -> FloatArray:
+        """The basis' function of an order, (...) -> (...)."""
+        if self.basis == "fourier":
+            turn = np.pi * ((order + 1) // 2) * u
+            return np.asarray(np.sin(turn) if order % 2 else np.cos(turn))
+        if self.basis == "monomial":
+            return np.asarray(u**order)
+        return np.asarray(np.polynomial.legendre.legval(u, np.eye(order + 1)[order]))
+
+    def _ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
+        """Everything divided by the light that belongs to it, to first order."""
+        kept = [k for k in range(y.shape[1]) if k not in self._lights]
+        lights = self._light_of[kept]
+
+        def divided(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+            light = values[:, lights]
+            # Without any light there is no ratio; the NIS says so.
+            light = np.where(light == 0, 1.0, light)
+            ratio = values[:, kept] / light
+            J = np.zeros((*ratio.shape, values.shape[1]))
+            rows = np.arange(len(kept))
+            J[:, rows, kept], J[:, rows, lights] = 1 / light, -ratio / light
+            return ratio, J
+
+        (ratio, at_measured), (expected, at_expected) = divided(y), divided(fit.expected)
+        remainder = batched.congruence(at_expected, fit.remainder)
+        slope = batched.matmul(at_expected, fit.slope)
+        return ratio, batched.congruence(at_measured, noise), Regression(expected, slope, remainder)
+
+
+class WindowedMoments(Windowed[Profile]):
+    """Windowed moments of line-sensor profiles, one output for each axis.
+
+    Parameters
+    ----------
+    orders:
+        Which functions of the basis; 0 is the light in the window.
+    basis, flux:
+        As of `Windowed`.
+    """
+
+    def __init__(
+        self, sensor: Sensor, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
+        flux: Flux = "known",
+    ) -> None:  # fmt: skip
+        self.sensor = sensor
+        # A ratio to the light in the window needs the light first.
+        self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
+        super().__init__(basis, flux, lights=[0], light_of=[0] * len(self.orders))
+
+    def look(self, nodes: Nodes, about: Belief, measured: Profile) -> tuple[FloatArray, FloatArray, Regression]:
+        """The weighted sums, their noise, and their regression on the coefficients."""
+        basis = nodes.basis[0]
+        mean = batched.matvec(basis, about.mean) + nodes.inputs[:, 0]
+        spread = batched.congruence(basis, about.covariance)
+        W = self.window_weights(mean, np.einsum("akk->ak", spread), measured.mask)
+        y, noise = self.measured(W, measured.density, measured.light)
+        return y, noise, self.regression(W, mean, spread, basis, nodes.weights, nodes.widening)
+
+    def window_weights(self, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
+        """Weights of the pixels about a path, (axes, sums, pixels), from its mean and variance, both (axes, nodes)."""
+        u, inside = self.window(self.sensor, self.sensor.kernel.variance, mean, variance, mask)
+        return np.stack([self.function(p, u) * inside for p in self.orders], axis=1)
+
+    def regression(
+        self, W: FloatArray, mean: FloatArray, spread: FloatArray, basis: FloatArray, weights: FloatArray,
+        widening: float = 0.0,
+    ) -> Regression:  # fmt: skip
+        """Regression of the weighted sums on the coefficients.
+
+        Parameters
+        ----------
+        W:
+            (axes, m, pixels)
+        mean, spread:
+            Of the path at its nodes, (axes, nodes) and (axes, nodes, nodes).
+        basis, weights:
+            Rows of the exposure basis at the nodes, (nodes, n_coefficients), and the nodes' weights, (nodes,).
+        widening:
+            Variance of the path about its nodes that no coefficient has.
+        """
+        variance = np.maximum(np.einsum("akk->ak", spread), 0.0)
+        if widening:
+            variance = variance + widening
+        g = expected_response(self.sensor.kernel.variance, self.sensor.edges, W, mean, variance)
+        light = weights[:, None]
+        # Mehler: Cov(g(a), g(b)) is the sum over j of C^j / j! times the means of the j-th derivatives.
+        square = spread * spread
+        remainder = sum(
+            batched.matmul(batched.transpose(light * g[j]), batched.matmul(power, light * g[j]))
+            for j, power in ((2, square / 2), (3, square * spread / 6))
+        )
+        slope = batched.matmul(batched.transpose(light * g[1]), np.broadcast_to(basis, (len(W), *basis.shape)))
+        return Regression((light * g[0]).sum(axis=1), slope, batched.symmetric(np.asarray(remainder)))
+
+    def measured(
+        self, W: FloatArray, density: FloatArray, light: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """The weighted sums, (axes, m), and the covariance of their pixels' noise, (axes, m, m)."""
+        return weighted_sums(self.sensor, W, density, light)
+
+
+def weighted_sums(
+    sensor: BaseSensor, W: FloatArray, density: FloatArray, light: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted sums of pixels and the covariance of the pixels' noise in them.
+
+    Parameters
+    ----------
+    W:
+        (..., m, pixels)
+    density:
+        (..., pixels), zero where a pixel cannot be used; its weights are zero as well.
+    light:
+        Light of the spot, of a whole one, that the density was divided by, (...); one where None.
+
+    Returns
+    -------
+    (..., m) and (..., m, m)
+    """
+    D = sensor.pixel_size
+    y = batched.matvec(W, density * D)
+    variance = np.full_like(density, effective_noise_density(sensor) * D)
+    if sensor.photoelectrons:
+        electrons = sensor.photoelectrons if light is None else sensor.photoelectrons / light[..., None]
+        variance += np.maximum(density, 0.0) * (D / electrons)
+    if light is not None:
+        variance /= light[..., None] ** 2
+    noise = batched.matmul(W * variance[..., None, :], batched.transpose(W))
+    # Where a window has too few pixels for its functions, their sums hang together.
+    noise += 1e-12 * np.eye(W.shape[-2]) * noise.max(axis=(-2, -1), keepdims=True)
+    return y, noise
+
+
+def expected_response(
+    kernel_variance: float, edges: FloatArray, W: FloatArray, mean: FloatArray, variance: FloatArray, highest: int = 3
+) -> list[FloatArray]:
+    """Expectations of g and its derivatives up to ``highest`` for theta ~ N(mean, variance), each (..., nodes, m).
+
+    Parameters
+    ----------
+    W:
+        Weights of the pixels, (..., m, pixels).
+    mean, variance:
+        (..., nodes)
+    """
+    width = np.sqrt(2 * kernel_variance + 2 * variance)[..., None]
+    u = (edges - mean[..., None]) / width
+    bell = np.exp(-u * u) / (math.sqrt(math.pi) * width)
+    # The sum over pixels of W_i times a difference of edges, summed by edges instead.
+    padded = np.zeros((*W.shape[:-1], W.shape[-1] + 2))
+    padded[..., 1:-1] = W
+    steps = batched.transpose(-np.diff(padded, axis=-1))
+    derivatives = [erf(u) / 2, -bell]
+    # Hermite's polynomials: H_n = 2u H_(n-1) - 2(n-1) H_(n-2), here over width^n.
+    before, last = np.zeros_like(u), np.ones_like(u)
+    for n in range(1, highest):
+        before, last = last, 2 * u / width * last - 2 * (n - 1) / width**2 * before
+        derivatives.append(-last * bell)
+    return [batched.matmul(d, steps) for d in derivatives[: highest + 1]]
+
+
+def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
+    after = correction.posterior
+    rest = correction.innovation, correction.innovation_covariance, correction.nis
+    return (after.mean, after.covariance, *rest)
+
+
+def _slowest(transition: FloatArray) -> FloatArray:
+    """Modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
+    finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
+    # What is not finite is refused by the filter; here it must only not stop the others.
+    return np.asarray(np.abs(np.linalg.eigvals(np.where(finite, transition, 0.0))).max(axis=1))
+
+
+def _memory(rho: FloatArray) -> FloatArray:
+    """Variance of a mean of errors with this correlation from frame to frame, over that of independent ones."""
+    return np.asarray(np.minimum(_MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
+
+
+def _closed_loop(model: ExposureModel, prior: Belief, H: FloatArray, R: FloatArray) -> FloatArray:
+    """How an error of the start state goes on to the next exposure's, A (I - K H), (axes, n_states, n_states)."""
+    n = len(model.transition)
+    PH = batched.matmul(prior.covariance, batched.transpose(H))
+    K = batched.matmul(PH, batched.inverse(batched.symmetric(batched.matmul(H, PH)) + R))
+    kept = np.eye(prior.mean.shape[1])[:, :n] - batched.matmul(K, H[:, :, :n])
+    return batched.matmul(np.broadcast_to(model.end_rows, (len(kept), *model.end_rows.shape)), kept)

@@ -1,0 +1,234 @@
+"""The recursion from exposure to exposure for posteriors that are not Gaussian: a mixture is carried, not one Gaussian.
+
+Timing, trust and words are those of `BlurFilter`: an exposure corrects the state at its start, a measurement that
+cannot be believed leaves the prediction, after several of them the filter starts again from what the plant would be
+without a camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.compiled.modes import drop_repeats
+from aolink.estimation.estimate import Status
+from aolink.estimation.kalman.filter import Posterior, predicted
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis, exposure_model
+from aolink.estimation.moments.spots import SpotWindows
+from aolink.estimation.moments.windowed import Profile
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, single
+from aolink.estimation.pixels.likelihood import PixelView, Reduction
+from aolink.numerics import batched
+from aolink.numerics.workers import in_threads, thread_count
+from aolink.optics.sensor import BaseSensor
+from aolink.plant.lifting import input_response, lift
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_PATIENCE = 3
+# Times the plant's own uncertainty.
+_WIDEST = 1e6
+# Chunks of axes: what NumPy computes for them together fits into the cache; compiled code has fewer calls to pay for.
+_AT_ONCE = 32
+_AT_ONCE_COMPILED = 450
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What is new in the pixels, in the directions in which the prior lets them move most."""
+
+    value: FloatArray
+    """(axes, k)"""
+    covariance: FloatArray
+    """(axes, k, k)"""
+    nis: FloatArray
+    """(axes,)"""
+    believed: BoolArray
+    """Whether pixels and prior together have a chi-square that can be, (axes,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What a frame made of a prior."""
+
+    coefficients: Belief
+    """Of the reduced coefficients t."""
+    end: Hypotheses
+    """Of the state at the exposure's end, without what inputs do."""
+    innovation: Innovation
+    several: BoolArray
+    """Whether it saw more than one reading of the blur, (axes,)."""
+
+
+class Updates(Protocol):
+    """A way to update a mixture with the pixels of an exposure."""
+
+    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
+        """The coefficients that it works with."""
+
+    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+        """The posterior of axes with a prior of their start states, in the exposure of this number.
+
+        ``unseen`` is what the start states would be without a camera.
+        """
+
+
+class HypothesisFilter:
+    """A mixture for each axis, carried from exposure to exposure.
+
+    Parameters
+    ----------
+    updates:
+        How a frame corrects it.
+    gate:
+        Whether frames that cannot be believed are left out.
+    """
+
+    def __init__(self, plant: Plant, sensor: BaseSensor, updates: Updates, *, gate: bool = True) -> None:
+        self.plant, self.sensor, self._updates, self._gate = plant, sensor, updates, gate
+        n, axes = plant.n_states, plant.axes
+        self.belief = single(
+            Belief(
+                np.broadcast_to(plant.initial_mean, (axes, n)).copy(),
+                np.broadcast_to(plant.initial_covariance, (axes, n, n)).copy(),
+            )
+        )
+        # The same without what the camera said.
+        self._unseen = self.belief.belief
+        self._missed = np.zeros(axes, dtype=np.int64)
+        self._number = 0
+
+    def warm_up(self, updates: Updates) -> None:
+        """Have an exposure of one axis updated by these: what they compile, a session need not wait for."""
+        one = slice(0, 1)
+        twice = joined(self.belief.part(one), self.belief.part(one))
+        n = self.plant.n_states
+        twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1)
+        drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
+        if self.plant.n_outputs > 1:
+            return
+        model, pixels = exposure_model(self.plant, 2), self.sensor.profile.pixels
+        dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
+        response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
+        view = PixelView(self.sensor, model, response, dark, updates.reduction(model, self.sensor))
+        updates.update(view.part(one), self.belief.part(one), _part(self._unseen, one), 0)
+        view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
+
+    def bridge(self, inputs: FloatArray) -> None:
+        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
+        if len(inputs):
+            transition, noise = lift(self.plant, len(inputs))
+            _, kick = input_response(self.plant, by_axis(self.plant, inputs))
+            self.belief = _moved(self.belief, transition, noise, kick)
+            self._unseen = self._unwatched(transition, noise, kick)
+
+    def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
+        """The next of `_unseen`; that of an unstable plant stays where it is so wide that it says nothing."""
+        now, later = self._unseen, predicted(self._unseen, transition, noise, kick)
+        widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
+        grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)
+        return Belief(
+            np.where(grows[:, None], later.mean, now.mean),
+            np.where(grows[:, None, None], later.covariance, now.covariance),
+        )
+
+    def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
+        """One exposure, with its pixels or without."""
+        axes = self.plant.axes
+        reduced = self._updates.reduction(model, self.sensor)
+        lost = self._missed >= _PATIENCE
+        prior = _chosen(lost, single(self._unseen), self.belief)
+        status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
+        new = Innovation(np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes), np.ones(axes, dtype=bool))
+        several = np.zeros(axes, dtype=bool)
+        done: list[Update] = []
+        took = np.zeros(0, dtype=np.intp)
+        if measured is not None:
+            usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
+            # Each axis is looked at as finely as its own path asks for, whatever is beside it.
+            level = reduced.resolution.of(model.path(prior.belief.mean, response.path))
+            views, parts = {}, []
+            for k in np.unique(level[usable]).tolist():
+                views[k] = PixelView(self.sensor, model, response, measured, reduced, k)
+                alike = usable[level[usable] == k]
+                at_once = _AT_ONCE_COMPILED if views[k].compiled else _AT_ONCE
+                at_once = min(at_once, -(-len(alike) // thread_count()))
+                parts += [alike[j : j + at_once] for j in range(0, len(alike), at_once)]
+            seen = np.concatenate([usable[:0], *parts])
+
+            def updated(p: NDArray[np.intp]) -> Update:
+                view = views[int(level[p[0]])].part(p)
+                u = self._updates.update(view, prior.part(p), _part(self._unseen, p), self._number)
+                return replace(u, coefficients=reduced.coefficients(u.coefficients))
+
+            done = in_threads(updated, parts)
+            new = _spread([each.innovation for each in done], seen, axes)
+            trusted = new.believed[seen] | (not self._gate)
+            took = seen[trusted]
+            self._missed[seen] = np.where(trusted, 0, np.where(lost[seen], 1, self._missed[seen] + 1))
+            status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
+            status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
+        if not np.array_equal(took, np.arange(axes)):
+            coefficients = reduced.coefficients(reduced.prior(prior.belief))
+            end = _moved(prior, model.transition, model.process_noise, response.end)
+        if len(took):
+            most = max(each.end.mean.shape[1] for each in done)
+            after = [np.concatenate(each) for each in zip(*(_arrays(d, most) for d in done), strict=True)]
+            if len(took) < len(trusted):
+                after = [each[trusted] for each in after]
+            kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
+            several[took] = after[5]
+            if np.array_equal(took, np.arange(axes)):
+                coefficients, end = Belief(after[3], after[4]), kicked
+            else:
+                coefficients.mean[took], coefficients.covariance[took] = after[3], after[4]
+                end = end.replaced(took, kicked)
+        self.belief = end
+        self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
+        self._number += 1
+        return Posterior(
+            coefficients=coefficients, end=end.belief, status=status, innovation=new.value,
+            innovation_covariance=new.covariance, nis=new.nis, several=several,
+        )  # fmt: skip
+
+
+def _part(belief: Belief, axes: slice | NDArray[np.intp]) -> Belief:
+    return Belief(belief.mean[axes], belief.covariance[axes])
+
+
+def _arrays(done: Update, components: int) -> tuple[NDArray[Any], ...]:
+    e, c = done.end.with_components(components), done.coefficients
+    return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several)
+
+
+def _spread(parts: Sequence[Innovation], seen: NDArray[np.intp], axes: int) -> Innovation:
+    """Innovations of these axes in their places; zero, with a covariance of zero, for the others."""
+    k = parts[0].value.shape[1] if parts else 0
+    out = Innovation(np.zeros((axes, k)), np.zeros((axes, k, k)), np.zeros(axes), np.zeros(axes, dtype=bool))
+    if parts:
+        out.value[seen] = np.concatenate([each.value for each in parts])
+        out.covariance[seen] = np.concatenate([each.covariance for each in parts])
+        out.nis[seen] = np.concatenate([each.nis for each in parts])
+        out.believed[seen] = np.concatenate([each.believed for each in parts])
+    return out
+
+
+def _moved(h: Hypotheses, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Hypotheses:
+    """x -> A x + d, P -> A P A' + Q for each component."""
+    return Hypotheses(
+        h.log_weight,
+        batched.matvec(transition, h.mean) + kick[:, None],
+        batched.symmetric(batched.congruence(transition, h.covariance) + noise),
+    )
+
+
+def _chosen(which: BoolArray, first: Hypotheses, second: Hypotheses) -> Hypotheses:
+    rows = np.flatnonzero(which)
+    return second.replaced(rows, first.part(rows)) if len(rows) else second

@@ -1,0 +1,177 @@
+"""Mixtures of Gaussians, many at once: the batch axis first, the components second."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.compiled import mixtures as compiled_mixtures
+from aolink.estimation.kalman.observation import Belief
+from aolink.numerics import batched
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Relative to each variance; what a prior knows for certain stays certain to this.
+_JITTER = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """A mixture of Gaussians for each axis."""
+
+    log_weight: FloatArray
+    """(axes, components), normalised; minus infinity for a component that is not there."""
+    mean: FloatArray
+    """(axes, components, n)"""
+    covariance: FloatArray
+    """(axes, components, n, n)"""
+
+    def part(self, axes: slice | NDArray[np.intp]) -> Hypotheses:
+        """Of these axes alone."""
+        return Hypotheses(self.log_weight[axes], self.mean[axes], self.covariance[axes])
+
+    @property
+    def belief(self) -> Belief:
+        """Mean and covariance of the mixture."""
+        axes, _, n = self.mean.shape
+        out = Belief(np.empty((axes, n)), np.empty((axes, n, n)))
+        compiled_mixtures.moments(*self.contiguous, out.mean, out.covariance)
+        return out
+
+    def mapped(self, rows: FloatArray, remainder: FloatArray) -> Hypotheses:
+        """Of M t + e instead of t, M being ``rows`` (m, n) and the independent e's covariance ``remainder`` (m, m)."""
+        (axes, count, _), m = self.mean.shape, len(rows)
+        out = Hypotheses(self.log_weight, np.zeros((axes, count, m)), np.zeros((axes, count, m, m)))
+        compiled_mixtures.mapped(
+            *self.contiguous, np.ascontiguousarray(rows), np.ascontiguousarray(remainder), out.mean, out.covariance
+        )
+        return out
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """At points (axes, points, n), (axes, points)."""
+        return log_sum(self.component_log_densities(points), axis=1)
+
+    def component_log_densities(self, points: FloatArray) -> FloatArray:
+        """Of each component times its weight, (axes, components, points)."""
+        n = points.shape[-1]
+        root = cholesky(self.covariance)
+        away = points[:, None] - self.mean[:, :, None]
+        white = batched.long_matmul(away, batched.transpose(lower_inverse(root)))
+        log_root = np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1)
+        constant = self.log_weight - log_root - 0.5 * n * math.log(2 * math.pi)
+        return np.asarray(constant[..., None] - 0.5 * np.add.reduce(white * white, axis=-1))
+
+    @property
+    def contiguous(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Its arrays as compiled code takes them."""
+        return (
+            np.ascontiguousarray(self.log_weight),
+            np.ascontiguousarray(self.mean),
+            np.ascontiguousarray(self.covariance),
+        )
+
+    def reduced(self, most: int, free: float = 0.0) -> Hypotheses:
+        """The same with ``most`` components, or fewer if mergers cost less than ``free``.
+
+        Those two are merged, again and again, whose merger costs least. The cost is Runnalls' bound on the
+        Kullback-Leibler divergence; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to
+        Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
+        """
+        merged = Hypotheses(self.log_weight.copy(), self.mean.copy(), self.covariance.copy())
+        compiled_mixtures.merge(*merged.contiguous, most, free)
+        return merged.ordered(most)
+
+    def with_components(self, count: int) -> Hypotheses:
+        """The same with components that are not there after its own."""
+        more = count - self.mean.shape[1]
+        if more <= 0:
+            return self
+        log_weight = np.concatenate([self.log_weight, np.full((len(self.mean), more), -np.inf)], axis=1)
+        mean, covariance = (
+            np.concatenate([each, np.repeat(each[:, :1], more, axis=1)], axis=1)
+            for each in (self.mean, self.covariance)
+        )
+        return Hypotheses(log_weight, mean, covariance)
+
+    def replaced(self, axes: NDArray[np.intp], by: Hypotheses) -> Hypotheses:
+        """The same with these axes' mixtures replaced."""
+        count = max(self.mean.shape[1], by.mean.shape[1])
+        old, new = self.with_components(count), by.with_components(count)
+        out = Hypotheses(old.log_weight.copy(), old.mean.copy(), old.covariance.copy())
+        out.log_weight[axes], out.mean[axes], out.covariance[axes] = new.log_weight, new.mean, new.covariance
+        return out
+
+    def ordered(self, most: int | None = None) -> Hypotheses:
+        """The heaviest components first, without columns of which none is there."""
+        order = np.argsort(-self.log_weight, axis=1, kind="stable")[:, :most]
+        rows = np.arange(len(order))[:, None]
+        kept = self.log_weight[rows, order]
+        count = max(1, int(np.isfinite(kept).sum(axis=1).max(initial=1)))
+        order = order[:, :count]
+        return Hypotheses(kept[:, :count], self.mean[rows, order], self.covariance[rows, order])
+
+
+def single(belief: Belief) -> Hypotheses:
+    """A mixture of one component."""
+    return Hypotheses(np.zeros((len(belief.mean), 1)), belief.mean[:, None], belief.covariance[:, None])
+
+
+def joined(*mixtures: Hypotheses) -> Hypotheses:
+    """All components of several mixtures, their weights normalised together."""
+    log_weight = np.concatenate([each.log_weight for each in mixtures], axis=1)
+    return Hypotheses(
+        log_weight - log_sum(log_weight, axis=1)[:, None],
+        np.concatenate([each.mean for each in mixtures], axis=1),
+        np.concatenate([each.covariance for each in mixtures], axis=1),
+    )
+
+
+def stacked_axes(mixtures: Sequence[Hypotheses]) -> Hypotheses:
+    """Mixtures of different axes, one after the other."""
+    return Hypotheses(
+        np.concatenate([each.log_weight for each in mixtures]),
+        np.concatenate([each.mean for each in mixtures]),
+        np.concatenate([each.covariance for each in mixtures]),
+    )
+
+
+def with_noise(prior: Hypotheses, t: FloatArray) -> FloatArray:
+    """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
+    states = prior.mean.shape[2]
+    rest = t[..., states:]
+    noise = -0.5 * np.add.reduce(rest * rest, axis=-1) - 0.5 * rest.shape[-1] * math.log(2 * math.pi)
+    return np.asarray(prior.log_density(t[..., :states]) + noise)
+
+
+def log_sum(values: FloatArray, axis: int) -> FloatArray:
+    """log sum exp along an axis; minus infinity where all are."""
+    top = np.maximum.reduce(values, axis=axis, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        # One after the other, so that what is not there does not change a bit.
+        total = np.take(np.add.accumulate(np.exp(values - top), axis=axis), -1, axis=axis)
+        return np.asarray(np.log(total) + np.squeeze(top, axis=axis))
+
+
+def cholesky(covariance: FloatArray) -> FloatArray:
+    """A root, lower triangular, of what may be singular."""
+    diagonal = np.einsum("...ii->...i", covariance)
+    largest = np.maximum.reduce(diagonal, axis=-1, keepdims=True)
+    lifted = covariance + (_JITTER * diagonal + 1e-14 * largest + 1e-300)[..., None] * np.eye(covariance.shape[-1])
+    return np.asarray(np.linalg.cholesky(lifted))
+
+
+def lower_inverse(root: FloatArray) -> FloatArray:
+    """Inverse of lower triangular matrices."""
+    return np.asarray(np.linalg.solve(root, np.broadcast_to(np.eye(root.shape[-1]), root.shape)))
+
+
+def log_determinant(covariance: FloatArray) -> FloatArray:
+    """log |P|"""
+    root = cholesky(covariance)
+    return np.asarray(2 * np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1))

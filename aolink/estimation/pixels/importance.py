@@ -1,0 +1,197 @@
+"""Points drawn from a mixture of Gaussians, weighted by the posterior over the density that they were drawn from.
+
+After a round the mixture is fitted to the weighted points, and the next round is drawn from that, until enough points
+count: a mode where none was looked for is found by the few points that fall there. The points of all rounds are
+weighted against all densities together (Veach's balance heuristic; in this use Cornuet et al., Adaptive multiple
+importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and frame.
+
+Some posteriors no such mixture comes near: of a spot that hardly moves, seen through little noise, the blur fixes the
+sum of many squares, and the posterior is a shell. There points are annealed (`aolink.estimation.pixels.tempering`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.estimation.compiled import mixtures as compiled_mixtures
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, joined, log_sum, stacked_axes, with_noise
+from aolink.estimation.pixels.likelihood import PixelView
+from aolink.estimation.pixels.tempering import annealed, fitted
+from aolink.numerics import batched
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Rounds at most, where fewer points than these count.
+_ROUNDS = 4
+_ENOUGH = 100.0
+# If it is fewer still, so many are annealed, and their end states described by so many Gaussians.
+_ANNEALED = 600
+_COMPONENTS = 6
+# Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
+# is too sure. And steps of the search for the power.
+_LEAST_EFFECTIVE = 128.0
+_HALVINGS = 6
+# Points of a round for each pair of coefficients; as many as the next power of two. Of one or two coefficients that
+# would be fewer than are to count.
+_POINTS = 14
+_FEWEST_POINTS = 128
+_MOST_POINTS = 2048
+# Share of the points that come from the wide Gaussians.
+_WIDE = 0.3
+# Modes are flattened by this much: tails that are too thin cost more than ones that are too thick. And of how much
+# better one is than another so much is believed, in logarithms, for Laplace's evidence of what is bent is rough.
+_INFLATION = 1.5
+_EVIDENCE = 0.5
+# A component's covariance counts as so many points for each coefficient beside those that it is fitted to. From round
+# to round few, so that it finds its place soon; at last many, and those of a mixture that was fitted already as so much
+# wider: a covariance of few points is too narrow, and all that comes after it too sure.
+_PRIOR_POINTS = 2.0
+_LAST_PRIOR_POINTS = 3.0
+_LOOSENED = 2.0
+# A component of less than this share is not drawn from any more.
+_NEGLIGIBLE = 1e-3
+
+
+def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, wide: Belief) -> Hypotheses:
+    """Modes, flattened a little, and the wide Gaussians of windowed moments about them, to draw points from.
+
+    Both weights are logarithms; covariances and means (axes, components, ...).
+    """
+    weight = _EVIDENCE * (modes_weight - np.maximum.reduce(modes_weight, axis=1, keepdims=True))
+    weight += math.log(1 - _WIDE) - log_sum(weight, axis=1)[:, None]
+    narrow = Hypotheses(weight, modes.mean, modes.covariance * _INFLATION)
+    return joined(narrow, Hypotheses(wide_weight + math.log(_WIDE), wide.mean, wide.covariance))
+
+
+def posterior(
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, number: int, believed: BoolArray, share: float,
+    several: BoolArray,
+) -> Hypotheses:  # fmt: skip
+    """The posterior of t in the exposure of this number as the mixture that fits it.
+
+    Of the usual number of points each round has this ``share``, and so many are to count, but for axes with ``several``
+    modes. Axes that are not ``believed`` are not worth annealing.
+    """
+    fit, effective = importance_corrected(view, prior, proposal, share, np.where(several, _ENOUGH, share * _ENOUGH))
+    few = np.flatnonzero(believed & ~(effective >= share * _ENOUGH))
+    if not len(few):
+        return fit
+    rows = view.reduced.end_rows
+    points = (
+        annealed(view.part(few[k : k + 1]), prior.part(few[k : k + 1]), _ANNEALED, (number, int(view.axes[few[k]])))
+        for k in range(len(few))
+    )
+    return fit.replaced(few, stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points]))
+
+
+def importance_corrected(
+    view: PixelView, prior: Hypotheses, proposal: Hypotheses, share: float, enough: FloatArray
+) -> tuple[Hypotheses, FloatArray]:
+    """The mixture that fits weighted points, and how many of them count, (axes,): ``enough``, if so many do."""
+    n = view.reduced.size
+    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
+    if (line := view.line) is not None:
+        numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]
+        fit = Hypotheses(
+            *(np.array(each, order="C") for each in (proposal.log_weight, proposal.mean, proposal.covariance))
+        )
+        effective = np.empty(len(prior.mean))
+        compiled_mixtures.importance_corrected(
+            line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
+            np.stack([e for _, e in numbers]), enough, _LEAST_EFFECTIVE, _HALVINGS, n * _PRIOR_POINTS,
+            n * _LAST_PRIOR_POINTS, _LOOSENED, _NEGLIGIBLE, effective,
+        )  # fmt: skip
+        return fit, effective
+    proposal, proposals = proposal.ordered(), list[Hypotheses]()
+    t = np.zeros((len(prior.mean), 0, n))
+    target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
+    fit, going_on = proposal, np.ones(len(t), dtype=bool)
+    for k in range(_ROUNDS):
+        new = _drawn(proposal, points, k)
+        proposals.append(proposal)
+        t = np.concatenate([t, new], axis=1)
+        target = np.concatenate([target, with_noise(prior, new) + view.log_likelihoods(new)], axis=1)
+        log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
+        log_weight -= log_sum(log_weight, axis=1)[:, None]
+        effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
+        tempered = _tempered(log_weight, _LEAST_EFFECTIVE)
+        loosened = replace(proposal, covariance=proposal.covariance * (_LOOSENED if k else 1.0))
+        fit = _where(going_on, _refitted(proposal, t, tempered, loosened, n * _LAST_PRIOR_POINTS), fit)
+        going_on &= effective < enough
+        if not going_on.any():
+            break
+        proposal = _refitted(proposal, t, tempered, proposal, n * _PRIOR_POINTS)
+    return fit, effective
+
+
+def _where(which: NDArray[np.bool_], first: Hypotheses, second: Hypotheses) -> Hypotheses:
+    """The first in these axes, the second in the others."""
+    return Hypotheses(
+        np.where(which[:, None], first.log_weight, second.log_weight),
+        np.where(which[:, None, None], first.mean, second.mean),
+        np.where(which[:, None, None, None], first.covariance, second.covariance),
+    )
+
+
+def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
+    """Weights raised to the largest power up to one at which so many points, or half of all, count."""
+    least = min(least, log_weight.shape[1] / 2)
+    low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
+    power = high
+    for _ in range(_HALVINGS):
+        w = power[:, None] * log_weight
+        enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
+        low, high = np.where(enough, power, low), np.where(enough, high, power)
+        power = (low + high) / 2
+        power = np.where(low == 1, 1.0, power)
+    w = np.where(low == 1, 1.0, low)[:, None] * log_weight
+    return w - log_sum(w, axis=1)[:, None]
+
+
+def _drawn(proposal: Hypotheses, count: int, number: int) -> FloatArray:
+    """Points of a mixture, (axes, count, n); those of each round have a number."""
+    axes, _, n = proposal.mean.shape
+    u, e = _quasi_random(count, n, number)
+    total = np.cumsum(np.exp(proposal.log_weight), axis=1)
+    component = np.minimum((total[:, None] < u[:, None] * total[:, -1:, None]).sum(axis=2), total.shape[1] - 1)
+    rows = np.arange(axes)[:, None]
+    root = cholesky(proposal.covariance)[rows, component]
+    return np.asarray(proposal.mean[rows, component] + np.add.reduce(root * e[:, None], axis=-1))
+
+
+@lru_cache(maxsize=32)
+def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArray]:
+    """Sobol's points, shifted: one uniform number and n normal ones for each, (count,) and (count, n)."""
+    from scipy.stats import qmc  # a third of what it takes to start, for this alone
+
+    points = qmc.Sobol(n + 1, scramble=False).random(count)
+    points = (points + np.random.default_rng(number).random(n + 1)) % 1.0
+    return points[:, 0], np.asarray(special.ndtri(np.clip(points[:, 1:], 1e-12, 1 - 1e-12)))
+
+
+def _refitted(
+    mixture: Hypotheses, points: FloatArray, log_weight: FloatArray, beside: Hypotheses, prior_points: float
+) -> Hypotheses:
+    """One step of expectation and maximisation with weighted points, and the covariances of ``beside`` as some more."""
+    logs = mixture.component_log_densities(points)
+    share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
+    mass = np.add.reduce(share, axis=2)
+    effective = mass**2 / np.maximum(np.add.reduce(share * share, axis=2), 1e-300)
+    safe = np.maximum(mass, 1e-300)[..., None]
+    mean = batched.long_matmul(share, points) / safe
+    mean = np.where(mass[..., None] > 1e-9, mean, mixture.mean)
+    away = points[:, None] - mean[:, :, None]
+    spread = batched.long_matmul(batched.transpose(away * share[..., None]), away) / safe[..., None]
+    trust = (effective / (effective + prior_points))[..., None, None]
+    covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
+    mass = np.where(mass > _NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
+    with np.errstate(divide="ignore"):
+        return Hypotheses(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

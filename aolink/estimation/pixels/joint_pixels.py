@@ -1,0 +1,241 @@
+"""The pixels of all spots of one large plant: one mode of the joint posterior, by Levenberg and Marquardt's method.
+
+As `aolink.estimation.pixels.modes`, but for hundreds of coefficients and in information form: the objective is
+(t - m)' P^-1 (t - m) / 2 minus the pixels' log-likelihood, Fisher's information in the place of the Hessian. At the
+mode its inverse is the covariance.
+
+It starts from where the prior has it, and from nowhere else. A spot by itself does not tell its path from its
+reversal; spots that one membrane moves do, once the states are known a little: on the rig membrane-12x12 paths run
+backwards or mirrored and backwards were worse by 200 and more (in log posterior) in every exposure but the first, and a
+start from the truth found nothing better in nine of ten. Where the prior leaves paths uncertain by more than two fifths
+of what a spot is wide there are many modes, and one of them says little: there, as in the first exposures of a
+recording, windowed moments of all spots (`JointMoments`) are taken instead, whose covariance says what they cannot
+tell apart.
+
+36 actuators before 16 lenslets are few enough for the dense `profile` with all its starts: path RMSE 0.090 there, 0.088
+here, 3 s and 20 ms a frame. The covariance at a mode is a little small: NEES of the start state 330 for 288 states, of
+the end state 285, and no better with more coefficients or nodes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.kalman import information
+from aolink.estimation.kalman.observation import Belief, Correction
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.factored import FactoredModel
+from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
+from aolink.estimation.moments.joint_moments import JointMoments, by_spot
+from aolink.estimation.moments.spots import SpotWindows
+from aolink.estimation.pixels.likelihood import _masses, mehler_series
+from aolink.numerics import single_thread
+from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+_PASSES = 12
+_FIRST_DAMPING = 0.01
+_LARGEST_DAMPING = 1e6
+_FREE_DAMPING = 0.1
+# The objective, which is of hundreds of coefficients, changes by less than this at a mode.
+_CONVERGED = 0.3
+# Rms of a path's prior, in standard deviations of the kernel, up to which there is one mode that matters.
+_LARGEST_SPREAD = 0.4
+# Relative to the information of a spot: one without pixels has none.
+_NO_LIGHT = 1e-9
+
+
+class JointPixels:
+    """What the pixels of one frame say of the coefficients of all spots together.
+
+    Parameters
+    ----------
+    density, mask, light:
+        Of one copy of the plant: (spots, rows, columns) twice, and (spots,) or None, as of `SpotWindows`.
+    """
+
+    def __init__(
+        self, sensor: SpotSensor, paths: JointPaths, density: FloatArray, mask: NDArray[np.bool_],
+        light: FloatArray | None,
+    ) -> None:  # fmt: skip
+        self.paths, self._edges, self._area = paths, sensor.profile.edges, sensor.pixel_size
+        self.y, self.mask = (np.ascontiguousarray(each.reshape(len(each), -1)) for each in (density, mask))
+        share = 1.0 if light is None else light
+        spots = np.ones(len(density))
+        self._read, self._gain = (
+            effective_noise_density(sensor) / self._area / share**2 * spots,
+            shot_gain(sensor) / share * spots,
+        )
+        self._kernel = sensor.kernel.covariance + paths.widening * np.eye(2)
+        self._terms = mehler_series(self._kernel)
+
+    @property
+    def kernel_variance(self) -> float:
+        """Of the narrowest direction, slope units squared."""
+        return float(np.linalg.eigvalsh(self._kernel)[0])
+
+    def at(self, t: FloatArray) -> Linearised:
+        """All that is known of the neighbourhood of a point."""
+        path, highest = self.paths.positions(t), len(self._terms)
+        X, Y = (np.stack(_masses(self._kernel[d, d], self._edges, path[:, d], highest)) for d in (0, 1))
+        # A displacement is one more course.
+        courses = np.column_stack([self.paths.functions, np.ones(len(self.paths.weights))])
+        spots, m = len(path), courses.shape[1]
+        log_likelihood, score = np.empty(spots), np.empty((spots, 2 * m))
+        told = np.empty((spots, 2 * m, 2 * m))
+        compiled_loops().looked_at(
+            X, Y, np.array(self._terms), self.paths.weights, courses, self._area, self.y, self.mask, self._read,
+            self._gain, log_likelihood, score, told,
+        )  # fmt: skip
+        score, told = score.reshape(spots, 2, m), told.reshape(spots, 2, m, 2, m)
+        return Linearised(
+            log_likelihood=float(log_likelihood.sum()),
+            score=score[..., :-1],
+            information=np.ascontiguousarray(told[:, :, :-1, :, :-1]),
+            displaced=told[:, :, :-1, :, -1],
+            of_displacement=told[:, :, -1, :, -1],
+            displacement_score=score[..., -1],
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Linearised:
+    """Pixels about a point, by the courses' shares of each spot's path (2, m) and by its displacement (2)."""
+
+    log_likelihood: float
+    score: FloatArray
+    """(spots, 2, m)"""
+    information: FloatArray
+    """(spots, 2, m, 2, m)"""
+    displaced: FloatArray
+    """(spots, 2, m, 2)"""
+    of_displacement: FloatArray
+    """(spots, 2, 2)"""
+    displacement_score: FloatArray
+    """(spots, 2)"""
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """Where the posterior is largest."""
+
+    t: FloatArray
+    """(size,)"""
+    precision: FloatArray
+    """(size, size)"""
+    objective: float
+    """-log p(t, y) up to a constant."""
+    passes: int
+    """How often the pixels were linearised on the way."""
+    at: Linearised
+
+
+def find_mode(
+    view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray, passes: int = _PASSES
+) -> Mode:
+    """Where a start leads, for a prior with this mean and information."""
+    paths, damping = view.paths, _FIRST_DAMPING
+
+    def pulled(t: FloatArray, log_likelihood: float) -> tuple[FloatArray, float]:
+        """By the prior, and the objective."""
+        pull = single_thread.matvec(precision, t - mean)
+        return pull, 0.5 * float((t - mean) @ pull) - log_likelihood
+
+    t, at, used = start, view.at(start), 1
+    pull, now = pulled(t, at.log_likelihood)
+    H = precision + paths.information(at.information)
+    while used < passes:
+        g = paths.score(at.score) - pull
+        damped = H.copy()
+        np.fill_diagonal(damped, np.diagonal(H) * (1 + damping))
+        step = information.solve(damped, g)
+        free = damping <= _FREE_DAMPING
+        # What a step would gain says when it is at a mode, before the pixels are looked at again.
+        if free and 0.5 * step @ g < _CONVERGED:
+            break
+        there = view.at(t + step)
+        used += 1
+        pull_there, value = pulled(t + step, there.log_likelihood)
+        if value < now:
+            gain, now, t, at, pull = now - value, value, t + step, there, pull_there
+            H, damping = precision + paths.information(at.information), damping / 8
+            if free and gain < _CONVERGED:
+                break
+        else:
+            damping = max(damping, 1e-3) * 8
+            if damping > _LARGEST_DAMPING:
+                break
+    return Mode(t, H, now, used, at)
+
+
+class JointProfile:
+    """The estimator `profile` of a plant with hundreds of states, as an observation of `BlurFilter`.
+
+    Its innovation is what the pixels, linearised at the mode, tell of each spot's displacement beyond the prediction:
+    one number for each output, chi-square together if all is well.
+    """
+
+    models_noise = True
+
+    def __init__(self, sensor: SpotSensor, n_outputs: int) -> None:
+        self.sensor, self.n_measurements = sensor, n_outputs
+        self._moments = JointMoments(sensor, n_outputs)
+
+    @single_thread.by_one_thread
+    def correct(
+        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
+    ) -> Correction:
+        """The mode of the posterior, copy by copy of the plant."""
+        assert isinstance(model, FactoredModel)
+        paths, n = joint_paths(model, self.sensor), model.plant.n_states
+        mean, covariance = prior.mean.copy(), prior.covariance.copy()
+        found = []
+        for axis in range(len(mean)):
+            light = None if measured.light is None else measured.light[axis]
+            before, P = prior.mean[axis, : paths.size], prior.covariance[axis, :n, :n]
+            foreseen = paths.foreseen(before, response, axis)
+            view = JointPixels(self.sensor, foreseen, measured.density[axis], measured.mask[axis], light)
+            if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
+                mode = find_mode(view, before, paths.prior_information(P), before)
+                t, after, at = mode.t, information.covariance(mode.precision), mode.at
+            else:
+                t, after, *_ = self._moments.corrected(model, view.paths, Belief(before, P), by_spot(measured, axis))
+                at = view.at(t)
+            mean[axis, : paths.size], covariance[axis, : paths.size, : paths.size] = t, after
+            found.append(innovation(view.paths, before, P, t, at))
+        new, S, nis = (np.stack(each) for each in zip(*found, strict=True))
+        return Correction(Belief(mean, covariance), new, S, nis)
+
+
+def innovation(
+    paths: JointPaths, mean: FloatArray, state_covariance: FloatArray, t: FloatArray, at: Linearised
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Displacement of each spot from its prediction as the pixels tell it, linearised at a point.
+
+    Returns
+    -------
+    (n_outputs,), its variance (n_outputs,), and its NIS.
+    """
+    spots, n = paths.spots, len(state_covariance)
+    told = at.of_displacement
+    most = np.einsum("sdd->s", told).max()
+    told = told + (_NO_LIGHT * most) * np.eye(2)
+    noise = np.linalg.inv(told)
+    # How much each share displaces its spot, (spots, 2, 2, m), and so each coefficient.
+    by_share = noise @ at.displaced.transpose(0, 3, 1, 2).reshape(spots, 2, -1)
+    by_share = by_share.reshape(spots, 2, 2, -1)
+    patterns = paths.patterns.reshape(spots, 1, 2, -1)
+    H = by_share[:, :, 0, paths.course_of] * patterns[:, :, 0] + by_share[:, :, 1, paths.course_of] * patterns[:, :, 1]
+    H = H.reshape(2 * spots, -1)
+    new = (noise @ at.displacement_score[..., None]).ravel() + single_thread.matvec(H, t - mean)
+    S = single_thread.matmul(single_thread.matmul(H[:, :n], state_covariance), H[:, :n].T)
+    S += single_thread.gram(H[:, n:].T)
+    for s in range(spots):
+        S[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += noise[s]
+    S = (S + S.T) / 2
+    return new, np.diagonal(S).copy(), np.asarray(new @ information.solve(S, new))

@@ -1,0 +1,369 @@
+"""The pixels of an exposure as a function of few coefficients, for the estimators that use the blur whole.
+
+A pixel is E[Y | path] = (1/N) sum_k (kernel integrated over it, the spot resting at theta_k) / D, and theta is linear
+in the coefficients z = (x(k0), xi) of the exposure. Of xi only those directions are kept that move the spot by
+something that the kernel does not hide: of the singular vectors of the noise path those whose
+remainder is a tenth of the kernel's standard deviation, rms. What is left out keeps its prior and widens the kernel by
+its variance, which is right to second order. Start states are kept whole.
+
+The path is looked at at few nodes (`aolink.estimation.model.quadrature`).
+"""
+
+from __future__ import annotations
+
+import math
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.model import quadrature
+from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, exposure_model
+from aolink.estimation.model.quadrature import Nodes
+from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
+from aolink.estimation.moments.windowed import Profile, Regression, Windowed, WindowedMoments
+from aolink.numerics import batched
+from aolink.numerics.covariance import psd_root
+from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.sensor import BaseSensor
+
+if TYPE_CHECKING:
+    from aolink.estimation.compiled.line import Line
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+# Rms of the noise path that is left out, in standard deviations of the kernel.
+_LEFT_OUT = 0.1
+# Paths by which the number of nodes is found.
+_PATHS = 64
+# Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
+_SERIES = 1e-6
+_MOST_TERMS = 30
+# Of a pixel's light by the spot's place: points in one standard deviation of the kernel, and where it ends.
+_POINTS = 16
+_REACH = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """Few coefficients t in the place of z: z = (x, V xi'), t = (x, xi')."""
+
+    expand: FloatArray
+    """(n_coefficients, n): z = expand t."""
+    left_out: FloatArray
+    """Covariance of z that t leaves out, (n_coefficients, n_coefficients)."""
+    end_rows: FloatArray
+    """End states of t, (n_states, n)."""
+    end_remainder: FloatArray
+    """Covariance of the end state that t leaves out, (n_states, n_states)."""
+    widening: float
+    """Mean variance of the path that t leaves out, which the kernel is to be widened by."""
+    resolution: quadrature.Resolution
+
+    @property
+    def size(self) -> int:
+        """n"""
+        return int(self.expand.shape[1])
+
+    def prior(self, state: Belief) -> Belief:
+        """Of t, from that of the start state; leading axes as they come."""
+        *lead, states = state.mean.shape
+        mean, covariance = np.zeros((*lead, self.size)), np.zeros((*lead, self.size, self.size))
+        mean[..., :states] = state.mean
+        covariance[...] = np.eye(self.size)
+        covariance[..., :states, :states] = state.covariance
+        return Belief(mean, covariance)
+
+    def end(self, t: Belief) -> Belief:
+        """Of the state at the exposure's end, without what inputs do; leading axes as they come."""
+        spread = batched.congruence(self.end_rows, t.covariance) + self.end_remainder
+        return Belief(batched.matvec(self.end_rows, t.mean), batched.symmetric(spread))
+
+    def coefficients(self, t: Belief) -> Belief:
+        """Of z, from that of t, one for each axis."""
+        spread = batched.congruence(self.expand, t.covariance) + self.left_out
+        return Belief(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
+
+
+def reduction(
+    model: ExposureModel, sensor: BaseSensor, *, left_out: float | None = None, all_steps: bool = False
+) -> Reduction:
+    """The reduction for a sensor, made once.
+
+    Parameters
+    ----------
+    left_out:
+        Rms of the path that may be left out, in standard deviations of the kernel.
+    all_steps:
+        Whether all fast steps are nodes.
+    """
+    return _reduction(model, sensor, _LEFT_OUT if left_out is None else left_out, all_steps)
+
+
+@lru_cache(maxsize=16)
+def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_steps: bool) -> Reduction:
+    n = model.plant.n_states
+    variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
+    noise = model.basis[..., n:]
+    size = noise.shape[2]
+    paths = noise.reshape(noise.shape[0] * noise.shape[1], size) / math.sqrt(model.n_steps)
+    _, values, vectors = np.linalg.svd(paths, full_matrices=False) if size else (0, np.zeros(0), np.zeros((0, 0)))
+    # Each output by itself: a remainder that is spread over many of them is as small on each.
+    rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / model.plant.n_outputs
+    kept = int(np.argmax(rest <= left_out**2 * variance))
+    V = vectors[:kept].T
+    expand = np.zeros((n + size, n + kept))
+    expand[:n, :n], expand[n:, n:] = np.eye(n), V
+    hidden = np.zeros((n + size, n + size))
+    hidden[n:, n:] = np.eye(size) - V @ V.T
+    remainder = model.end_remainder + model.end_rows @ hidden @ model.end_rows.T
+    if all_steps:
+        seen = quadrature.all_steps(model.n_steps)
+    elif model.moved:  # it is the same whenever in a step an exposure starts
+        seen = _reduction(exposure_model(model.plant, model.n_steps), sensor, left_out, all_steps).resolution
+    else:
+        seen = quadrature.resolution(_paths(model, expand), variance, sensor.profile)
+    return Reduction(
+        expand=expand, left_out=hidden, end_rows=model.end_rows @ expand, end_remainder=remainder,
+        widening=float(rest[kept]) + model.unmodelled_rest, resolution=seen,
+    )  # fmt: skip
+
+
+def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
+    """Of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
+    t = np.random.default_rng(0).standard_normal((_PATHS, expand.shape[1]))
+    n = model.plant.n_states
+    t[:, :n] = t[:, :n] @ psd_root(model.plant.initial_covariance).T
+    return np.asarray(np.tensordot(t, model.basis @ expand, axes=(1, 2))).reshape(-1, model.n_steps)
+
+
+class PixelView:
+    """What one frame shows, as a function of the reduced coefficients of each axis.
+
+    Hypotheses of each axis lie along the second dimension of every argument, (axes, hypotheses, ...). ``level`` is that
+    of the reduction's resolution.
+    """
+
+    def __init__(
+        self, sensor: BaseSensor, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows,
+        reduced: Reduction, level: int = 0,
+    ) -> None:  # fmt: skip
+        self.sensor, self.reduced = sensor, reduced
+        line = isinstance(measured, Profile)
+        self._optics = sensor.profile if line else sensor
+        at = quadrature.nodes_of(model, response, reduced.resolution.levels[level])
+        self._basis = at.basis @ reduced.expand
+        self._weights = at.weights
+        self._inputs = at.inputs
+        axes = len(measured.density)
+        self.y = measured.density.reshape(axes, -1)
+        """Densities of all pixels of an axis, (axes, pixels)."""
+        self.mask = measured.mask.reshape(axes, -1)
+        self.axes = np.arange(axes)
+        """Which axes of the plant these are, (axes,)."""
+        self.read_noise = effective_noise_density(self._optics) / self._optics.pixel_size
+        self.gain = shot_gain(self._optics)
+        self._line = line
+        self.compiled = line
+        """Whether compiled code does what it can; its twins in NumPy do all."""
+        self._kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
+        self._measured, self._windowed = measured, _windowed(sensor, line, model.plant.n_outputs)
+
+    def part(self, axes: slice | NDArray[np.intp]) -> PixelView:
+        """Of these axes alone."""
+        view = copy(self)
+        view.y, view.mask, view._inputs = self.y[axes], self.mask[axes], self._inputs[axes]
+        view._measured = replace(self._measured, density=self._measured.density[axes], mask=self._measured.mask[axes])
+        view.axes = self.axes[axes]
+        return view
+
+    @property
+    def outputs(self) -> int:
+        """Of one axis."""
+        return int(self._basis.shape[0])
+
+    @property
+    def whole_nodes(self) -> int:
+        """Nodes inside the exposure's fast steps; two that correct for where it starts and ends come after them."""
+        return len(self._weights) - (2 if self._weights.min() < 0 else 0)
+
+    @property
+    def weights(self) -> FloatArray:
+        """What each node counts, (nodes,)."""
+        return self._weights
+
+    @property
+    def kernel_variance(self) -> float:
+        """Of the narrowest direction, slope units squared."""
+        return float(np.linalg.eigvalsh(self._kernel)[0])
+
+    @property
+    def rows(self) -> FloatArray:
+        """Path at the nodes of the coefficients, (n_outputs * nodes, n)."""
+        return self._basis.reshape(-1, self._basis.shape[2])
+
+    @property
+    def gram(self) -> FloatArray:
+        """Their squares, the mean over the exposure and the sum over outputs, (n, n)."""
+        return np.asarray((self.rows * np.tile(self._weights, self.outputs)[:, None]).T @ self.rows)
+
+    def moments(self, about: Belief) -> tuple[FloatArray, FloatArray, Regression]:
+        """Windowed moments about a belief of t, their noise and regression, as `Windowed.look`; of all axes."""
+        at = Nodes(basis=self._basis, weights=self._weights, inputs=self._inputs)
+        return self._windowed.look(at, about, self._measured)
+
+    def paths(self, t: FloatArray) -> FloatArray:
+        """Outputs at the nodes, (axes, hypotheses, n_outputs, nodes)."""
+        outputs, nodes, size = self._basis.shape
+        rows = self._basis.reshape(-1, size)
+        flat = batched.long_matmul(t, rows.T)
+        return np.asarray(flat.reshape(*t.shape[:2], outputs, nodes) + self._inputs[:, None])
+
+    def predicted(self, t: FloatArray) -> FloatArray:
+        """Densities of the pixels without noise, (axes, hypotheses, pixels)."""
+        path, w = self.paths(t), self._weights
+        edges = self._optics.profile.edges
+        if self._line:
+            (mass,) = _masses(self._kernel[0, 0], edges, path[:, :, 0], 0)
+            return batched.matmul(w[None], mass)[..., 0, :] / self._optics.pixel_size
+        spots, terms = path.shape[2] // 2, self._terms()
+        path = path.reshape(*path.shape[:2], spots, 2, -1)
+        X, Y = (_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
+        light = sum(c * batched.long_matmul(batched.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms))
+        return np.asarray(light).reshape(*t.shape[:2], -1) / self._optics.pixel_size
+
+    def log_likelihoods(self, t: FloatArray) -> FloatArray:
+        """Of many points (axes, points, n), (axes, points)."""
+        line = self.line
+        if line is None:
+            return self.log_likelihood(self.predicted(t))
+        from aolink.estimation.compiled.line import log_likelihoods
+
+        out = np.empty(t.shape[:2])
+        log_likelihoods(line, np.ascontiguousarray(t), out)
+        return out
+
+    @property
+    def line(self) -> Line | None:
+        """What compiled code needs of line sensors."""
+        if not self.compiled:
+            return None
+        from aolink.estimation.compiled.line import Line
+
+        edges, variance = self._optics.profile.edges, float(self._kernel[0, 0])
+        return Line(
+            y=np.ascontiguousarray(self.y), usable=np.ascontiguousarray(self.mask),
+            inputs=np.ascontiguousarray(self._inputs[:, 0]), basis=np.ascontiguousarray(self._basis[0].T),
+            weights=self._weights, table=_light_table(variance, self._optics.pixel_size), low=float(edges[0]),
+            high=float(edges[-1]), pixel=self._optics.pixel_size, per_unit=1 / self._optics.pixel_size,
+            read_noise=self.read_noise, gain=self.gain, kernel_variance=self.sensor.kernel.variance,
+        )  # fmt: skip
+
+    def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The same and their Jacobian, (axes, hypotheses, pixels, n)."""
+        path, w = self.paths(t), self._weights[:, None]
+        edges, D = self._optics.profile.edges, self._optics.pixel_size
+        lead, size = t.shape[:2], t.shape[2]
+        if self._line:
+            mass, slope = _masses(self._kernel[0, 0], edges, path[:, :, 0], 1)
+            f = batched.matmul(self._weights[None], mass)[..., 0, :] / D
+            J = batched.long_matmul(batched.transpose(slope * w), self._basis[0]) / D
+            return f, J
+        spots, terms = path.shape[2] // 2, self._terms()
+        path = path.reshape(*lead, spots, 2, -1)
+        X, Y = (_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms)) for d in (0, 1))
+        along, across = (self._basis.reshape(spots, 2, -1, size)[:, d] for d in (0, 1))
+        light: FloatArray = np.zeros(())
+        slopes: FloatArray = np.zeros(())
+        for j, c in enumerate(terms):
+            left = batched.transpose(Y[j])
+            light = light + c * batched.long_matmul(left, X[j] * w)
+            # d/dt sum_k w Y_r X_c: the columns' derivative times the rows, and the other way round.
+            columns = (X[j + 1] * w)[..., None] * along[:, :, None, :]
+            by_x = batched.long_matmul(left, columns.reshape(*columns.shape[:-2], -1))
+            rows = (Y[j + 1] * w)[..., None] * across[:, :, None, :]
+            by_y = batched.long_matmul(batched.transpose(X[j]), rows.reshape(*rows.shape[:-2], -1))
+            n_rows, n_columns = left.shape[-2], X[j].shape[-1]
+            by_x = by_x.reshape(*lead, spots, n_rows, n_columns, size)
+            by_y = by_y.reshape(*lead, spots, n_columns, n_rows, size).swapaxes(-3, -2)
+            slopes = slopes + c * (by_x + by_y)
+        return light.reshape(*lead, -1) / D, slopes.reshape(*lead, -1, size) / D
+
+    def log_likelihood(self, f: FloatArray) -> FloatArray:
+        """Of the usable pixels where these are expected, up to a constant, (axes, hypotheses)."""
+        R = self._variance(f)
+        e = self.y[:, None] - f
+        terms = e * e / R
+        if self.gain:
+            terms = terms + np.log(R / self.read_noise)
+        return np.asarray(-0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1))
+
+    def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Score and Fisher information of each pixel by what is expected of it, (axes, hypotheses, pixels).
+
+        The variance grows with what is expected (shot noise), which is information of its own.
+        """
+        R = self._variance(f)
+        e = self.y[:, None] - f
+        score, information = e / R, 1 / R
+        if self.gain:
+            grows = np.where(f > 0, self.gain, 0.0)
+            score = score + grows * (e * e / R - 1) / (2 * R)
+            information = information + grows**2 / (2 * R * R)
+        usable = self.mask[:, None]
+        return np.where(usable, score, 0.0), np.where(usable, information, 0.0)
+
+    def _variance(self, f: FloatArray) -> FloatArray:
+        return self.read_noise + self.gain * np.maximum(f, 0.0)
+
+    def _terms(self) -> list[float]:
+        return mehler_series(self._kernel)
+
+
+def mehler_series(kernel: FloatArray) -> list[float]:
+    """c^j / j!, c the kernel's covariance of the two directions, (2, 2), as far as terms matter."""
+    (xx, xy), (_, yy) = kernel
+    rho = abs(xy) / math.sqrt(xx * yy)
+    count = 1 if rho == 0 else min(_MOST_TERMS, math.ceil(math.log(_SERIES) / math.log(rho)))
+    return [xy**j / math.factorial(j) for j in range(count)]
+
+
+@lru_cache(maxsize=16)
+def _windowed(sensor: BaseSensor, line: bool, outputs: int) -> Windowed[Any]:
+    return WindowedMoments(sensor.profile) if line else WindowedSpots(sensor, outputs // 2)  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=16)
+def _light_table(variance: float, pixel: float) -> FloatArray:
+    """Taylor coefficients of the densities of pixels about a spot, by its place in its own, (points, 4, pixels).
+
+    By powers of its distance in pixels.
+    """
+    points = math.ceil(_POINTS * pixel / math.sqrt(variance))
+    half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1
+    places = (np.arange(points) + 0.5) * pixel / points
+    masses = _masses(variance, pixel * np.arange(-half, half + 1.0), places, 3)
+    return np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
+
+
+def _masses(variance: float, edges: FloatArray, positions: FloatArray, highest: int) -> list[FloatArray]:
+    """Share of the light of a Gaussian spot that each pixel gets, and its derivatives by the position.
+
+    (..., nodes) -> (..., nodes, pixels), 0 to ``highest``.
+    """
+    width = math.sqrt(2 * variance)
+    u = (edges - positions[..., None]) / width
+    out = [np.diff(erf(u) / 2, axis=-1)]
+    if highest:
+        bell = np.exp(-u * u) / (math.sqrt(math.pi) * width)
+        before, last = np.zeros_like(u), np.ones_like(u)
+        for n in range(1, highest + 1):
+            out.append(-np.diff(last * bell, axis=-1))
+            before, last = last, 2 * u / width * last - 2 * (n - 1) / width**2 * before
+    return out

@@ -1,0 +1,335 @@
+"""The pixels themselves: the modes of the posterior by Levenberg and Marquardt's method, from several starts.
+
+The objective is -log p(t | pixels) with t whitened by its prior, s = L^-1 (t - m): |s|^2 / 2 minus the pixels'
+log-likelihood, Fisher's information in the place of the Hessian. At a mode its inverse is the covariance, and
+(Laplace) the log-evidence is log p(y | s) - |s|^2 / 2 - log |H| / 2.
+
+It starts where windowed moments have it, and from there along the directions in which they leave the path most
+uncertain: a path and its reversal in time give the same blur. A mode is not Gaussian, where the path moves by more than
+the kernel is wide: so mean and covariance are those of points drawn about the modes (`importance`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.estimation.compiled import modes as compiled_modes
+from aolink.estimation.compiled import moments as compiled_moments
+from aolink.estimation.compiled.line import Line
+from aolink.estimation.kalman.observation import Belief, corrected
+from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
+from aolink.estimation.pixels.filter import Innovation
+from aolink.estimation.pixels.gaussian_mixture import cholesky, lower_inverse
+from aolink.estimation.pixels.likelihood import PixelView
+from aolink.numerics import batched
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_PASSES = 16
+_BROAD_PASSES = 2
+_FIRST_DAMPING = 0.01
+_LARGEST_DAMPING = 1e6
+_FREE_DAMPING = 0.1
+_NO_NOISE = 1e-14
+# The objective changes by less than this at a mode, which is near enough to draw points about it.
+_CONVERGED = 0.03
+# Modes that are nearer to each other than so many standard deviations are one.
+_APART = 0.7
+# Starts lie on both sides along the most uncertain direction of the path; where that is wider than so many variances of
+# the kernel, along so many.
+_WIDE_PATH = 0.5
+_DIRECTIONS = 3
+_START_REACH = 1.3
+# A reversed path is met to so many standard deviations of the kernel, if the prior allows.
+_REVERSED_TO = 0.2
+# Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
+_NEW_DIRECTIONS = 4
+_GATE_PROBABILITY = 1e-9
+# Information of a direction, as a share of the largest, that is rounding.
+_TELLS_NOTHING = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Modes of the posterior, (axes, starts, ...)."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    log_evidence: FloatArray
+    """Laplace's, without the prior weight; minus infinity of a mode that is not there."""
+    distance: FloatArray
+    """|s|^2, squared distance from the prior, (axes, starts)."""
+    objective: FloatArray
+    """-log p(s, y) up to a constant, (axes, starts)."""
+
+    @property
+    def best(self) -> NDArray[np.intp]:
+        """The one of least objective, (axes,)."""
+        return np.asarray(np.argmin(self.objective, axis=1))
+
+
+def find_modes(
+    view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES, converged: float = _CONVERGED
+) -> Modes:
+    """Where each start leads.
+
+    Parameters
+    ----------
+    prior:
+        Of each axis.
+    starts:
+        In whitened coordinates, (axes, starts, n).
+    """
+    axes, count, n = starts.shape
+    if (line := view.line) is not None:
+        return _found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0, passes, converged)
+    if prior.mean.ndim == 2:
+        prior = Belief(
+            np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
+        )
+    rows = view.part(np.repeat(np.arange(axes), count))
+    m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
+    s = starts.reshape(-1, n)
+    at = _at(rows, m, L, s)
+    damping = np.full(len(s), _FIRST_DAMPING)
+    active = np.arange(len(s))
+    for _ in range(passes):
+        if not len(active):
+            break
+        H, g, now = at.H[active], at.g[active], at.objective[active]
+        scale = np.einsum("rii->ri", H)
+        damped = H + (damping[active][:, None] * scale)[..., None] * np.eye(n)
+        step = np.linalg.solve(damped, g[..., None])[..., 0]
+        there = _at(rows.part(active), m[active], L[active], s[active] + step)
+        gain = now - there.objective
+        better = gain > 0
+        took = active[better]
+        s[took] += step[better]
+        for mine, theirs in ((at.H, there.H), (at.g, there.g), (at.objective, there.objective)):
+            mine[took] = theirs[better]
+        before = damping[active]
+        damping[active] = np.where(better, damping[active] / 8, np.maximum(damping[active], 1e-3) * 8)
+        # A short step says nothing where it is the damping that made it short.
+        free = before <= _FREE_DAMPING
+        settled = (free & better & (gain < converged)) | (free & (batched.dot(step, g) < converged))
+        settled |= damping[active] > _LARGEST_DAMPING
+        active = active[~settled]
+    covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(at.H), dtype=np.float64)))
+    _, log_H = np.linalg.slogdet(at.H)
+    evidence = -at.objective - 0.5 * log_H
+    mean = m[:, 0] + batched.matvec(L, s)
+    shape = (axes, count)
+    return Modes(
+        mean.reshape(*shape, n), batched.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
+        batched.dot(s, s).reshape(shape), at.objective.reshape(shape),
+    )  # fmt: skip
+
+
+def _found_compiled(
+    line: Line, prior: Belief, starts: FloatArray, of_axis: NDArray[np.intp], whole: int, reversed_precision: float,
+    passes: int = _PASSES, converged: float = _CONVERGED,
+) -> Modes:  # fmt: skip
+    axes, count, n = starts.shape
+    count += 3 if reversed_precision else 0
+    found = Modes(
+        np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), np.full((axes, count), -np.inf),
+        np.zeros((axes, count)), np.full((axes, count), np.inf),
+    )  # fmt: skip
+    compiled_modes.find_modes(
+        line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
+        of_axis, whole, reversed_precision, passes, _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged,
+        found.mean, found.covariance, found.log_evidence, found.distance, found.objective,
+    )  # fmt: skip
+    return found
+
+
+def modes_of(view: PixelView, prior: Belief, wide: Belief) -> Modes:
+    """The modes of a posterior, looked for from what windowed moments make of the prior.
+
+    Starts lie there and on both sides along the most uncertain direction of the path; where that is wider than so many
+    variances of the kernel, along so many. After them come those that the best mode's reversal and mirror images lead
+    to.
+    """
+    starts, squares = spread_starts(view, prior, wide)
+    many = squares[:, 0] > _WIDE_PATH * view.kernel_variance
+    if (line := view.line) is not None:
+        of_axis = np.where(many, starts.shape[1], 3)
+        return _found_compiled(line, prior, starts, of_axis, view.whole_nodes, _reversed_precision(view))
+    found = find_modes(view, prior, starts[:, :3])
+    if len(some := np.flatnonzero(many)):
+        of_some = Belief(prior.mean[some], prior.covariance[some])
+        found = with_more(found, some, find_modes(view.part(some), of_some, starts[some, 3:]))
+    return with_reversals(view, prior, found)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    H: FloatArray
+    g: FloatArray
+    objective: FloatArray
+
+
+def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
+    """Information, gradient and objective at whitened coordinates, one hypothesis a row."""
+    f, J = rows.linearised(m + batched.matvec(L, s)[:, None])
+    score, information = rows.information(f)
+    J = batched.long_matmul(J[:, 0], L)
+    H = batched.long_matmul(batched.transpose(J) * information, J) + np.eye(s.shape[1])
+    g = batched.matvec(batched.transpose(J), score[:, 0]) - s
+    return _Point(batched.symmetric(H), g, 0.5 * batched.dot(s, s) - rows.log_likelihood(f)[:, 0])
+
+
+def without_repeats(modes: Modes) -> Modes:
+    """The same without modes that an earlier start led to as well, those that are there first."""
+    kept = [getattr(modes, f.name).copy() for f in fields(Modes)]
+    mean, covariance, evidence, distance, objective = kept
+    most = compiled_modes.drop_repeats(mean, covariance, _APART, evidence, distance, objective)
+    return Modes(*(each[:, : max(most, 1)] for each in kept))
+
+
+def broad(view: PixelView, prior: Belief) -> Belief:
+    """What windowed moments make of the prior of t: wide where the blur has several readings."""
+    if (line := view.line) is not None:
+        after = Belief(np.empty_like(prior.mean), np.empty_like(prior.covariance))
+        compiled_moments.broad(
+            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), _BROAD_PASSES, _NO_NOISE,
+            PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
+        )  # fmt: skip
+        return after
+    about = prior
+    for _ in range(_BROAD_PASSES):
+        y, noise, fit = view.moments(about)
+        innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
+        # A window without a pixel that can be used has neither moments nor noise.
+        spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
+        about = corrected(prior, innovation, fit.slope, spread).posterior
+    return about
+
+
+def spread_starts(view: PixelView, prior: Belief, wide: Belief) -> tuple[FloatArray, FloatArray]:
+    """The mean of a wide belief and points on both sides of it along the path's most uncertain directions.
+
+    Returns
+    -------
+    The points, (axes, 1 + 2 directions, n), in coordinates in which the prior is N(0, I): the mean, and a pair for each
+    direction. And the mean square of the path along each direction at one standard deviation, the largest first,
+    (axes, n).
+    """
+    axes, n = wide.mean.shape
+    if view.compiled:
+        starts, squares = np.empty((axes, 1 + 2 * min(_DIRECTIONS, n), n)), np.empty((axes, n))
+        compiled_modes.spread_starts(
+            *(np.ascontiguousarray(each) for each in (prior.mean, prior.covariance, wide.mean, wide.covariance)),
+            view.gram, _START_REACH, starts, squares,
+        )  # fmt: skip
+        return starts, squares
+    L = cholesky(wide.covariance)
+    values, V = np.linalg.eigh(batched.symmetric(batched.matmul(batched.transpose(L), batched.matmul(view.gram, L))))
+    V = batched.transpose(V[:, :, ::-1])
+    along = batched.matmul(V[:, :_DIRECTIONS], batched.transpose(L)) * _START_REACH
+    mean = wide.mean[:, None]
+    pairs = np.stack([mean + along, mean - along], axis=2).reshape(axes, -1, n)
+    return whitened(prior, np.concatenate([mean, pairs], axis=1)), values[:, ::-1]
+
+
+def _reversed_precision(view: PixelView) -> float:
+    return 1 / (_REVERSED_TO**2 * view.kernel_variance)
+
+
+def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> FloatArray:
+    """Whitened coordinates of paths that blur like those of points (axes, k, n), (axes, 3 k, n).
+
+    Run backwards, which gives the same blur; mirrored about their mean, which gives the same where the blur is
+    symmetric, as that of a vibration is; and both.
+    """
+    L, m = cholesky(prior.covariance), prior.mean
+    nodes, outputs = view.whole_nodes, view.outputs
+    rows = view.rows.reshape(outputs, -1, view.reduced.size)[:, :nodes].reshape(outputs * nodes, -1)
+    weights = view.weights[:nodes] / view.weights[:nodes].sum()
+    precision = np.tile(weights, outputs) * _reversed_precision(view)
+    B = batched.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
+    path = view.paths(points)[..., :nodes]
+    mirrored = 2 * (path @ weights)[..., None] - path
+    like = np.concatenate([path[..., ::-1], mirrored, mirrored[..., ::-1]], axis=1)
+    back = like.reshape(len(like), -1, outputs * nodes)
+    away = back - view.paths(m[:, None])[..., :nodes].reshape(-1, 1, outputs * nodes)
+    weighted = B * precision[:, None]
+    H = batched.matmul(batched.transpose(weighted), B) + np.eye(B.shape[-1])
+    right = batched.matmul(away, weighted)
+    return np.asarray(np.linalg.solve(H, batched.transpose(right)).swapaxes(-1, -2))
+
+
+def with_reversals(view: PixelView, prior: Belief, modes: Modes) -> Modes:
+    """The same modes, and those that the reversal of the best one and its mirror images lead to."""
+    back = reversed_starts(view, prior, modes.mean[np.arange(len(modes.mean)), modes.best][:, None])
+    more = find_modes(view, prior, back)
+    return with_more(modes, slice(None), more)
+
+
+def with_more(modes: Modes, axes: slice | NDArray[np.intp], more: Modes) -> Modes:
+    """The same modes, and after them those that more starts of some axes led to."""
+    nothing = {"mean": 0.0, "covariance": 0.0, "log_evidence": -np.inf, "distance": 0.0, "objective": np.inf}
+
+    def both(name: str) -> FloatArray:
+        old, new = getattr(modes, name), getattr(more, name)
+        spread = np.full((len(old), *new.shape[1:]), nothing[name])
+        spread[axes] = new
+        return np.concatenate([old, spread], axis=1)
+
+    return Modes(*(both(f.name) for f in fields(Modes)))
+
+
+def whitened(prior: Belief, points: FloatArray) -> FloatArray:
+    """Points (axes, k, n) in coordinates in which the prior is N(0, I)."""
+    inverse = lower_inverse(cholesky(prior.covariance))
+    return batched.matmul(points - prior.mean[:, None], batched.transpose(inverse))
+
+
+def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
+    """Innovation of the pixels linearised at the best mode, in units of their noise.
+
+    With A = R^(-1/2) J L = U S V', the pixels' innovation has variance 1 + S^2 along U's columns, and 1 elsewhere.
+    """
+    rows = np.arange(len(modes.mean)), modes.best
+    t, distance = modes.mean[rows], modes.distance[rows]
+    axes, n = t.shape
+    k = min(_NEW_DIRECTIONS * view.outputs, n)
+    if (line := view.line) is not None:
+        u, values, nis, square = np.empty((axes, k)), np.empty((axes, k)), np.empty(axes), np.empty(axes)
+        compiled_modes.innovations(
+            line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t, _TELLS_NOTHING, u,
+            values, nis, square,
+        )  # fmt: skip
+    else:
+        u, values, nis, square = _innovations(view, prior, t, k)
+    # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
+    total = square + distance
+    degrees = np.add.reduce(view.mask, axis=1) + n
+    believed = total <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
+    covariance = (1 + values)[..., None] * np.eye(k)
+    return Innovation(u, covariance, nis, believed & np.isfinite(nis))
+
+
+def _innovations(
+    view: PixelView, prior: Belief, t: FloatArray, k: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
+    L, s = cholesky(prior.covariance), whitened(prior, t[:, None])[:, 0]
+    f, J = view.linearised(t[:, None])
+    score, information = (each[:, 0] for each in view.information(f))
+    root = np.sqrt(information)
+    A = batched.matmul(J[:, 0] * root[..., None], L)
+    e = score / np.where(root > 0, root, 1.0)
+    values, V = np.linalg.eigh(batched.matmul(batched.transpose(A), A))
+    values, V = np.maximum(values[:, ::-1][:, :k], 0.0), V[:, :, ::-1][:, :, :k]
+    S = np.sqrt(values)
+    # Nothing is new in a direction in which the pixels do not tell anything.
+    tells = values > _TELLS_NOTHING * values[:, :1]
+    pull = batched.matvec(batched.transpose(batched.matmul(A, V)), e)
+    u = np.where(tells, pull / np.where(tells, S, 1.0), 0.0) + S * batched.matvec(batched.transpose(V), s)
+    return u, values, np.add.reduce(u * u / (1 + values), axis=1), batched.dot(e, e)

@@ -1,0 +1,69 @@
+"""The posterior by sampling (`tempering`): offline and slow; the limit for all other estimators.
+
+All fast steps are looked at, and less of the path is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.model.exposure_model import ExposureModel
+from aolink.estimation.pixels.filter import Update
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, stacked_axes
+from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
+from aolink.estimation.pixels.modes import innovation
+from aolink.estimation.pixels.tempering import annealed, fitted
+from aolink.estimation.pixels.updates import explored, has_several
+from aolink.numerics import batched
+from aolink.optics.sensor import BaseSensor
+
+FloatArray = NDArray[np.float64]
+
+# Rms of the path that is left out, in standard deviations of the kernel.
+_LEFT_OUT = 0.05
+_COMPONENTS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class SampledUpdates:
+    """Particles of one axis after another; a mixture of Gaussians is fitted to their end states."""
+
+    particles: int = 3000
+    seed: int = 0
+
+    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
+        """The coefficients that it works with."""
+        return reduction(model, sensor, left_out=_LEFT_OUT, all_steps=True)
+
+    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+        """The posterior of axes with a prior of their start states."""
+        t = self.sample(view, prior, number)
+        reduced, before = view.reduced, view.reduced.prior(prior.belief)
+        mean = t.mean(axis=1)
+        away = t - mean[:, None]
+        after = Belief(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
+        modes, _ = explored(view, prior)
+        new = innovation(view, before, modes)
+        fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
+        end = reduced.end(Belief(fit.mean, fit.covariance))
+        return Update(after, Hypotheses(fit.log_weight, end.mean, end.covariance), new, has_several(modes))
+
+    def sample(self, view: PixelView, prior: Hypotheses, number: int) -> FloatArray:
+        """Equally likely particles of the posterior, (axes, particles, n).
+
+        Parameters
+        ----------
+        prior:
+            Of the start state; the noise coefficients have N(0, I).
+        number:
+            Of the exposure: with the seed and the axis it makes the random numbers.
+        """
+        each = [np.array([axis]) for axis in range(len(prior.mean))]
+        keys = [(self.seed, number, int(axis)) for axis in view.axes]
+        return np.stack(
+            [annealed(view.part(a), prior.part(a), self.particles, key) for a, key in zip(each, keys, strict=True)]
+        )

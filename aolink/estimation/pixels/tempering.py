@@ -1,0 +1,155 @@
+"""Points of a posterior that no Gaussians describe: tempered sequential Monte Carlo.
+
+Particles are drawn from the prior, and the pixels' likelihood is let in by and by, raised to a power that grows from
+zero to one: each time so far that the effective sample size falls to one half. Particles are then drawn anew by their
+weights and moved by Metropolis' rule: differences of two others (ter Braak's differential evolution), which go from
+mode to mode, and random walks of the particles' own covariance.
+
+Del Moral, Doucet, Jasra, Sequential Monte Carlo samplers, J. R. Stat. Soc. B 68 (2006), section 3.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, log_sum, with_noise
+from aolink.estimation.pixels.likelihood import PixelView
+
+FloatArray = NDArray[np.float64]
+
+_MOVES = 16
+_EFFECTIVE = 0.5
+_EM_PASSES = 25
+# Part of the covariance of all that a component of the fit has at least.
+_LEAST_SPREAD = 1e-3
+# Every so many moves a difference is taken whole, which leads from one mode to another.
+_WHOLE = 4
+
+
+def annealed(view: PixelView, prior: Hypotheses, count: int, key: tuple[int, ...]) -> FloatArray:
+    """Equally likely points of the posterior of one axis, (count, n).
+
+    Parameters
+    ----------
+    prior:
+        Of the start state; the noise coefficients have N(0, I).
+    key:
+        The same one gives the same points.
+    """
+    rng, n = np.random.default_rng(key), view.reduced.size
+    t = _drawn(prior, rng, count, n)
+    log_prior, log_light = _log_prior(prior, t), _log_likelihood(view, t)
+    power = 0.0
+    while power < 1.0:
+        power, before = _next_power(log_light, power), power
+        chosen = _resampled(np.exp((power - before) * (log_light - log_light.max())), rng)
+        t, log_prior, log_light = t[chosen], log_prior[chosen], log_light[chosen]
+        root = cholesky(np.cov(t, rowvar=False).reshape(n, n))
+        size = 1.0
+        for move in range(_MOVES):
+            if move % 2:
+                step = 2.38 / math.sqrt(n) * size * rng.standard_normal((count, n)) @ root.T
+            else:
+                first, second = rng.integers(0, count, (2, count))
+                length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * size
+                step = length * (t[first] - t[second]) + 0.01 * rng.standard_normal((count, n)) @ root.T
+            there = t + step
+            its_prior, its_light = _log_prior(prior, there), _log_likelihood(view, there)
+            gain = its_prior - log_prior + power * (its_light - log_light)
+            taken = np.log(rng.random(count)) < gain
+            t[taken], log_prior[taken], log_light[taken] = there[taken], its_prior[taken], its_light[taken]
+            if move % _WHOLE:
+                # Towards a quarter of the moves taken.
+                size *= math.exp(taken.mean() - 0.25)
+    return t
+
+
+def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> Hypotheses:
+    """A mixture of Gaussians for equally likely points of one axis, by expectation and maximisation.
+
+    Parameters
+    ----------
+    points:
+        (points, n)
+    rows:
+        It is their projections whose density is fitted, (k, n): few numbers, of which so many points say much.
+
+    Returns
+    -------
+    Of the points themselves, one axis; its mean is theirs, and its covariance to a thousandth.
+    """
+    rng, seen = np.random.default_rng(seed), points @ rows.T
+    k = seen.shape[1]
+    white = np.linalg.solve(cholesky(np.cov(seen, rowvar=False).reshape(k, k)), (seen - seen.mean(axis=0)).T).T
+    centres = _spread_centres(white, components, rng)
+    share = np.eye(components)[np.argmin(((white[:, None] - white[centres]) ** 2).sum(axis=2), axis=1)]
+    for _ in range(_EM_PASSES):
+        logs = _with_shares(seen, share).component_log_densities(seen[None])[0]
+        share = np.exp(logs - log_sum(logs, axis=0)).T
+    return _with_shares(points, share)
+
+
+def _with_shares(points: FloatArray, share: FloatArray) -> Hypotheses:
+    """Components with these shares of points, (points, components)."""
+    mass = share.sum(axis=0) + 1e-300
+    mean = (share.T @ points) / mass[:, None]
+    away = points[:, None] - mean
+    spread = np.einsum("kc,kci,kcj->cij", share, away, away, optimize=True) / mass[:, None, None]
+    spread += _LEAST_SPREAD * np.cov(points, rowvar=False)
+    with np.errstate(divide="ignore"):
+        return Hypotheses(np.log(mass / len(points))[None], mean[None], spread[None])
+
+
+def _spread_centres(white: FloatArray, count: int, rng: np.random.Generator) -> list[int]:
+    """Points far from each other (k-means++)."""
+    chosen = [int(rng.integers(len(white)))]
+    distance = np.full(len(white), np.inf)
+    while len(chosen) < count:
+        distance = np.minimum(distance, ((white - white[chosen[-1]]) ** 2).sum(axis=1))
+        total = distance.sum()
+        weights = distance / total if total > 0 else np.full(len(white), 1 / len(white))
+        chosen.append(int(rng.choice(len(white), p=weights)))
+    return chosen
+
+
+def _drawn(prior: Hypotheses, rng: np.random.Generator, count: int, n: int) -> FloatArray:
+    """Points of the prior: start states of the mixture of one axis, standard normal numbers after them."""
+    weights, states = np.exp(prior.log_weight[0]), prior.mean.shape[2]
+    component = rng.choice(len(weights), size=count, p=weights / weights.sum())
+    t = rng.standard_normal((count, n))
+    root = cholesky(prior.covariance[0])
+    t[:, :states] = prior.mean[0, component] + (root[component] @ t[:, :states, None])[..., 0]
+    return t
+
+
+def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
+    return np.asarray(with_noise(prior, t[None])[0])
+
+
+def _log_likelihood(view: PixelView, t: FloatArray) -> FloatArray:
+    return np.asarray(view.log_likelihoods(t[None])[0])
+
+
+def _next_power(log_light: FloatArray, power: float) -> float:
+    """The largest one up to 1 that leaves the effective sample size that is wanted."""
+    away = log_light - log_light.max()
+
+    def excess(more: float) -> float:
+        w = np.exp(more * away)
+        return float(w.sum() ** 2 / (w @ w) / len(w)) - _EFFECTIVE
+
+    if excess(1.0 - power) >= 0:
+        return 1.0
+    return power + float(optimize.brentq(excess, 0.0, 1.0 - power, xtol=1e-300, rtol=1e-6))
+
+
+def _resampled(weights: FloatArray, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Systematic resampling."""
+    count = len(weights)
+    places = (rng.random() + np.arange(count)) / count
+    total = np.cumsum(weights)
+    return np.minimum(np.searchsorted(total / total[-1], places), count - 1)

@@ -1,0 +1,111 @@
+"""The posterior of the pixels as Gaussians: few of them are carried from exposure to exposure.
+
+Modes are not Gaussian: the blur fixes how much a path moves and leaves open which way, and such a posterior is
+bent. So the modes, and the wide Gaussians of windowed moments about them, are where points are drawn from only;
+what counts is the points' weights (`aolink.estimation.pixels.importance`).
+
+A mode that was lost is found again: a thousandth of the prior is what the plant would be without a camera. It is
+searched where the best mode is further from the rest than chance brings it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.model.exposure_model import ExposureModel
+from aolink.estimation.pixels.filter import Update
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, log_sum, single
+from aolink.estimation.pixels.importance import posterior, proposed
+from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
+from aolink.estimation.pixels.modes import Modes, broad, innovation, modes_of, without_repeats
+from aolink.optics.sensor import BaseSensor
+
+FloatArray = NDArray[np.float64]
+
+# Of the prior is what the plant would be without a camera; and how rarely chance makes it looked at.
+_DOUBT = 1e-3
+_DOUBTED = 1e-3
+# A second mode is one if the posterior gives it this much. Of a tenth of it are many points worth the while, for modes'
+# own evidence is rough.
+_LEAST_SHARE = 0.05
+_LEAST_DOUBTED_SHARE = 0.005
+
+
+@dataclass(frozen=True)
+class PixelUpdates:
+    """A mixture in, a mixture out."""
+
+    carried: int
+    """Gaussians from exposure to exposure, at most."""
+    free: float
+    """Fewer, where mergers lose less than this, in nats."""
+    share: float
+    """Of the usual number of points; and of those that are to count, where there is one mode."""
+
+    def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
+        """The coefficients that it works with."""
+        return reduction(model, sensor)
+
+    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+        """The posterior of axes with a prior of their start states."""
+        reduced = view.reduced
+        modes, proposal = explored(view, prior)
+        new = innovation(view, reduced.prior(prior.belief), modes)
+        doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
+        if len(doubted):
+            _, more = explored(view.part(doubted), single(Belief(unseen.mean[doubted], unseen.covariance[doubted])))
+            proposal = proposal.replaced(doubted, joined(proposal.part(doubted), more))
+        rest = Hypotheses(prior.log_weight + math.log1p(-_DOUBT), prior.mean, prior.covariance)
+        wide = Hypotheses(
+            np.full((len(unseen.mean), 1), math.log(_DOUBT)), unseen.mean[:, None], unseen.covariance[:, None]
+        )
+        several = has_several(modes, _LEAST_DOUBTED_SHARE)
+        after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
+        carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
+        return Update(after.belief, carried, new, has_several(modes))
+
+
+PROFILE = PixelUpdates(carried=3, free=0.1, share=0.25)
+MIXTURE = PixelUpdates(carried=6, free=1e-3, share=1.0)
+
+
+def has_several(modes: Modes, least: float = _LEAST_SHARE) -> NDArray[np.bool_]:
+    """Whether there is a second mode that the posterior gives so much, (axes,)."""
+    share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
+    return np.asarray((share > least).sum(axis=1) > 1)
+
+
+def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
+    """The modes that each component of a prior of the start state leads to, and a mixture to draw points from.
+
+    The modes' log-evidence has the weights of the components in it.
+    """
+    before = view.reduced.prior(Belief(prior.mean, prior.covariance))
+    axes, count, _ = before.mean.shape
+    there = np.nonzero(np.isfinite(prior.log_weight))
+    rows, each = view.part(there[0]), Belief(before.mean[there], before.covariance[there])
+    wide = broad(rows, each)
+    found = modes_of(rows, each, wide)
+    of_each = found.mean.shape[1]
+    found = replace(found, log_evidence=found.log_evidence + prior.log_weight[there][:, None])
+
+    def placed(values: FloatArray, empty: float) -> FloatArray:
+        out = np.full((axes, count, *values.shape[1:]), empty)
+        out[there] = values
+        return out.reshape(axes, count * of_each, *values.shape[2:])
+
+    modes = without_repeats(
+        Modes(
+            placed(found.mean, 0.0), placed(found.covariance, 0.0), placed(found.log_evidence, -math.inf),
+            placed(found.distance, 0.0), placed(found.objective, math.inf),
+        )
+    )  # fmt: skip
+    flat = Belief(np.zeros_like(before.mean), np.zeros_like(before.covariance))
+    flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
+    return modes, proposed(modes.log_evidence, Belief(modes.mean, modes.covariance), prior.log_weight, flat)

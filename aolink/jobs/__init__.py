@@ -1,0 +1,1 @@
+"""Whole jobs that commands do: the demo, a calibration, many recordings at once."""

@@ -1,0 +1,403 @@
+"""Many recordings, many models: each recording is estimated again with each, and what came of it is one table."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import itertools
+import json
+import re
+import time
+import tomllib
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from aolink.errors import AolinkError, RecordingError, RigError
+from aolink.estimation import Engine, Scorer
+from aolink.files import remove_unfinished, writing
+from aolink.numerics.workers import processes
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import check_has_exposures, fill_reestimated, recorded_estimates
+from aolink.rig import parse_rig
+from aolink.rig.toml_table import did_you_mean
+
+COLUMNS = (
+    "recording", "model", "estimator", "exposures", "path_rmse", "start_rmse", "end_rmse",
+    "nis", "nis_low", "nis_high", "start_nees", "end_nees", "nees_low", "nees_high", "not_ok", "nothing_measured",
+    "seconds", "output", "damage", "error",
+)  # fmt: skip
+"""Of the table: one row for each recording, model and estimator; what is not known is empty."""
+_IN_EVERY_ROW = {"recording", "model", "estimator", "exposures", "output"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """The rig that recordings are estimated with: their own, or another, with some values changed."""
+
+    name: str = ""
+    """The other rig's name and what was changed; empty for the recording's own."""
+    rig_text: str | None = None
+    """Instead of the rig file in the recording."""
+    changes: tuple[tuple[str, Any], ...] = ()
+    """Dotted keys of the rig file, with their new values."""
+
+    def text_for(self, recorded: str) -> str:
+        """The rig file to use for a recording that was made with ``recorded``. Raises RigError for a key it lacks."""
+        text = recorded if self.rig_text is None else self.rig_text
+        for key, value in self.changes:
+            text = _with_value(text, key, value)
+        return text
+
+    def applied_to(self, recording: Recording) -> Recording:
+        """The same recording to be estimated with this model. Raises RigError where that cannot be."""
+        text = self.text_for(recording.rig.toml)
+        return recording if text == recording.rig.toml else Recording(recording.path, rig=parse_rig(text))
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One recording with one model."""
+
+    source: Path
+    model: Model
+    estimators: tuple[str, ...]
+    """Empty: those that the recording has."""
+    output: Path
+    engine: Engine = "aolink"
+    overwrite: bool = False
+    """Do it even if it was done before."""
+    only: bool = False
+    """Leave the estimates of other estimators out of the output."""
+
+    @property
+    def record(self) -> Path:
+        """Where the job writes what came of it, when it is done."""
+        return self.output.with_suffix(".json")
+
+    def digest(self) -> str:
+        """Of everything that the result depends on: a job with the same digest need not be done again."""
+        status = self.source.stat()
+        facts = [
+            str(self.source.resolve()),
+            status.st_size,
+            status.st_mtime_ns,
+            version("aolink"),
+            self.estimators,
+            self.engine,
+            self.only,
+            self.model.rig_text,
+            [[key, str(value)] for key, value in self.model.changes],
+        ]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What came of a job."""
+
+    job: Job
+    rows: list[dict[str, Any]]
+    """By `COLUMNS`."""
+    error: str = ""
+    skipped: bool = False
+    """It had been done before."""
+
+    @property
+    def nothing_measured(self) -> list[str]:
+        """Estimators that could not use a single exposure, with the reason, in words."""
+        whole = [(row["estimator"], row.get("nothing_measured")) for row in self.rows]
+        return [f"{name} has predicted only: {why}" for name, why in whole if why]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is doubtful about the result, in words: what of the recording could not be read or estimated."""
+        damage = self.rows[0].get("damage") if self.rows else ""
+        return [*([str(damage)] if damage else []), *self.nothing_measured]
+
+
+def models(rig_text: str | None, settings: Sequence[str], rig_name: str = "") -> list[Model]:
+    """The models that ``--rig`` and ``--set KEY=VALUE,VALUE`` ask for: every combination of the different values.
+
+    Raises
+    ------
+    RigError
+        A setting is not of that form.
+    """
+    axes: dict[str, list[Any]] = {}
+    for setting in settings:
+        key, equals, values = setting.partition("=")
+        if not equals or not key.strip() or not values.strip():
+            raise RigError(f"--set {setting}: KEY=VALUE or KEY=VALUE,VALUE is needed, as plant.process_noise=0.2,0.4")
+        known = axes.setdefault(key.strip(), [])
+        for value in _values(values, setting):
+            if value not in known:
+                known.append(value)
+    made = []
+    for values_of_one in itertools.product(*axes.values()):
+        changes = tuple(zip(axes, values_of_one, strict=True))
+        name = " ".join([rig_name, *(f"{key}={_short(value)}" for key, value in changes)]).strip()
+        made.append(Model(name=name, rig_text=rig_text, changes=changes))
+    return made
+
+
+def jobs(
+    sources: Sequence[Path],
+    each: Sequence[Model],
+    estimators: Sequence[str],
+    folder: Path,
+    engine: Engine = "aolink",
+    *,
+    only: bool = False,
+    overwrite: bool = False,
+) -> list[Job]:
+    """Every recording with every model; with ``overwrite`` also those that were done before.
+
+    With ``only`` the outputs have no other estimates than the new ones.
+
+    Raises
+    ------
+    RigError
+        Two would write the same file.
+    RecordingError
+        An output would take the place of a recording that is read, or, without ``overwrite``, of a file that no
+        job has written.
+    """
+    made = []
+    for source, model in itertools.product(sources, each):
+        suffix = "".join(c if c.isalnum() or c in "=.-_" else "-" for c in model.name.replace("plant.", ""))
+        name = f"{source.stem}-{suffix}" if suffix else source.stem
+        output = folder / f"{name}.mcap"
+        made.append(Job(source, model, tuple(dict.fromkeys(estimators)), output, engine, overwrite, only))
+    names = [job.output for job in made]
+    if doubled := {name for name in names if names.count(name) > 1}:
+        raise RigError(f"two recordings would be written as {doubled.pop().name}: give them different names")
+    for job in made:
+        if not job.output.exists():
+            continue
+        if any(source.exists() and job.output.samefile(source) for source in sources):
+            raise RecordingError(f"{job.output} is one of the recordings: give another folder for the results")
+        if not overwrite and _record(job.record) is None:
+            raise RecordingError(
+                f"{job.output} exists and is no result of a batch: give another folder, or --overwrite to replace it"
+            )
+    return made
+
+
+def run(
+    todo: Sequence[Job],
+    workers: int,
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Iterator[Done]:
+    """Do the jobs on ``workers`` processes; gives each when it is done, in no order. A failed one stops no other.
+
+    When ``stop()`` says so no other job is begun, and those that are on the way are ended in good order.
+    """
+    fresh: list[Job] = []
+    for job in todo:
+        before = None if job.overwrite else _done_before(job)
+        if before is None:
+            fresh.append(job)
+        else:
+            yield before
+    count = len(todo) - len(fresh)
+    progress(count)
+    each = map(_do, itertools.takewhile(lambda job: not stop(), fresh))
+    for done in each if workers == 1 or len(fresh) < 2 else _in_parallel(fresh, workers, stop):
+        yield done
+        progress(count := count + 1)
+
+
+def _in_parallel(todo: Sequence[Job], workers: int, stop: Callable[[], bool]) -> Iterator[Done]:
+    queue = deque(todo)
+    while queue and not stop():  # again, if a process was lost and its pool with it
+        running: dict[Future[Done], Job] = {}
+        lost, broken = False, list[Job]()
+        try:
+            with processes(workers) as pool:
+                while running or (queue and not lost and not stop()):
+                    # No more than can run: what waits in a pool cannot be taken back.
+                    while queue and not lost and len(running) < workers and not stop():
+                        try:
+                            running[pool.submit(_do, queue[0])] = queue[0]
+                        except BrokenProcessPool:
+                            lost = True
+                        else:
+                            queue.popleft()
+                    finished, _ = wait(running, timeout=0.2, return_when=FIRST_COMPLETED)
+                    for future in finished:
+                        job = running.pop(future)
+                        try:
+                            done = future.result()
+                        except BrokenProcessPool:
+                            lost = True
+                            broken.append(job)
+                            done = Done(job, [], "its process was ended from outside: too little memory, or a signal")
+                        yield done
+        finally:
+            for job in [*running.values(), *broken]:
+                remove_unfinished(job.output)
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows of `COLUMNS` as CSV, or as Parquet if the name ends with .parquet.
+
+    Raises
+    ------
+    AolinkError
+        It cannot be written, or pyarrow is missing for Parquet.
+    """
+    with writing(path, overwrite=True) as partial:
+        if path.suffix == ".parquet":
+            try:
+                import pyarrow as pa
+                import pyarrow.parquet as pq
+            except ImportError:
+                raise AolinkError("Parquet needs pyarrow: pip install 'aolink[parquet]', or write .csv") from None
+            pq.write_table(pa.Table.from_pylist([dict(row) for row in rows]), partial)
+        else:
+            with partial.open("w", newline="") as file:
+                writer = csv.DictWriter(file, COLUMNS)
+                writer.writeheader()
+                writer.writerows(rows)
+
+
+def table_rows(done: Sequence[Done], folder: Path) -> list[dict[str, Any]]:
+    """Rows by `COLUMNS` of these jobs, and of those whose results are in the folder from before, sorted.
+
+    A failed job has one row, with its error.
+    """
+    rows = []
+    for each in done:
+        failed = {"recording": str(each.job.source), "model": each.job.model.name, "error": each.error}
+        rows += [dict.fromkeys(COLUMNS) | row for row in (each.rows or [failed])]
+    known = {each.job.record.resolve() for each in done}
+    for path in folder.glob("*.json"):
+        if path.resolve() not in known and path.with_suffix(".mcap").exists() and (record := _record(path)):
+            rows += [dict.fromkeys(COLUMNS) | row for row in record["rows"]]
+    return sorted(rows, key=lambda row: (_numerically(row["recording"]), _numerically(row["model"])))
+
+
+# A sign belongs to a number only where a value begins: "session-2" comes after "session-1".
+_NUMBERS = re.compile(r"((?:(?<=[=,\[])[-+])?\d+(?:\.\d+)?(?:e[-+]?\d+)?)")
+
+
+def _numerically(text: str) -> list[tuple[str, float]]:
+    """A key that sorts texts with numbers in them by the numbers: 5 before 10, and 1e-05 before both."""
+    parts = _NUMBERS.split(text)
+    return [(words, float(number)) for words, number in zip(parts[::2], [*parts[1::2], "-inf"], strict=True)]
+
+
+def _record(path: Path) -> dict[str, Any] | None:
+    """What a job has written of itself; None if there is nothing, or something else."""
+    try:
+        record = json.loads(path.read_text())
+        rows = record["rows"]
+        if isinstance(record["digest"], str) and rows and all(_IN_EVERY_ROW <= {*row} <= {*COLUMNS} for row in rows):
+            return dict(record)
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return None
+
+
+def _do(job: Job) -> Done:
+    """Estimate a recording again; whatever goes wrong is the result."""
+    try:
+        with writing(job.output, overwrite=True, sources=[job.source], error=RecordingError) as partial:
+            rows = _estimated(job, partial)
+            # A result is never there without the record that says whose it is and what it depends on.
+            job.output.unlink(missing_ok=True)
+            with writing(job.record, overwrite=True) as record:
+                record.write_text(json.dumps({"digest": job.digest(), "rows": rows}))
+    except (AolinkError, OSError) as error:
+        return Done(job, [], f"{error}")
+    except Exception as error:  # a value that nobody thought of stops no other job
+        return Done(job, [], f"it cannot be estimated with this model: {error!r}")
+    return Done(job, rows)
+
+
+def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
+    begin = time.perf_counter()
+    recording = job.model.applied_to(Recording(job.source))
+    check_has_exposures(recording)
+    names = list(job.estimators or recording.estimators or ["o3"])
+    fill_reestimated(recording, names, target, only=job.only, engine=job.engine)
+    seconds = time.perf_counter() - begin
+    written = Recording(target)
+    scorers, not_ok = {name: Scorer() for name in names}, dict.fromkeys(names, 0)
+    each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
+    count = 0
+    for exposure, estimates in zip(written.exposures(), each, strict=True):
+        count += 1
+        for estimate in estimates:
+            scorers[estimate.estimator].add(exposure, estimate)
+            not_ok[estimate.estimator] += estimate.status.name not in ("OK", "PREDICTED")
+    rows = []
+    for name, scorer in scorers.items():
+        score = scorer.result()
+        values = {
+            "path_rmse": score.path_rmse, "start_rmse": score.start_rmse, "end_rmse": score.end_rmse,
+            "nis": score.nis.mean, "nis_low": score.nis.low, "nis_high": score.nis.high,
+            "start_nees": score.start_nees.mean, "end_nees": score.end_nees.mean,
+            "nees_low": score.end_nees.low, "nees_high": score.end_nees.high,
+        }  # fmt: skip
+        known = {key: value if value == value else None for key, value in values.items()}
+        rows.append(
+            {
+                "recording": str(job.source), "model": job.model.name, "estimator": name, "exposures": count,
+                **known, "not_ok": not_ok[name], "nothing_measured": score.nothing_measured or None,
+                "seconds": round(seconds, 3), "output": job.output.name, "damage": recording.damage or None,
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _done_before(job: Job) -> Done | None:
+    record = _record(job.record)
+    try:
+        if record and record["digest"] == job.digest() and job.output.exists():
+            return Done(job, record["rows"], skipped=True)
+    except OSError:  # there is no such recording: the job will say so
+        pass
+    return None
+
+
+def _values(text: str, setting: str) -> list[Any]:
+    """Values divided by commas that are not inside brackets, as TOML reads them."""
+    try:
+        return list(tomllib.loads(f"values = [{text}]")["values"])
+    except tomllib.TOMLDecodeError:
+        raise RigError(
+            f"--set {setting}: {text} is no number, nor a text in quotation marks, as TOML has them"
+        ) from None
+
+
+def _short(value: Any) -> str:
+    return str(value).replace(" ", "")
+
+
+def _with_value(text: str, key: str, value: Any) -> str:
+    try:
+        document = tomlkit.parse(text)
+    except TOMLKitError as error:
+        raise RigError(f"not valid TOML: {error}") from None
+    table: Any = document
+    *path, name = key.split(".")
+    for part in [*path, name]:
+        if not hasattr(table, "get") or part not in table:
+            known = list(table) if hasattr(table, "get") else []
+            why = did_you_mean([part], known) or f"known there: {', '.join(known) or 'none'}"
+            raise RigError(f"--set {key}: the rig file has no such key: {why}")
+        parent, table = table, table[part]
+    parent[name] = value
+    return tomlkit.dumps(document)

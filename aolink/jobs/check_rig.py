@@ -1,0 +1,377 @@
+"""What a rig file says, judged before anything runs on it: what cannot work, and what is probably a slip."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.frames.moments import least_significance, spot_significance
+from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.kernel import exposure_density
+from aolink.optics.sensor import SpotSensor
+from aolink.plant.check import nominal_path
+from aolink.plant.lifting import lift
+from aolink.plant.observability import observability
+from aolink.rig import Rig
+from aolink.units import with_unit
+
+FloatArray = NDArray[np.float64]
+
+_FASTEST_STEP_S, _SLOWEST_STEP_S = 1e-6, 0.05
+"""A mirror that takes commands at more than 1 MHz or at less than 20 Hz is not a fast mirror on a serial line."""
+_SHORTEST_EXPOSURE_S, _LONGEST_EXPOSURE_S = 20e-6, 30.0
+_FASTEST_FRAMES_HZ = 2000.0
+_MOST_DEAD = 0.95
+"""Share of the time in which the camera does not look."""
+_FEWEST_STEPS = 4
+"""An exposure of fewer fast steps holds hardly any motion that the blur could tell."""
+_STEPS_IN_PERIOD = 8
+"""Fast steps in one period of the drive below which a sine is no longer one."""
+_LEAST_QUEUE_S = 0.02
+"""A host's operating system holds a program up for some milliseconds now and then."""
+_LONGEST_WATCHDOG_S = 60.0
+_COARSE = 0.05
+"""Share of the drive's range that the converter may round it by."""
+_ROUNDED = 101
+"""Inputs along the drive's range that are rounded to see that."""
+_LARGEST_DRIFT_PPM = 1000.0
+"""Quartz clocks keep to 100 ppm."""
+_LONGEST_LATENCY_S = 0.1
+_GAINS = (1e-3, 1e3)
+"""Counts per photo-electron that cameras have, generously."""
+_STILL = 0.01
+"""Motion inside an exposure, in kernel sds, below which there is nothing to see."""
+_WINDOWS = 64
+"""Exposures along the drive's path whose blur is looked at."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """Something that `check_rig` has to say."""
+
+    severity: Literal["error", "warning", "info"]
+    key: str
+    """The rig file's key that it is about."""
+    message: str
+
+
+def check_rig(rig: Rig) -> list[Finding]:
+    """What will not work, what is probably a slip, and what the file comes to in plain numbers; errors first."""
+    try:
+        with np.errstate(all="ignore"):
+            path, sd = nominal_path(_different_copies(rig))
+            findings = [
+                *_check_timing(rig), *_check_sensor(rig), *_check_signal(rig, path), *_check_motion(rig, path),
+                *_check_field(rig, path, sd), *_check_mirror(rig), *_check_simulation(rig), *_check_observability(rig),
+            ]  # fmt: skip
+    except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
+        return [_error("rig", f"it has numbers that are too large or too small to compute with ({error})")]
+    order = ("error", "warning", "info")
+    return sorted(findings, key=lambda f: order.index(f.severity))
+
+
+def _error(key: str, message: str) -> Finding:
+    return Finding(severity="error", key=key, message=message)
+
+
+def _warning(key: str, message: str) -> Finding:
+    return Finding(severity="warning", key=key, message=message)
+
+
+def _info(key: str, message: str) -> Finding:
+    return Finding(severity="info", key=key, message=message)
+
+
+def _check_timing(rig: Rig) -> Iterator[Finding]:
+    timing, step_s = rig.timing, rig.timing.fast_step_s
+    exposure_s, period_s = timing.exposure_steps * step_s, timing.frame_period_steps * step_s
+    dead = 1 - timing.exposure_steps / timing.frame_period_steps
+    yield _info(
+        "timing",
+        f"a fast step of {with_unit(step_s, 's')} ({with_unit(1 / step_s, 'Hz')}); exposures of {timing.exposure_steps}"
+        f" steps, {with_unit(exposure_s, 's')}, one every {with_unit(period_s, 's')} ({with_unit(1 / period_s, 'Hz')}),"
+        f" {f'{dead:.0%}' if dead else 'no'} dead time",
+    )
+    if not _FASTEST_STEP_S <= step_s <= _SLOWEST_STEP_S:
+        yield _warning(
+            "timing.fast_step_s",
+            f"commands at {with_unit(1 / step_s, 'Hz')} are not what a fast mirror takes on a serial line"
+            f" ({with_unit(1 / _SLOWEST_STEP_S, 'Hz')} to {with_unit(1 / _FASTEST_STEP_S, 'Hz')}): is it in seconds?",
+        )
+    if not _SHORTEST_EXPOSURE_S <= exposure_s <= _LONGEST_EXPOSURE_S:
+        yield _warning(
+            "timing.exposure_steps",
+            f"an exposure of {timing.exposure_steps} steps of {with_unit(step_s, 's')} takes"
+            f" {with_unit(exposure_s, 's')}: is that the camera's?",
+        )
+    elif period_s < 1 / _FASTEST_FRAMES_HZ:
+        yield _warning(
+            "timing.frame_period_steps",
+            f"frames at {with_unit(1 / period_s, 'Hz')} are more than a host takes from a serial line",
+        )
+    if dead > _MOST_DEAD:
+        yield _warning(
+            "timing.frame_period_steps",
+            f"the camera looks for {1 - dead:.2g} of the time only, {timing.exposure_steps} of"
+            f" {timing.frame_period_steps} fast steps",
+        )
+    if timing.exposure_steps < _FEWEST_STEPS:
+        yield _warning(
+            "timing.exposure_steps",
+            f"{timing.exposure_steps} fast step(s) in an exposure hold no motion that its blur could tell:"
+            " the mirror should be many times as fast as the camera",
+        )
+
+
+def _check_sensor(rig: Rig) -> Iterator[Finding]:
+    sensor = rig.sensor
+    low, high = sensor.field
+    pixel, width = sensor.pixel_width, high - low
+    narrow, wide = np.sqrt(np.linalg.eigvalsh(sensor.kernel.covariance)).tolist()
+    spots = f" for each of {sensor.spots} spots" if isinstance(sensor, SpotSensor) else ""
+    sds = f"{wide:.3g}" if narrow == wide else f"{narrow:.3g} to {wide:.3g}"
+    in_pixels = f"{wide / pixel:.3g}" if narrow == wide else f"{narrow / pixel:.3g} to {wide / pixel:.3g}"
+    yield _info(
+        "sensor",
+        f"{sensor.profile.pixels} pixels of {pixel:.4g} over the field [{low:.4g}, {high:.4g}] (slope units){spots};"
+        f" the kernel's sd (sigma / sqrt 2) is {sds}, {in_pixels} pixels",
+    )
+    if 2 * wide > width:
+        yield _error(
+            "sensor.kernel.sigma",
+            f"the kernel is wider than the field: its sd is {wide:.3g}, the field {width:g} wide, so most of a spot's"
+            " light misses its pixels; sigma is in slope units, as sensor.field is",
+        )
+    elif 4 * wide > width:
+        yield _warning(
+            "sensor.kernel.sigma",
+            f"two sd of the kernel to either side, {4 * wide:.3g}, are more than the field, {width:g}: every frame"
+            " cuts the spot off",
+        )
+    if narrow < pixel / 3:
+        yield _warning(
+            "sensor.kernel.sigma",
+            f"the kernel's sd, {narrow:.3g}, is under a third of a pixel ({pixel:.3g}):"
+            " moments depend on where in a pixel the spot rests",
+        )
+    noise = 5 * math.sqrt(sensor.noise_density / sensor.pixel_size) * sensor.counts_per_density
+    if sensor.black_level < noise:
+        yield _warning(
+            "sensor.black_level",
+            f"five sd of pixel noise are {noise:.4g} counts, more than the black level, {sensor.black_level:g}:"
+            " clipped at zero, the noise biases every moment",
+        )
+    peak = sensor.peak_density * sensor.counts_per_density
+    if sensor.black_level + peak + noise > sensor.full_scale:
+        yield _warning(
+            "sensor.counts_per_density",
+            f"a resting spot and five sd of noise reach {sensor.black_level + peak + noise:.5g} counts,"
+            f" the full scale is {sensor.full_scale}: lower counts_per_density",
+        )
+    gain = sensor.counts_per_density / sensor.pixel_size / sensor.photoelectrons if sensor.photoelectrons else 1.0
+    if not _GAINS[0] <= gain <= _GAINS[1]:
+        yield _warning(
+            "sensor.photoelectrons",
+            f"{sensor.photoelectrons:g} photo-electrons and counts_per_density = {sensor.counts_per_density:g} make"
+            f" {gain:.3g} counts for each photo-electron: cameras have {_GAINS[0]:g} to {_GAINS[1]:g}",
+        )
+
+
+def _check_signal(rig: Rig, path: FloatArray) -> Iterator[Finding]:
+    """How the spot stands out of the noise: resting, and blurred as the drive moves it."""
+    sensor, line = rig.sensor, rig.sensor.profile
+    peak = sensor.peak_density
+    noise = math.sqrt(effective_noise_density(sensor) / sensor.pixel_size + shot_gain(sensor) * peak)
+    middle = (sensor.field[0] + sensor.field[1]) / 2
+    resting = exposure_density(line.kernel, line.edges, np.array([[middle]]))
+    whole = float(spot_significance(line, resting)[0])
+    steps = min(rig.timing.exposure_steps, path.shape[1])
+    first = np.unique(np.linspace(0, path.shape[1] - steps, _WINDOWS).astype(np.intp))
+    moved = path[int(np.ptp(path, axis=1).argmax())]
+    blurred = exposure_density(line.kernel, line.edges, moved[first[:, None] + np.arange(steps)])
+    least, needed = float(spot_significance(line, blurred).min()), float(least_significance(line))
+    counts = sensor.counts_per_density
+    yield _info(
+        "sensor.noise_density",
+        f"signal to noise {peak / noise:.3g} in the brightest pixel of a resting spot ({peak * counts:.5g} counts over"
+        f" {noise * counts:.4g}); the whole spot stands out by {whole:.3g} sd of noise, blurred by the drive by at"
+        f" least {least:.3g}, and estimators ask for {needed:.3g}",
+    )
+    if peak * counts < 1:
+        yield _error(
+            "sensor.counts_per_density",
+            f"the brightest pixel of a resting spot has {peak * counts:.2g} counts: the read-out rounds it away",
+        )
+    elif whole < needed:
+        yield _error(
+            "sensor.noise_density",
+            f"the spot is lost in the noise: resting, it stands out by {whole:.2g} sd, estimators ask for {needed:.2g};"
+            " every frame would be taken for one without a spot",
+        )
+    elif least < needed:
+        yield _warning(
+            "sensor.noise_density",
+            f"blurred by the drive the spot stands out by {least:.2g} sd of noise only, estimators ask for"
+            f" {needed:.2g}: some frames will be taken for frames without a spot",
+        )
+
+
+def _check_motion(rig: Rig, path: FloatArray) -> Iterator[Finding]:
+    """How far the spot goes within an exposure and from one fast step to the next."""
+    plant, steps, pixel = rig.plant, rig.timing.exposure_steps, rig.sensor.pixel_width
+    kernel_sd = math.sqrt(rig.sensor.kernel.variance)
+    inside = min(steps, path.shape[1])
+    exposures = path.shape[1] // inside
+    driven = float(np.ptp(path[:, : exposures * inside].reshape(len(path), exposures, inside), axis=2).max())
+    stepped = float(np.abs(np.diff(path)).max(initial=0.0))
+    noise = _wandered(rig, steps)
+    yield _info(
+        "plant",
+        f"within an exposure the spot goes through {driven:.3g} ({driven / pixel:.2g} pixels) under the drive, and"
+        f" noise carries it by {noise:.3g} ({noise / pixel:.2g} pixels, sd)",
+    )
+    jump = stepped + 2 * _wandered(rig, 1)
+    if jump > 2 * kernel_sd + pixel:
+        yield _warning(
+            "timing.fast_step_s",
+            f"the spot jumps by {jump:.3g} from one fast step to the next, more than its own width,"
+            f" {2 * kernel_sd:.3g}: the model has no motion inside a fast step; make it shorter, or the drive slower",
+        )
+    if max(driven, noise) < _STILL * kernel_sd and not rig.disturbance:
+        yield _warning(
+            "plant.process_noise",
+            f"within an exposure the spot moves by {max(driven, noise):.2g}, under {_STILL:.0%} of the kernel's sd:"
+            " there is no blur to learn from",
+        )
+    if not (plant.process_noise.any() or plant.initial_covariance.any()):
+        yield _warning(
+            "plant.process_noise",
+            "neither process noise nor doubt about the start: estimators are sure of their prediction and never look",
+        )
+    drive = rig.drive
+    if drive.kind == "sine" and drive.amplitude.any() and drive.period_s < _STEPS_IN_PERIOD * rig.timing.fast_step_s:
+        yield _warning(
+            "drive.period_s",
+            f"{drive.period_s:g} s are {drive.period_s / rig.timing.fast_step_s:.2g} fast steps: too few for a sine",
+        )
+
+
+def _wandered(rig: Rig, steps: int) -> float:
+    """Standard deviation of how far process noise carries the spot in some fast steps, the largest of all outputs."""
+    plant = rig.plant
+    transition, noise = lift(plant, steps)
+    change = transition - np.eye(plant.n_states)
+    rows = plant.C @ change
+    variances = ((rows @ plant.initial_covariance) * rows).sum(axis=1) + ((plant.C @ noise) * plant.C).sum(axis=1)
+    return math.sqrt(max(0.0, float(variances.max())))
+
+
+def _check_field(rig: Rig, path: FloatArray, sd: FloatArray) -> Iterator[Finding]:
+    """Whether the spot stays on the sensor, as it should go and with three standard deviations around that."""
+    low, high = rig.sensor.field
+    least, most = float(path.min()), float(path.max())
+    key = "drive.amplitude" if rig.drive.kind == "sine" else "drive.offset"
+    where = f"the spot goes from {least:.3g} to {most:.3g}"
+    if least < low or most > high:
+        yield _error(
+            key,
+            f"{where} under the drive, beyond sensor.field = [{low:g}, {high:g}]: lower {key} or widen sensor.field",
+        )
+        return
+    plant = rig.plant
+    wide = math.sqrt(max(0.0, float(np.diag(plant.C @ plant.initial_covariance @ plant.C.T).max())))
+    if wide > high - low:
+        yield _error(
+            "plant.process_noise",
+            f"noise carries the spot by {wide:.3g} (sd), more than the field is wide, {high - low:g}:"
+            " it is hardly ever on the sensor; lower plant.process_noise, or widen sensor.field",
+        )
+        return
+    reach_low, reach_high = float((path - 3 * sd[:, None]).min()), float((path + 3 * sd[:, None]).max())
+    if reach_low < low or reach_high > high:
+        yield _warning(
+            "sensor.field",
+            f"{where} under the drive, and process noise carries it from {reach_low:.3g} to {reach_high:.3g}"
+            f" (three sd), beyond the field [{low:g}, {high:g}]: moments will be biased there",
+        )
+
+
+def _check_mirror(rig: Rig) -> Iterator[Finding]:
+    mirror, step_s = rig.mirror, rig.timing.fast_step_s
+    block_s, queue_s = mirror.block_steps * step_s, mirror.queue_steps * step_s
+    yield _info(
+        "mirror",
+        f"commands in blocks of {mirror.block_steps} steps, {with_unit(block_s, 's')}; the device queues"
+        f" {with_unit(queue_s, 's')} of them and parks {with_unit(mirror.watchdog_s, 's')} after the last packet",
+    )
+    if queue_s < _LEAST_QUEUE_S:
+        yield _warning(
+            "mirror.queue_steps",
+            f"a queue of {mirror.queue_steps} steps lasts {with_unit(queue_s, 's')}: a host that pauses for so long"
+            " leaves the mirror without commands in real time",
+        )
+    if mirror.watchdog_s < 2 * block_s:
+        yield _warning(
+            "mirror.watchdog_s",
+            f"the mirror parks after {with_unit(mirror.watchdog_s, 's')} without a packet, but a block of commands"
+            f" lasts {with_unit(block_s, 's')}: shorten mirror.block_steps, or lengthen the watchdog",
+        )
+    if mirror.watchdog_s > _LONGEST_WATCHDOG_S:
+        yield _warning(
+            "mirror.watchdog_s",
+            f"when its host is gone the mirror goes on for {mirror.watchdog_s:g} s before it parks: is it in seconds?",
+        )
+    played = rig.drive.offset + np.linspace(-1, 1, _ROUNDED)[:, None] * rig.drive.amplitude
+    rounding, span = float(np.abs(mirror.quantise(played) - played).max()), float(np.ptp(played, axis=0).max())
+    if span and rounding > _COARSE * span:
+        yield _warning(
+            "mirror.dac_bits",
+            f"{mirror.dac_bits} bits between mirror.input_min and mirror.input_max round the drive by up to"
+            f" {rounding:.2g}, and it goes through {span:.2g} only",
+        )
+
+
+def _check_simulation(rig: Rig) -> Iterator[Finding]:
+    simulation = rig.simulation
+    if abs(simulation.clock_drift_ppm) > _LARGEST_DRIFT_PPM:
+        yield _warning(
+            "simulation.clock_drift_ppm",
+            f"{simulation.clock_drift_ppm:g} ppm is a broken clock: quartz keeps to 100",
+        )
+    if simulation.latency_s > _LONGEST_LATENCY_S:
+        yield _warning(
+            "simulation.latency_s",
+            f"{with_unit(simulation.latency_s, 's')} one way is no serial line: is it in seconds?",
+        )
+
+
+def _check_observability(rig: Rig) -> Iterator[Finding]:
+    report = observability(rig.plant, rig.timing.exposure_steps, rig.timing.fast_step_s)
+    if not report.rank:
+        yield _error("plant.C", "the camera sees no state of the plant")
+        return
+    for mode in report.unseen:
+        harm = "it dies out by itself" if abs(mode.eigenvalue) < 1 - 1e-9 else "its estimate will never converge"
+        yield _warning("plant.C", f"the outputs do not see all of {mode}; {harm}")
+    for mode in report.lost_by_centroid:
+        yield _warning(
+            "timing.exposure_steps",
+            f"the centroid over {rig.timing.exposure_steps} fast steps loses {mode}, wholly or in part;"
+            " the blur may still show it, another exposure time would",
+        )
+    message = f"rank {report.rank} of {report.n_states} at the fast rate, {report.centroid_rank} by centroids"
+    yield _info("plant", f"{message}; o2 needs {report.o2_needs}")
+
+
+def _different_copies(rig: Rig) -> Rig:
+    """The rig with one of all copies of the plant that its drive moves alike: thousands of axes take no longer."""
+    plant, drive = rig.plant, rig.drive
+    each = np.stack([drive.amplitude, drive.offset]).reshape(2, plant.axes, plant.n_inputs).transpose(1, 0, 2)
+    different = np.unique(each, axis=0)
+    drive = replace(drive, amplitude=different[:, 0].ravel(), offset=different[:, 1].ravel())
+    return replace(rig, plant=replace(plant, axes=len(different)), drive=drive)

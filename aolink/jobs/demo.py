@@ -1,0 +1,198 @@
+"""The main job from end to end: a rig, a session, the estimates again, the pictures, the table."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+from aolink.errors import AolinkError, DeviceError, EstimatorError, ViewerError
+from aolink.estimation import make_estimator
+from aolink.files import writing
+from aolink.optics.sensor import Sensor
+from aolink.recording.deblur import Summary, write_deblurred
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, recorded_estimates, reestimate
+from aolink.rig import Rig
+from aolink.session import Report, record
+
+ESTIMATORS = ("open-loop", "o1", "o2", "o3", "moments")
+_OF_LINES = ("profile", "mixture")
+"""For line sensors as well; of spots on a plane they would make a demo long."""
+_RIG_START_S = 20.0
+_RIG_END_S = 5.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoResult:
+    """What the demo made."""
+
+    recording: Path
+    rrd: Path | None
+    """None if the demo was interrupted before."""
+    picture: Path | None
+    not_of_viewer: str
+    """Why the picture is not one of the viewer, but of matplotlib or None; empty where it is the viewer's."""
+    report: Report
+    deblurred: Summary | None = None
+    """What came of the pictures that a picture sensor took; None where the rig has none."""
+    deblurred_by: str = ""
+    """Whose path they were restored with."""
+    deblurred_recording: Path | None = None
+    """The session with them."""
+    differences: dict[str, str]
+    """Where online and offline estimates differ, by estimator; empty if nowhere."""
+    seconds: dict[str, float]
+    """Wall time of each part."""
+
+
+def possible_estimators(rig: Rig) -> tuple[str, ...]:
+    """Those that can work on a rig: not each of them knows plants that move many spots."""
+    possible = []
+    for name in (*ESTIMATORS, *(_OF_LINES if isinstance(rig.sensor, Sensor) else ())):
+        with contextlib.suppress(EstimatorError):
+            make_estimator(rig, name)
+            possible.append(name)
+    return tuple(possible)
+
+
+@contextlib.contextmanager
+def simulated_rig(rig: str | Path, *options: str) -> Iterator[tuple[str, str]]:
+    """A simulated rig as a process of its own, `aolink rig` with ``options``; gives the ports of camera and mirror.
+
+    Raises
+    ------
+    DeviceError
+        The process does not start.
+    """
+    command = [sys.executable, "-m", "aolink", "rig", str(rig), "--json", "--tied", *options]
+    # A group of its own: Ctrl-C is for the session, which still has to park the mirror.
+    # Its input is a pipe that ends with this process, and the rig with it, whatever ends this process.
+    started = False
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.PIPE, start_new_session=True)
+    try:
+        assert process.stdout is not None
+        ready, _, _ = select.select([process.stdout], [], [], _RIG_START_S)
+        line = process.stdout.readline() if ready else b""
+        if not line:
+            raise DeviceError(f"the simulated rig did not start; try it by hand: {' '.join(command)}")
+        ports, started = json.loads(line), True
+        yield ports["camera"], ports["mirror"]
+    finally:
+        if process.stdin is not None:
+            process.stdin.close()  # a rig that serves ends with it, and says nothing; one that does not is killed
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(_RIG_END_S if started else 0)
+        process.kill()
+        process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def new_folder(parent: Path) -> Path:
+    """A dated folder that did not exist before."""
+    name = time.strftime("demo-%Y%m%d-%H%M%S")
+    for suffix in ("", *(f"-{n}" for n in range(2, 1000))):
+        folder = parent / (name + suffix)
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise AolinkError(f"cannot create {folder}: {error.strerror}; give another --out") from None
+        return folder
+    raise AolinkError(f"{parent} is full of folders named {name}: give another --out")
+
+
+def run_demo(
+    rig: Rig,
+    source: str | Path,
+    folder: Path,
+    *,
+    exposures: int,
+    seed: int | None,
+    real_time: bool,
+    stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
+    progress: Callable[[str, int], None],
+) -> DemoResult:
+    """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays.
+
+    The rig runs from its ``source``, file or name: what that names is relative to it. ``stoppable`` is entered for
+    the session alone, which ends in good order when what it gives says so; nothing else is made then.
+    """
+    from aolink import viewing
+
+    with writing(folder / "rig.toml") as partial:
+        partial.write_text(rig.toml)
+    path, rrd, picture = folder / "session.mcap", folder / "session.rrd", folder / "session.png"
+    seconds: dict[str, float] = {}
+    estimators = possible_estimators(rig)
+
+    @contextlib.contextmanager
+    def part(name: str) -> Iterator[Callable[[int], None]]:
+        start = time.monotonic()
+        progress(name, 0)
+        yield lambda done: progress(name, done)
+        seconds[name] = time.monotonic() - start
+
+    options = ["--real-time"] if real_time else []
+    options += ["--seed", str(seed)] if seed is not None else []
+    with part("record") as tell, stoppable() as stop, simulated_rig(source, *options) as (camera, mirror):
+        report = record(
+            rig, camera, mirror, path, estimators=estimators, exposures=exposures, note="aolink demo", stop=stop,
+            progress=tell,
+        )  # fmt: skip
+    if stop():
+        return DemoResult(
+            recording=path, rrd=None, picture=None, not_of_viewer="interrupted", report=report, differences={},
+            seconds=seconds,
+        )  # fmt: skip
+    with part("estimate again") as tell:
+        recording = Recording(path)
+        offline = reestimate(recording, estimators, tell, as_recorded=True)
+        differences = {
+            name: difference
+            for name, again in offline.items()
+            if (difference := first_difference(list(recorded_estimates(recording, name)), again))
+        }
+    deblurred, deblurred_recording = None, None
+    if rig.scene is not None:
+        deblurred_recording = folder / "deblurred.mcap"
+        with part("deblur") as tell:
+            deblurred = write_deblurred(
+                recording, deblurred_recording, estimator=estimators[-1], workers=os.cpu_count() or 1, progress=tell
+            )
+        recording = Recording(deblurred_recording)
+    with part("write .rrd"):
+        viewing.save_rrd(recording, rrd)
+    drawn: Path | None = picture
+    not_of_viewer = ""
+    with part("draw"):
+        try:
+            viewing.screenshot(rrd, picture)
+        except ViewerError as error:
+            drawn, not_of_viewer = None, str(error)
+            try:
+                drawn = viewing.draw_session(recording, picture)
+            except ViewerError as also:
+                not_of_viewer += f"; {also}"
+    return DemoResult(
+        recording=path,
+        rrd=rrd,
+        picture=drawn,
+        not_of_viewer=not_of_viewer,
+        report=report,
+        deblurred=deblurred,
+        deblurred_by=estimators[-1],
+        deblurred_recording=deblurred_recording,
+        differences=differences,
+        seconds=seconds,
+    )

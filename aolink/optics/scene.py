@@ -1,0 +1,82 @@
+"""A second, picture sensor that shares the spot's exposure: a scene that the same mirror moves.
+
+An intensity of one is the brightest that a picture file of whole numbers can hold, and 0 is dark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.optics.sensor import Kernel
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSensor:
+    """The picture sensor."""
+
+    shape: tuple[int, int]
+    """Rows and columns of pixels."""
+    pixel_scale: float
+    """Slope units of the spot that move the scene by one pixel."""
+    kernel: Kernel
+    """Of the picture's optics; its width is in slope units, as the spot's."""
+    noise_sd: float
+    """Standard deviation of a pixel's intensity by read-out noise."""
+    bit_depth: int
+    black_level: float
+    """Counts of a dark pixel."""
+    counts_per_intensity: float
+    picture: str
+    """What a simulated rig shows: a picture file beside the rig file, or one that comes with aolink; may be empty."""
+    picture_pixels: int
+    """Rows and columns of the picture's own pixels in one of the sensor's."""
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return (1 << self.bit_depth) - 1
+
+    def to_counts(self, intensity: FloatArray) -> NDArray[np.uint16]:
+        """What the sensor reads out: rounded, and cut at zero and at full scale."""
+        counts = np.rint(self.black_level + self.counts_per_intensity * intensity)
+        return np.clip(counts, 0, self.full_scale).astype(np.uint16)
+
+    def to_intensity(self, counts: NDArray[np.uint16]) -> FloatArray:
+        """The intensity that counts stand for; noise makes it negative where it is dark."""
+        return np.asarray((counts.astype(np.float64) - self.black_level) / self.counts_per_intensity)
+
+    def is_saturated(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        """True where a count is at an end of the scale."""
+        return np.asarray((counts == 0) | (counts >= self.full_scale))
+
+
+def scene_motion(n_outputs: int) -> FloatArray:
+    """How the scene moves when the spots do: as their mean along x and y; along x alone where a line is seen.
+
+    Returns
+    -------
+    (1 or 2, n_outputs): times the rig's outputs it is the scene's displacement, slope units.
+    """
+    return np.eye(1) if n_outputs == 1 else np.tile(np.eye(2), (1, n_outputs // 2)) / (n_outputs // 2)
+
+
+def framed(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
+    """The middle of a picture in the sensor's pixels, each the mean of its own, (rows, columns)."""
+    return framed_columns(sensor, framed_rows(sensor, picture))
+
+
+def framed_rows(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
+    """The same for the rows alone, (rows, the picture's columns)."""
+    n, rows = sensor.picture_pixels, sensor.shape[0]
+    top = (picture.shape[0] - n * rows) // 2
+    return np.asarray(picture[top : top + n * rows].reshape(rows, n, -1).mean(axis=1))
+
+
+def framed_columns(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
+    """And for the columns alone, (the picture's rows, columns)."""
+    return framed_rows(replace(sensor, shape=sensor.shape[::-1]), picture.T).T

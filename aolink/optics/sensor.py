@@ -1,0 +1,214 @@
+"""What a camera is: where its pixels lie, how it counts, and how well that is known.
+
+Quantities are in the rig's own slope unit: that of ``sensor.field``, of the plant's output and of the
+kernel's width. A density is light over length for a line of pixels, and over area where pixels have two sides.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kernel:
+    """Image kernel Psi, the spot that a resting beam makes; of unit mass."""
+
+    shape: Literal["gaussian"]
+    sigma: float
+    """Width, slope units, in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2.
+
+    Of a kernel that is not round, that of the round one whose variance is the mean of both directions'.
+    """
+    matrix: tuple[tuple[float, float], tuple[float, float]] | None = None
+    """Sigma of Psi = exp(-w' Sigma^-2 w) / (pi |Sigma|), Mishra & Wen (4), symmetric; None where it is round."""
+
+    @property
+    def variance(self) -> float:
+        """Variance of the kernel in one direction, slope units squared."""
+        return self.sigma**2 / 2
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the kernel on a plane, Sigma^2/2, slope units squared, (2, 2)."""
+        width = self.sigma * np.eye(2) if self.matrix is None else np.array(self.matrix)
+        return np.asarray(width @ width / 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseSensor(ABC):
+    """What all sensors have: equal pixels, each spot seen on ``field``, an integer read-out."""
+
+    field: tuple[float, float]
+    """Outer edges of the first and the last pixel that see a spot, slope units; the same in both directions."""
+    noise_density: float
+    """V: a pixel of size D that holds the mean density has noise variance V/D (Mishra & Wen, section V)."""
+    kernel: Kernel
+    bit_depth: int
+    black_level: float
+    """Counts of a pixel that sees nothing."""
+    counts_per_density: float
+    """Counts for a density of one."""
+    photoelectrons: float = 0.0
+    """Photo-electrons of a whole spot in one exposure; 0 means so many that shot noise does not matter."""
+
+    @property
+    @abstractmethod
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+
+    @property
+    @abstractmethod
+    def pixel_width(self) -> float:
+        """Side of a pixel, slope units."""
+
+    @property
+    @abstractmethod
+    def pixel_size(self) -> float:
+        """D: a pixel's length (slope units) on a line, its area on a plane."""
+
+    @property
+    @abstractmethod
+    def profile(self) -> Sensor:
+        """The line sensor that sees one slope of one spot as this one does, all light of the other direction summed."""
+
+    @property
+    @abstractmethod
+    def peak_density(self) -> float:
+        """Density of a pixel at whose middle a spot rests."""
+
+    @property
+    def full_scale(self) -> int:
+        """Largest count."""
+        return (1 << self.bit_depth) - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor(BaseSensor):
+    """A line sensor: one spot on a row of pixels."""
+
+    kind: Literal["line"]
+    pixels: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return (1, self.pixels)
+
+    @property
+    def pixel_width(self) -> float:
+        """D, slope units."""
+        return (self.field[1] - self.field[0]) / self.pixels
+
+    @property
+    def pixel_size(self) -> float:
+        """D, slope units."""
+        return self.pixel_width
+
+    @property
+    def profile(self) -> Sensor:
+        """Itself."""
+        return self
+
+    @property
+    def peak_density(self) -> float:
+        """Density of a pixel at whose middle a spot rests, one over slope units."""
+        return math.erf(self.pixel_width / 2 / self.kernel.sigma) / self.pixel_width
+
+    @property
+    def edges(self) -> FloatArray:
+        """Pixel edges, slope units, (pixels + 1,)."""
+        return np.linspace(self.field[0], self.field[1], self.pixels + 1)
+
+    @property
+    def centres(self) -> FloatArray:
+        """Pixel centres, slope units, (pixels,)."""
+        edges = self.edges
+        return (edges[:-1] + edges[1:]) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpotSensor(BaseSensor):
+    """A camera behind lenslets: a grid of windows, a spot in each, seen in two directions.
+
+    The rig's outputs are spot 0's slope along x (columns), spot 0's along y (rows), spot 1's along x, ...;
+    spots are counted along the rows of the grid, windows in the dark left out. Densities are those of a wholly lit
+    lenslet's spot: of one that is lit in part, a window has so much less.
+    """
+
+    kind: Literal["spots"]
+    grid: tuple[int, int]
+    """Rows and columns of windows."""
+    window: tuple[int, int]
+    """Rows and columns of pixels in a window; a square."""
+    light: tuple[float, ...] | None = None
+    """Share of each window's lenslet that is lit, along the rows of the grid; 0 without a spot. None: all is."""
+
+    @property
+    def spots(self) -> int:
+        """Number of spots."""
+        return len(self.lit)
+
+    @cached_property
+    def lit(self) -> NDArray[np.intp]:
+        """Windows that have a spot, counted along the rows of the grid, (spots,)."""
+        return np.arange(self.grid[0] * self.grid[1]) if self.light is None else np.flatnonzero(self.light)
+
+    @cached_property
+    def spot_light(self) -> FloatArray | None:
+        """Share of each spot's lenslet that is lit, (spots,); None where all is."""
+        return None if self.light is None else np.array(self.light)[self.lit]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of a frame."""
+        return (self.grid[0] * self.window[0], self.grid[1] * self.window[1])
+
+    @property
+    def pixel_width(self) -> float:
+        """Side of a pixel, slope units."""
+        return (self.field[1] - self.field[0]) / self.window[1]
+
+    @property
+    def pixel_size(self) -> float:
+        """Area of a pixel, slope units squared."""
+        return self.pixel_width**2
+
+    @cached_property
+    def profile(self) -> Sensor:
+        """The line sensor whose counts are the sums of a window's counts over its rows, or over its columns.
+
+        A density summed over the other direction's length L has noise density V L. Every pixel is rounded,
+        not only the sum: the variance of the other roundings is in V.
+        """
+        side, across = self.pixel_width, self.window[0]
+        roundings = (across - 1) * side**3 / (12 * self.counts_per_density**2)
+        return Sensor(
+            kind="line",
+            pixels=self.window[1],
+            field=self.field,
+            noise_density=self.noise_density * (self.field[1] - self.field[0]) + roundings,
+            kernel=self.kernel,
+            bit_depth=self.bit_depth + (across - 1).bit_length(),
+            black_level=across * self.black_level,
+            counts_per_density=self.counts_per_density / side,
+            photoelectrons=self.photoelectrons,
+        )
+
+    @property
+    def peak_density(self) -> float:
+        """Density of a pixel at whose middle a spot rests, one over slope units squared."""
+        half = self.pixel_width / 2
+        if self.kernel.matrix is None:
+            return (math.erf(half / self.kernel.sigma) / self.pixel_width) ** 2
+        # To the second order in a pixel's width over the kernel's.
+        covariance = self.kernel.covariance + np.eye(2) * half**2 / 3
+        return 1 / (2 * math.pi * math.sqrt(float(np.linalg.det(covariance))))

@@ -1,0 +1,199 @@
+"""The slopes and the wavefront of one Shack-Hartmann frame against a reference frame of the same camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from aolink.errors import FrameError
+from aolink.files import writing
+from aolink.optics.frame_file import read_frame
+from aolink.optics.lattice import Lattice, find_lattice, match
+from aolink.optics.wavefront import SpotReconstructor, modal_reconstructor, residual_rms, zernike_slopes
+from aolink.optics.zernike import zernike
+
+FloatArray = NDArray[np.float64]
+
+
+# Zernike modes that are fitted, by Noll's index, up to the fourth order; fewer where spots do not tell them apart.
+_HIGHEST = (15, 10, 6, 3)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ZernikeFit:
+    """The wavefront as Zernike modes over the round pupil that just holds all lenslets of the reference."""
+
+    centre_px: FloatArray
+    """(2,)"""
+    radius_px: float
+    indices: tuple[int, ...]
+    """Noll's, from 2."""
+    coefficients: FloatArray
+    """Rms of each mode over the pupil, in the unit of the wavefront, (modes,)."""
+    wavefront: FloatArray
+    """Sum of the modes at each lenslet, NaN where the frame has no spot, (rows, columns)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameSlopes:
+    """What a frame shows against its reference. Grids are the reference's, NaN where the frame has no spot.
+
+    Row j and column i of a grid are node (i, j) of the reference's lattice, square or hexagonal, and lie on the frame
+    at ``positions_px``. Vectors are (x, y) along the frame's columns and rows, however the lattice is turned.
+    """
+
+    frame: FloatArray
+    """(rows, columns) of pixels, counts."""
+    lattice: Lattice
+    """The frame's own."""
+    reference: Lattice
+    positions_px: FloatArray
+    """Where the reference's lattice has its nodes, with spots or without, (rows, columns, 2)."""
+    displacements_px: FloatArray
+    """From the reference's spot to the frame's, without their mean, pixels, (rows, columns, 2)."""
+    shift_px: FloatArray
+    """The mean displacement, (2,): known up to whole steps of the lattice."""
+    slopes: FloatArray
+    """(rows, columns, 2): radians, or pixels where the optics are not known."""
+    wavefront: FloatArray
+    """Zone by zone, (rows, columns), without piston and tilt: metres, or pixels times the pitch of a lenslet."""
+    pieces: NDArray[np.int64]
+    """Which lenslets hang together, counted from 0, -1 where the frame has no spot, (rows, columns).
+
+    Slopes do not tell the step from one piece to another; the wavefront's mean is zero in each.
+    """
+    zernikes: ZernikeFit
+    in_metres: bool
+
+    @property
+    def rms(self) -> float:
+        """Of the wavefront."""
+        return residual_rms(self.wavefront)
+
+    @property
+    def peak_to_valley(self) -> float:
+        """Of the wavefront."""
+        return float(np.nanmax(self.wavefront) - np.nanmin(self.wavefront))
+
+
+def measure_slopes(
+    frame: NDArray[np.generic],
+    reference: NDArray[np.generic],
+    *,
+    pitch_m: float | None = None,
+    focal_m: float | None = None,
+) -> FrameSlopes:
+    """Find the spots of a frame and of its reference, and what lies between them.
+
+    Parameters
+    ----------
+    frame, reference:
+        Counts of any real type and scale, (rows, columns), of the same camera.
+    pitch_m, focal_m:
+        From a lenslet's middle to the next one's, and focal length, m; the pitch in pixels is the reference's own.
+        Where both are None, slopes are left in pixels.
+
+    Raises
+    ------
+    FrameError
+        A frame has no spots, they lie on no grid, or the two grids are not of one instrument.
+    """
+    if frame.shape != reference.shape:
+        raise FrameError(f"the frame has {frame.shape} pixels, the reference {reference.shape}: take one camera's")
+    base = _found(reference, "the reference")
+    lattice = match(_found(frame, "the frame"), base)
+    rows, columns = base.shape
+    column, row = lattice.nodes.T
+
+    def on_grid(values: FloatArray) -> FloatArray:
+        grid = np.full((rows, columns, *values.shape[1:]), np.nan)
+        grid[row, column] = values
+        return grid
+
+    rest = np.empty((rows, columns, 2))
+    rest[base.nodes[:, 1], base.nodes[:, 0]] = base.spots
+    moved = lattice.spots - rest[row, column]
+    in_metres = pitch_m is not None and focal_m is not None
+    pitch = pitch_m if pitch_m is not None and in_metres else 1.0
+    slopes = moved - moved.mean(axis=0)
+    if focal_m is not None and in_metres:
+        slopes = slopes * (pitch / base.pitch / focal_m)
+    zonal = SpotReconstructor(base.node_positions(lattice.nodes) * (pitch / base.pitch), lattice.neighbours)
+    pieces = np.full((rows, columns), -1, dtype=np.int64)
+    pieces[row, column] = zonal.parts
+    indices, coefficients, values, (centre, radius) = _zernikes(base, lattice.nodes, slopes, pitch)
+    everywhere = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
+    return FrameSlopes(
+        frame=frame.astype(np.float64), lattice=lattice, reference=base, positions_px=base.node_positions(everywhere),
+        displacements_px=on_grid(moved - moved.mean(axis=0)), shift_px=moved.mean(axis=0), slopes=on_grid(slopes),
+        wavefront=on_grid(zonal(slopes)), pieces=pieces, in_metres=in_metres,
+        zernikes=ZernikeFit(
+            centre_px=centre, radius_px=radius, indices=indices, coefficients=coefficients, wavefront=on_grid(values)
+        ),
+    )  # fmt: skip
+
+
+def _zernikes(
+    base: Lattice, nodes: NDArray[np.int64], slopes: FloatArray, pitch: float
+) -> tuple[tuple[int, ...], FloatArray, FloatArray, tuple[FloatArray, float]]:
+    """Indices and coefficients, their sum at the nodes, centre and radius of the pupil in pixels."""
+    middles = base.node_positions(base.nodes)
+    centre, radius = _circle((middles[:, None] + base.lenslet).reshape(-1, 2))
+    scale = pitch / base.pitch
+    positions = (base.node_positions(nodes) - centre) * scale
+    for highest in _HIGHEST:
+        indices = tuple(range(2, highest + 1))
+        modes = zernike_slopes(positions, indices, radius * scale, base.lenslet * scale)
+        try:
+            matrix = modal_reconstructor(modes, np.ones(len(nodes)))
+        except ValueError:
+            continue
+        coefficients = matrix @ slopes.ravel()
+        values = np.tensordot(coefficients, [zernike(i, positions / (radius * scale)) for i in indices], axes=1)
+        return indices, coefficients, np.asarray(values), (centre, radius)
+    raise AssertionError("two tilts are always told apart")
+
+
+def _circle(points: FloatArray) -> tuple[FloatArray, float]:
+    """Middle (2,) and radius of the smallest circle about points (n, 2), to a thousandth.
+
+    The middle goes a smaller and smaller share of the way to the point that is furthest from it; Badoiu and Clarkson,
+    Smaller core-sets for balls, SODA (2003).
+    """
+    points = points[ConvexHull(points).vertices]
+    middle = points.mean(axis=0)
+    for k in range(2, 1002):
+        middle = middle + (points[np.linalg.norm(points - middle, axis=1).argmax()] - middle) / k
+    return middle, float(np.linalg.norm(points - middle, axis=1).max())
+
+
+def _found(frame: NDArray[np.generic], name: str) -> Lattice:
+    try:
+        return find_lattice(frame)
+    except FrameError as error:
+        raise FrameError(f"{name}: {error}") from None
+
+
+def measure_files(
+    frame: str | Path, reference: str | Path, *, pitch_m: float | None = None, focal_m: float | None = None
+) -> FrameSlopes:
+    """`measure_slopes` of two files, .fits, .fits.gz or .npy. Raises `FrameError`."""
+    return measure_slopes(read_frame(frame), read_frame(reference), pitch_m=pitch_m, focal_m=focal_m)
+
+
+def save(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> None:
+    """Write slopes, wavefront, Zernike coefficients and the spots' places as .npz. Raises `FrameError`."""
+    target = writing(path, overwrite=overwrite, suffix=".npz", error=FrameError)
+    with target as partial, partial.open("wb") as file:
+        np.savez(
+            file, slopes=result.slopes, wavefront=result.wavefront, displacements_px=result.displacements_px,
+            spots_px=result.lattice.spots, nodes=result.lattice.nodes, shift_px=result.shift_px,
+            grid=result.reference.kind, positions_px=result.positions_px, pieces=result.pieces,
+            zernike_indices=result.zernikes.indices, zernike_coefficients=result.zernikes.coefficients,
+            zernike_wavefront=result.zernikes.wavefront, pupil_centre_px=result.zernikes.centre_px,
+            pupil_radius_px=result.zernikes.radius_px,
+        )  # fmt: skip

@@ -1,0 +1,171 @@
+"""What the camera can know of the plant (remarks 1 and 2 of Mishra & Wen)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.numerics.block_diagonal import Indices, blockwise, components, eigenvalues, null_space
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+
+
+# A mode that shrinks to this over one exposure is gone before the next, whatever the camera saw of it.
+_FORGOTTEN = 1e-3
+
+
+# Eigenvalues closer than this are one; and a vector that A moves less from its multiple is an eigenvector.
+_SAME = 1e-7
+
+
+# What an eigenvector makes of the outputs, relative to their size, below which they do not see it.
+_UNSEEN = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mode:
+    """One eigenvalue of A (of a complex pair, the one above the axis)."""
+
+    eigenvalue: complex
+    frequency_hz: float
+    time_constant_s: float
+    """Time in which it falls to 1/e; infinite where it does not."""
+    seen: bool
+    """Whether the outputs see it at the fast rate, (A, C)."""
+    seen_by_centroid: bool
+    """Whether the mean over each exposure sees it, (A^N, C-bar)."""
+
+    def __str__(self) -> str:
+        lasts = "undamped" if math.isinf(self.time_constant_s) else f"time constant {self.time_constant_s:.3g} s"
+        return f"the mode at {self.frequency_hz:.4g} Hz ({lasts})"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservabilityReport:
+    """What can be known of the plant's state (remarks 1 and 2 of Mishra & Wen)."""
+
+    n_states: int
+    rank: int
+    """Dimension of the state space that the outputs see at the fast rate."""
+    centroid_rank: int
+    """Dimension that the means over exposures see; remark 1 holds where it equals ``rank``, and it need not."""
+    modes: tuple[Mode, ...]
+    o2_needs: str
+    """What an estimator of the second moment alone (`o2`) needs before it can work."""
+
+    @property
+    def detectable(self) -> bool:
+        """Whether every mode that the outputs do not see dies out by itself."""
+        return all(m.seen or abs(m.eigenvalue) < 1 - 1e-9 for m in self.modes)
+
+    @property
+    def unseen(self) -> tuple[Mode, ...]:
+        """Modes that the outputs do not see at the fast rate."""
+        return tuple(m for m in self.modes if not m.seen)
+
+    @property
+    def lost_by_centroid(self) -> tuple[Mode, ...]:
+        """Modes that the outputs see and the means over exposures do not."""
+        return tuple(m for m in self.modes if m.seen and not m.seen_by_centroid)
+
+
+def observability(plant: Plant, n_steps: int, fast_step_s: float) -> ObservabilityReport:
+    """Rank of what the camera sees, mode by mode (Popov-Belevitch-Hautus), for exposures of ``n_steps``."""
+    A, parts = plant.A, components(plant.A)
+    transition, mean, square = blockwise(partial(_powers, n_steps), (A,), parts)
+    values = _distinct(eigenvalues(A, parts))
+    blind = [_unobservable(A, plant.C / np.linalg.norm(plant.C), value, parts) for value in values]
+    # The outputs' mean over an exposure, in units of what they are in its steps.
+    centroid = plant.C @ mean / math.sqrt(float(((plant.C @ square) * plant.C).sum()))
+    lifted = values**n_steps
+    distinct = _distinct(lifted)
+    lost = [_unobservable(transition, centroid, value, parts) for value in distinct]
+    modes = []
+    for value, value_n, unseen in zip(values, lifted, blind, strict=True):
+        if value.imag < 0:
+            continue
+        radius = abs(value)
+        modes.append(
+            Mode(
+                eigenvalue=complex(value),
+                frequency_hz=float(abs(np.angle(value))) / (2 * math.pi * fast_step_s),
+                time_constant_s=math.inf if radius >= 1 - 1e-12 else -fast_step_s / math.log(max(radius, 1e-300)),
+                seen=not unseen.shape[1],
+                seen_by_centroid=abs(value_n) < _FORGOTTEN
+                or not any(
+                    _has_part_in(A, value, space, parts)
+                    for other, space in zip(distinct, lost, strict=True)
+                    if abs(other - value_n) < _SAME
+                ),
+            )
+        )
+    n = plant.n_states
+    stable = bool(np.abs(lifted).max() < 1 - 1e-9)
+    # Eigenvectors of different eigenvalues are independent.
+    rank, centroid_rank = (n - sum(space.shape[1] for space in spaces) for spaces in (blind, lost))
+    return ObservabilityReport(
+        n_states=n,
+        rank=rank,
+        centroid_rank=centroid_rank,
+        modes=tuple(modes),
+        o2_needs=_o2_needs(stable, centroid_rank == n),
+    )
+
+
+def _powers(n_steps: int, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A^N, and the means of A^i and of A^i A^i' for i from 0 to N - 1."""
+    power, total, squares = np.eye(len(A)), np.zeros_like(A), np.zeros_like(A)
+    for _ in range(n_steps):
+        total += power
+        squares += power @ power.T
+        power = power @ A
+    return power, total / n_steps, squares / n_steps
+
+
+def _distinct(values: NDArray[Any]) -> NDArray[Any]:
+    """Values without repetition: a mirror's actuators are alike, and what holds for one holds for all."""
+    keep: list[complex] = []
+    for value in values:
+        if all(abs(value - other) > _SAME for other in keep):
+            keep.append(value)
+    return np.array(keep)
+
+
+def _unobservable(A: FloatArray, C: FloatArray, value: complex, parts: list[Indices]) -> NDArray[Any]:
+    """Basis of the eigenvectors for a value that (A, C) cannot tell from zero, (n_states, dimension), orthonormal."""
+    vectors = null_space(A, value, parts, _SAME)
+    seen = C @ vectors
+    if not vectors.shape[1]:
+        return vectors
+    if len(seen) > vectors.shape[1]:
+        seen = np.linalg.qr(seen)[1]
+    _, sizes, rows = np.linalg.svd(seen)
+    hidden = np.concatenate([sizes, np.zeros(len(rows) - len(sizes))]) < _UNSEEN
+    return np.asarray(vectors @ rows[hidden].conj().T)
+
+
+def _has_part_in(A: FloatArray, value: complex, space: NDArray[Any], parts: list[Indices]) -> bool:
+    """Whether the invariant subspace of an eigenvalue of A has a part in ``space``."""
+    if not space.shape[1]:
+        return False
+    # The eigenvalue's own left space: what it cannot annihilate has a part in the mode.
+    left = null_space(A, value, parts, _SAME, left=True, power=len(A))
+    return bool(np.linalg.norm(left.conj().T @ space) > 1e-6)
+
+
+def _o2_needs(stable: bool, observable: bool) -> str:
+    needs = [
+        "a spot off centre (drive.offset or drive.amplitude, or plant.initial_mean): at zero state and input"
+        " the second moment's slope is zero, and x and -x look alike"
+    ]
+    if not stable:
+        needs.append("a plant that forgets (every eigenvalue of A inside the unit circle): this one does not")
+    if not observable:
+        needs.append("a state that the centroid sees whole, (A^N, C-bar) observable: this one is not")
+    return "; ".join(needs)

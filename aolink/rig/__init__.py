@@ -1,0 +1,26 @@
+"""What a rig is: a TOML file, and the frozen dataclasses that it becomes."""
+
+from aolink.optics.sensor import Kernel, Sensor, SpotSensor
+from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig
+from aolink.rig.parts import Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing
+from aolink.rig.sensor_tables import CalibrationTable
+from aolink.rig.tables import parse_light
+
+__all__ = [
+    "CalibrationTable",
+    "Drive",
+    "Faults",
+    "Kernel",
+    "Light",
+    "MirrorDriver",
+    "Plant",
+    "Rig",
+    "Sensor",
+    "Simulation",
+    "SpotSensor",
+    "Timing",
+    "builtin_rigs",
+    "load_rig",
+    "parse_light",
+    "parse_rig",
+]

@@ -1,0 +1,89 @@
+"""What disturbs a rig beside its plant's own noise, as a rig file's ``[disturbance]`` says; simulated rigs play it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RigError
+from aolink.optics.turbulence import Layer
+from aolink.rig.toml_table import Table
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Vibration:
+    """A line in the spectrum of all spots' slopes; its phase is by the seed."""
+
+    frequency_hz: float
+    amplitude: tuple[float, float]
+    """Along x and y, slope units; a line of pixels sees x."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Disturbance:
+    """Slopes that are added to the plant's outputs."""
+
+    plant_noise: bool
+    """Whether the plant makes its own process noise as well. Where not, ``plant.process_noise`` is only what
+    estimators expect of the disturbance."""
+    layers: tuple[Layer, ...]
+    """Turbulence."""
+    pupil_m: float
+    """Width of the turbulence that the lenslets' columns see together, m."""
+    vibrations: tuple[Vibration, ...]
+    zernike_m: FloatArray
+    """Static aberration: Noll's index and metres rms over the circle about the lenslets, (k, 2)."""
+    recorded: str
+    """A file with slopes at each fast step, slope units, (steps, outputs), played round and round; empty for none."""
+
+
+def read_disturbance(table: Table) -> Disturbance:
+    """The table ``[disturbance]``. Raises `RigError`."""
+    layers: tuple[Layer, ...] = ()
+    pupil = 0.0
+    if table.has("turbulence"):
+        air = table.table("turbulence")
+        pupil = air.number("pupil_m", above=0.0)
+        outer, wavelength = air.number("outer_scale_m", 25.0, above=0.0), air.number("wavelength_m", 500e-9, above=0.0)
+        layers = tuple(_layer(each, outer, wavelength) for each in air.tables("layers"))
+        if not layers:
+            raise RigError(f"{air.key('layers')} is empty: give each layer's r0_m and wind_m_s")
+        air.finish()
+    zernike = table.matrix("zernike_m", (None, 2), "Noll's index and metres") if table.has("zernike_m") else None
+    if zernike is not None and not all(index >= 2 and index == round(index) for index in zernike[:, 0]):
+        raise RigError(f"{table.key('zernike_m')}: each row begins with one of Noll's indices, a whole number from 2")
+    disturbance = Disturbance(
+        plant_noise=table.flag("plant_noise", True),
+        layers=layers,
+        pupil_m=pupil,
+        vibrations=tuple(_vibration(each) for each in table.tables("vibration")),
+        zernike_m=np.zeros((0, 2)) if zernike is None else zernike,
+        recorded=table.text("recorded", ""),
+    )
+    table.finish()
+    return disturbance
+
+
+def _layer(table: Table, outer_scale_m: float, wavelength_m: float) -> Layer:
+    wind = table.vector("wind_m_s", 2, "along x and y")
+    layer = Layer(
+        r0_m=table.number("r0_m", above=0.0),
+        wind_m_s=(float(wind[0]), float(wind[1])),
+        outer_scale_m=outer_scale_m,
+        wavelength_m=wavelength_m,
+    )
+    table.finish()
+    return layer
+
+
+def _vibration(table: Table) -> Vibration:
+    amplitude = table.vector("amplitude", 2, "along x and y")
+    line = Vibration(
+        frequency_hz=table.number("frequency_hz", above=0.0), amplitude=(float(amplitude[0]), float(amplitude[1]))
+    )
+    table.finish()
+    return line

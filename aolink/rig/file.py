@@ -1,0 +1,141 @@
+"""What a rig is: a TOML file, and the frozen dataclasses that it becomes.
+
+`load_rig` reads and validates the whole file; what is wrong is one `RigError` that names the key.
+Quantities are SI (seconds) where the key ends in a unit, and otherwise in the rig's own slope unit:
+the unit of ``sensor.field``, of the plant's output and of the kernel's width.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+from aolink.errors import RigError
+from aolink.optics.scene import SceneSensor
+from aolink.optics.sensor import BaseSensor
+from aolink.rig.disturbance import Disturbance, read_disturbance
+from aolink.rig.optical_plant import Optics, read_optics
+from aolink.rig.parts import Drive, MirrorDriver, Plant, Simulation, Timing
+from aolink.rig.scene_table import read_scene
+from aolink.rig.sensor_tables import CalibrationTable, read_calibration, read_grid, read_sensor
+from aolink.rig.tables import read_drive, read_mirror, read_plant, read_simulation, read_timing
+from aolink.rig.toml_table import Table
+
+_TABLES = (
+    "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
+    "lenslets", "disturbance", "scene", "calibration",
+)  # fmt: skip
+"""What a rig file may hold at its top."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rig:
+    """A whole rig, validated."""
+
+    name: str
+    summary: str
+    plant: Plant
+    timing: Timing
+    sensor: BaseSensor
+    mirror: MirrorDriver
+    drive: Drive
+    simulation: Simulation
+    calibration: CalibrationTable | None
+    """None where the sensor's values were not measured."""
+    optics: Optics | None
+    """The lenslets, where the file describes them."""
+    disturbance: Disturbance | None
+    scene: SceneSensor | None
+    """The picture sensor that shares the exposure, where the rig has one."""
+    folder: Path
+    """Of the file; where a file is named in it, its path is relative to this."""
+    toml: str
+    """The file's text, as read."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the file's text: the rig's identity in a recording."""
+        return hashlib.sha256(self.toml.encode()).hexdigest()
+
+    @property
+    def n_inputs(self) -> int:
+        """Inputs of the whole rig: a row of a command."""
+        return self.plant.axes * self.plant.n_inputs
+
+    @property
+    def n_outputs(self) -> int:
+        """Outputs of the whole rig: rows of a path."""
+        return self.plant.axes * self.plant.n_outputs
+
+
+def load_rig(path_or_name: str | Path) -> Rig:
+    """Read and validate a rig file.
+
+    Parameters
+    ----------
+    path_or_name:
+        A TOML file, or the name of a rig that comes with aolink (see `builtin_rigs`).
+
+    Raises
+    ------
+    RigError
+        The file cannot be read, or what it says cannot work; the message names the key.
+    """
+    path = Path(path_or_name)
+    if path.suffix != ".toml" and str(path_or_name) in builtin_rigs():
+        path = Path(str(resources.files("aolink") / "rigs")) / f"{path_or_name}.toml"
+        text = path.read_text()
+    else:
+        try:
+            text = path.read_text()
+        except OSError as error:
+            if path.name.removesuffix(".toml") in builtin_rigs() and path.parent == Path():
+                return load_rig(path.name.removesuffix(".toml"))
+            raise RigError(
+                f"cannot read the rig file {path}: {error.strerror};"
+                f" give a TOML file or one of: {', '.join(builtin_rigs())}"
+            ) from None
+        except UnicodeDecodeError:
+            raise RigError(f"{path} is not a rig file: it is not text") from None
+    try:
+        return parse_rig(text, path.parent)
+    except RigError as error:
+        raise RigError(f"{path_or_name}: {error}") from None
+
+
+def builtin_rigs() -> list[str]:
+    """Names of the rigs that come with aolink."""
+    files = (resources.files("aolink") / "rigs").iterdir()
+    return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
+
+
+def parse_rig(text: str, folder: Path | None = None) -> Rig:
+    """Validate the text of a rig file. Raises `RigError`, naming the key."""
+    try:
+        root = Table(tomllib.loads(text), "")
+    except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number or nesting beyond what Python reads
+        raise RigError(f"not valid TOML: {error}") from None
+    root.finish(*_TABLES)
+    name, summary = root.text("name"), root.text("summary", "")
+    timing = read_timing(root.table("timing"))
+    optics = read_optics(root.table("lenslets"), read_grid(root.table("sensor"))) if root.has("lenslets") else None
+    plant = read_plant(root, optics, timing)
+    seen = (optics.field, optics.light) if optics else (None, None)
+    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, *seen)
+    n_inputs = plant.axes * plant.n_inputs
+    mirror = read_mirror(root.table("mirror"), n_inputs, timing)
+    drive = read_drive(root.table("drive", optional=True), n_inputs, mirror)
+    disturbance = read_disturbance(root.table("disturbance")) if root.has("disturbance") else None
+    if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
+        raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
+    scene = read_scene(root.table("scene")) if root.has("scene") else None
+    simulation = read_simulation(root.table("simulation", optional=True))
+    calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
+    return Rig(
+        name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
+        mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,
+        optics=optics, disturbance=disturbance, scene=scene, folder=folder or Path(), toml=text,
+    )  # fmt: skip

@@ -1,0 +1,80 @@
+"""The table ``[scene]`` of a rig file, and the picture that it names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RestorationError, RigError
+from aolink.optics.pictures import read_picture
+from aolink.optics.scene import SceneSensor
+from aolink.rig.sensor_tables import read_kernel
+from aolink.rig.toml_table import Table
+
+FloatArray = NDArray[np.float64]
+
+
+_SHIPPED = Path(__file__).parent.parent / "rigs"
+
+
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+def read_scene(table: Table) -> SceneSensor:
+    """The table ``[scene]``; the picture itself is not opened. Raises `RigError`."""
+    kernel_table = table.table("kernel")
+    kernel = read_kernel(kernel_table)
+    kernel_table.finish()
+    rows, columns = table.integers("pixels", 2, "rows and columns", low=2, high=8192)
+    sensor = SceneSensor(
+        shape=(rows, columns),
+        pixel_scale=table.number("pixel_scale", above=0.0),
+        kernel=kernel,
+        noise_sd=table.number("noise_sd", low=0.0),
+        bit_depth=table.integer("bit_depth", 16, low=1, high=16),
+        black_level=table.number("black_level", 0.0, low=0.0),
+        counts_per_intensity=table.number("counts_per_intensity", above=0.0),
+        picture=table.text("picture", ""),
+        picture_pixels=table.integer("picture_pixels", 1, low=1, high=64),
+    )
+    if sensor.black_level >= sensor.full_scale:
+        raise RigError(f"scene.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
+    table.finish()
+    return sensor
+
+
+def read_scene_picture(sensor: SceneSensor, folder: Path) -> FloatArray:
+    """The picture that a simulated rig shows, in its own, finer pixels; grey, 0 to 1 where it holds whole numbers.
+
+    Parameters
+    ----------
+    folder:
+        Of the rig file; what is not in it may come with aolink.
+
+    Raises
+    ------
+    RigError
+        There is none, it cannot be read, or it is smaller than the sensor's frame.
+    """
+    if not sensor.picture:
+        raise RigError("scene.picture is missing: a simulated rig needs a picture to show")
+    beside, shipped = folder / sensor.picture, _SHIPPED / sensor.picture
+    try:
+        found = read_picture(shipped if shipped.is_file() and not beside.is_file() else beside)
+    except RestorationError as error:
+        raise RigError(f"scene.picture: {error}") from None
+    if found.ndim == 3 and found.shape[2] in (3, 4):
+        grey = found[..., :3] @ np.array(_LUMINANCE)
+    else:
+        grey = found.astype(np.float64) if found.dtype.kind in "buif" else np.zeros(0)
+    if found.dtype.kind in "ui":
+        grey = grey / np.iinfo(found.dtype).max
+    needed = tuple(n * sensor.picture_pixels for n in sensor.shape)
+    if grey.ndim != 2 or grey.shape[0] < needed[0] or grey.shape[1] < needed[1] or not np.isfinite(grey).all():
+        raise RigError(
+            f"scene.picture: {beside} has shape {found.shape}, expected at least {needed[0]} x {needed[1]} finite"
+            " numbers (scene.pixels times scene.picture_pixels), better more: the scene goes on beyond the frame"
+        )
+    return np.asarray(grey, dtype=np.float64)

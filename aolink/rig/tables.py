@@ -1,0 +1,219 @@
+"""The tables of a rig file, read and validated; what is wrong is one `RigError` that names the key."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RigError
+from aolink.numerics.block_diagonal import stationary_covariance
+from aolink.rig.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
+from aolink.rig.parts import Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, UnmodelledSlopes
+from aolink.rig.sensor_tables import read_grid
+from aolink.rig.toml_table import Table, shape_text
+
+FloatArray = NDArray[np.float64]
+
+# A row of them, and their limits, in one message of the protocol.
+_MOST_INPUTS = 10_000
+# Each output has a coefficient of its own for the slopes that the model leaves out, and estimators keep the covariance
+# of all of them: of 512 it is 2 MB an exposure.
+_MOST_UNMODELLED = 512
+
+
+def read_plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
+    """The table ``[plant]``, of matrices or of a mirror that is described. Raises `RigError`."""
+    table = root.table("plant")
+    kind = table.choice("kind", ("matrices", "membrane", "tip-tilt"), "matrices")
+    if kind == "membrane":
+        if optics is None:
+            raise RigError("plant.kind = 'membrane' needs [lenslets], to know the slopes that deflections make")
+        model = read_membrane(table, optics, timing.fast_step_s)
+    elif kind == "tip-tilt":
+        spots = int(optics.lit.sum()) if optics else math.prod(read_grid(root.table("sensor")))
+        model = read_tip_tilt(table, spots, timing.fast_step_s)
+    else:
+        return _plant_by_matrices(table, timing)
+    # A number is the variance of each noise.
+    W = np.diag(table.vector("process_noise", model.B_w.shape[1], "noises"))
+    if (W < 0).any():
+        raise RigError("plant.process_noise has a variance below zero")
+    unmodelled = _read_unmodelled(table, len(model.C), timing)
+    table.finish()
+    initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
+    return Plant(
+        A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
+        initial_covariance=initial, axes=1, unmodelled=unmodelled,
+    )  # fmt: skip
+
+
+def _read_unmodelled(table: Table, n_outputs: int, timing: Timing) -> UnmodelledSlopes | None:
+    """The table ``[plant.unmodelled]``; None where the file has none."""
+    if not table.has("unmodelled"):
+        return None
+    if n_outputs > _MOST_UNMODELLED:
+        raise RigError(
+            f"{table.key('unmodelled')} is for at most {_MOST_UNMODELLED} slopes of one plant, this one has"
+            f" {n_outputs}: leave it out"
+        )
+    slopes = table.table("unmodelled")
+    unmodelled = UnmodelledSlopes(
+        sd=slopes.number("sd", above=0.0),
+        correlation_steps=slopes.number("correlation_s", above=0.0) / timing.fast_step_s,
+    )
+    slopes.finish()
+    return unmodelled
+
+
+def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
+    A = table.matrix("A", (None, None), "states x states")
+    n = A.shape[0]
+    if A.shape != (n, n):
+        raise RigError(f"plant.A has shape {shape_text(A)}, expected a square matrix (states x states)")
+    radius = float(np.abs(np.linalg.eigvals(A)).max())
+    if radius > 1 + 1e-9:
+        raise RigError(f"plant.A is unstable: its largest eigenvalue has modulus {radius:.6g}, it must be at most 1")
+    B = table.matrix("B", (n, None), "states x inputs")
+    B_w = table.matrix("B_w", (n, None), "states x process noises")
+    C = table.matrix("C", (None, n), "outputs x states")
+    if not C.any():
+        raise RigError("plant.C is zero: the camera sees nothing of the plant, nothing is observable")
+    W = _covariance(table, "process_noise", B_w.shape[1], "noises x noises")
+    mean = table.vector("initial_mean", n, "states", 0.0)
+    if table.get("initial_covariance", "stationary") == "stationary":
+        if radius > 1 - 1e-9:
+            raise table.missing(
+                "initial_covariance",
+                f"plant.A has an eigenvalue of modulus {radius:.6g}, so there is no stationary covariance;"
+                " give a matrix",
+            )
+        covariance = stationary_covariance(A, B_w @ W @ B_w.T)
+    else:
+        covariance = _covariance(table, "initial_covariance", n, "states x states")
+    axes = table.integer("axes", 1, low=1, high=10_000)
+    unmodelled = _read_unmodelled(table, len(C), timing)
+    table.finish()
+    return Plant(
+        A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes,
+        unmodelled=unmodelled,
+    )  # fmt: skip
+
+
+def _covariance(table: Table, name: str, size: int, why: str) -> FloatArray:
+    matrix = table.matrix(name, (size, size), why)
+    if not np.allclose(matrix, matrix.T):
+        raise RigError(f"{table.key(name)} is not symmetric, a covariance must be")
+    lowest = float(np.linalg.eigvalsh(matrix).min())
+    if lowest < -1e-12 * max(1.0, float(np.abs(matrix).max())):
+        raise RigError(f"{table.key(name)} has the negative eigenvalue {lowest:.3g}, a covariance has none")
+    return matrix
+
+
+def read_timing(table: Table) -> Timing:
+    """The table ``[timing]``. Raises `RigError`."""
+    fast_step_s = table.number("fast_step_s", above=0.0)
+    steps = table.integer("exposure_steps", low=1, high=1_000_000)
+    period = table.integer("frame_period_steps", steps, low=1, high=10_000_000)
+    if period < steps:
+        raise RigError(f"timing.frame_period_steps = {period} is shorter than timing.exposure_steps = {steps}")
+    if abs(fast_step_s * 1e9 - round(fast_step_s * 1e9)) > 1e-6:
+        raise RigError(f"timing.fast_step_s = {fast_step_s!r} is not a whole number of nanoseconds")
+    offset = table.number("exposure_offset", 0.0, low=0.0)
+    if offset >= 1:
+        raise RigError(f"timing.exposure_offset = {offset:g} is a part of a fast step: it must be below 1")
+    offset_ns = offset * fast_step_s * 1e9
+    if abs(offset_ns - round(offset_ns)) > 1e-6:
+        raise RigError(f"timing.exposure_offset = {offset!r} of a fast step is not a whole number of nanoseconds")
+    table.finish()
+    return Timing(
+        fast_step_s=fast_step_s, exposure_steps=steps, frame_period_steps=period, exposure_offset=offset
+    )  # fmt: skip
+
+
+def read_mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
+    """The table ``[mirror]``. Raises `RigError`."""
+    law = read_voltage(table.table("voltage")) if table.has("voltage") else None
+    if law and (table.has("input_min") or table.has("input_max")):
+        raise RigError("mirror.input_min and mirror.input_max follow from [mirror.voltage]: leave them out")
+    low = np.full(n_inputs, law.input_range[0]) if law else table.vector("input_min", n_inputs, "inputs")
+    high = np.full(n_inputs, law.input_range[1]) if law else table.vector("input_max", n_inputs, "inputs")
+    if (low >= high).any():
+        raise RigError("mirror.input_min must be below mirror.input_max for every input")
+    park = table.vector("park", n_inputs, "inputs", 0.0)
+    if (park < low).any() or (park > high).any():
+        raise RigError("mirror.park is outside mirror.input_min .. mirror.input_max: the safe input must be allowed")
+    if n_inputs > _MOST_INPUTS:
+        raise RigError(
+            f"the mirror has {n_inputs} inputs (plant.axes times the columns of plant.B): at most {_MOST_INPUTS}"
+        )
+    # A block is one packet, 4 KiB of 8-byte numbers; where not even one step fits, it goes in parts.
+    in_packet, in_parts = 4096 // (8 * n_inputs), 65_536 // (8 * n_inputs)
+    most = in_packet or max(1, in_parts)
+    block = table.integer("block_steps", min(50, most), low=1)
+    if block > most:
+        room = "one packet" if in_packet else "64 KiB"
+        raise RigError(f"mirror.block_steps = {block} does not fit into {room}: at most {most} for {n_inputs} inputs")
+    queue = table.integer("queue_steps", 8 * block, low=1)
+    if queue < 2 * block:
+        raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")
+    driver = MirrorDriver(
+        input_min=low,
+        input_max=high,
+        park=park,
+        dac_bits=table.integer("dac_bits", 16, low=0, high=32),
+        block_steps=block,
+        queue_steps=queue,
+        watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
+        voltage=law,
+    )
+    table.finish()
+    return driver
+
+
+def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
+    """The table ``[drive]``. Raises `RigError`."""
+    kind = table.choice("kind", ("none", "sine"), "none")
+    offset = table.vector("offset", n_inputs, "inputs", 0.0)
+    amplitude = table.vector("amplitude", n_inputs, "inputs", None if kind == "sine" else 0.0)
+    period = table.number("period_s", None if kind == "sine" else 1.0, above=0.0)
+    for name, reach in (("input_min", offset - np.abs(amplitude)), ("input_max", offset + np.abs(amplitude))):
+        if (reach < mirror.input_min).any() or (reach > mirror.input_max).any():
+            raise RigError(f"drive.amplitude and drive.offset reach beyond mirror.{name}: the mirror would refuse it")
+    table.finish()
+    return Drive(kind=kind, amplitude=amplitude, period_s=period, offset=offset)
+
+
+def read_simulation(table: Table) -> Simulation:
+    """The table ``[simulation]``. Raises `RigError`."""
+    faults_table = table.table("faults", optional=True)
+    faults = Faults(**{name: faults_table.rate(name) for name in Faults.__dataclass_fields__})
+    faults_table.finish()
+    simulation = Simulation(
+        seed=table.integer("seed", 1, low=0),
+        light=parse_light(table.text("light", "moving"), table.key("light")),
+        clock_offset_s=table.number("clock_offset_s", 0.0),
+        clock_drift_ppm=table.number("clock_drift_ppm", 0.0),
+        latency_s=table.number("latency_s", 100e-6, low=0.0),
+        faults=faults,
+    )
+    table.finish()
+    return simulation
+
+
+def parse_light(text: str, name: str) -> tuple[Light, ...]:
+    """Lights in a row, ``dark,flat:4,still``; ``name`` is what an error calls them. Raises RigError."""
+    lights = []
+    for word in text.split(","):
+        kind, colon, level = word.strip().partition(":")
+        if kind not in ("dark", "flat", "still", "moving") or (colon and kind != "flat"):
+            raise RigError(f"{name}: {word.strip()!r} is not known: use dark, flat, flat:DENSITY, still, moving")
+        try:
+            density = float(level) if colon else None
+        except ValueError:
+            density = math.nan
+        if density is not None and not 0 < density < math.inf:
+            raise RigError(f"{name}: the density of {word.strip()!r} must be a number above 0")
+        lights.append(Light(kind=kind, level=density))  # type: ignore[arg-type] # one of the four, as checked
+    return tuple(lights)

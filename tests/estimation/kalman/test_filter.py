@@ -1,0 +1,428 @@
+"""The recursion, given moments: against filterpy, against its own printed forms, axis by axis."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
+from scipy import linalg, stats
+
+from aolink.estimation.estimate import Status
+from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.kalman.filter import BlurFilter
+from aolink.estimation.kalman.observation import (
+    Belief,
+    PathMoments,
+    corrected,
+    corrected_by_blocks,
+    many_moments,
+    predicted_moments,
+    steady_gain,
+)
+from aolink.estimation.model.exposure_model import exposure_model
+from aolink.plant.lifting import lift
+from aolink.rig import load_rig
+
+LIVELY = load_rig("section-vi-lively")
+PLANT, N = LIVELY.plant, 200
+R = np.diag([2 / 3, 2 / 5]) * 0.01
+ORDERS = {"o1": (1,), "o2": (2,), "o3": (1, 2)}
+
+
+def brute_moments(plant, x, u, orders):
+    """Moments of the path of a state under inputs, step by step, an output's orders together."""
+    x, path = x.copy(), []
+    for k in range(len(u)):
+        path.append(plant.C @ x)
+        x = plant.A @ x + plant.B @ u[k]
+    path = np.array(path)
+    return np.array([np.mean(path[:, o] ** p) for o in range(path.shape[1]) for p in orders])
+
+
+def difference(function, x, h=1e-5):
+    """Central differences, a column for each entry of x."""
+    return np.transpose([(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))])
+
+
+def scenario(n_exposures=25, seed=0, offset=0.3):
+    """Inputs and noisy moments of the lively plant about an offset."""
+    rng = np.random.default_rng(seed)
+    u = 0.006 * np.sin(np.arange(n_exposures * N) / 3000)[:, None].reshape(n_exposures, N, 1) + 0.0198 * offset
+    x = np.array([offset, 0.0]) + np.linalg.cholesky(PLANT.initial_covariance) @ rng.standard_normal(2)
+    moments, states = [], []
+    for j in range(n_exposures):
+        states.append(x)
+        path = []
+        for k in range(N):
+            path.append((PLANT.C @ x)[0])
+            x = PLANT.A @ x + PLANT.B @ u[j, k] + PLANT.B_w[:, 0] * np.sqrt(10) * rng.standard_normal()
+        moments.append([np.mean(path), np.mean(np.square(path))])
+    noise = rng.standard_normal((n_exposures, 2)) @ np.sqrt(R)
+    return u, np.array(moments) + noise, np.array(states)
+
+
+def selected(orders):
+    return [p - 1 for p in orders]
+
+
+def our_steps(plant, orders, u, moments, gain=None, **options):
+    filter_ = BlurFilter(plant, PathMoments(plant.n_outputs, orders, gain), **options)
+    model = exposure_model(plant, u.shape[1])
+    pick = selected(orders)
+    for inputs, y in zip(u, moments, strict=True):
+        measurement = Measurement(value=y[None, pick], covariance=R[np.ix_(pick, pick)][None])
+        yield filter_.step(model, model.response(inputs), measurement)
+
+
+@pytest.mark.parametrize("name", ["o1", "o2", "o3"])
+def test_every_step_is_filterpys(name):
+    u, moments, _ = scenario()
+    orders, pick = ORDERS[name], selected(ORDERS[name])
+    A_N, Q = lift(PLANT, N)
+    ekf = ExtendedKalmanFilter(dim_x=2, dim_z=len(orders), dim_u=2)
+    ekf.x, ekf.P = PLANT.initial_mean[:, None].copy(), PLANT.initial_covariance.copy()
+    ekf.F, ekf.Q, ekf.R, ekf.B = A_N, Q, R[np.ix_(pick, pick)], np.eye(2)
+    for inputs, y, ours in zip(u, moments, our_steps(PLANT, orders, u, moments), strict=True):
+        ekf.update(
+            y[pick][:, None],
+            lambda x, v=inputs: difference(lambda z: brute_moments(PLANT, z, v, orders), x[:, 0], h=1.0),
+            lambda x, v=inputs: brute_moments(PLANT, x[:, 0], v, orders)[:, None],
+        )
+        np.testing.assert_allclose(ours.start.mean[0], ekf.x[:, 0], atol=1e-9)
+        np.testing.assert_allclose(ours.start.covariance[0], ekf.P, atol=1e-9)
+        np.testing.assert_allclose(ours.innovation[0], ekf.y[:, 0], atol=1e-9)
+        np.testing.assert_allclose(ours.innovation_covariance[0], ekf.S, atol=1e-9)
+        assert ours.nis[0] == pytest.approx(float((ekf.y.T @ ekf.SI @ ekf.y)[0, 0]), abs=1e-9)
+        kick = np.zeros(2)
+        for v in inputs:
+            kick = PLANT.A @ kick + PLANT.B @ v
+        ekf.predict(u=kick[:, None])
+        np.testing.assert_allclose(ours.end.mean[0], ekf.x[:, 0], atol=1e-9)
+        np.testing.assert_allclose(ours.end.covariance[0], ekf.P, atol=1e-9)
+
+
+def test_steady_gain_is_where_filterpys_gain_settles():
+    model = exposure_model(PLANT, N)
+    kf = KalmanFilter(dim_x=2, dim_z=1)
+    kf.F, kf.Q, kf.H, kf.R = model.transition, model.process_noise, model.mean_row, R[:1, :1]
+    kf.P = PLANT.initial_covariance.copy()
+    for _ in range(300):
+        kf.update(np.zeros((1, 1)))
+        kf.predict()
+    np.testing.assert_allclose(steady_gain(model, model.process_noise, R[:1, :1]), kf.K, atol=1e-10)
+
+
+def test_with_the_steady_gain_the_filter_settles_where_the_optimal_one_does():
+    u, moments, _ = scenario(60)
+    model = exposure_model(PLANT, N)
+    gain = steady_gain(model, model.process_noise, R[:1, :1])
+    *_, optimal = our_steps(PLANT, (1,), u, moments)
+    *_, steady = our_steps(PLANT, (1,), u, moments, gain=gain)
+    np.testing.assert_allclose(steady.end.mean, optimal.end.mean, rtol=1e-6)
+    np.testing.assert_allclose(steady.end.covariance, optimal.end.covariance, rtol=1e-6)
+
+
+def test_there_is_no_steady_gain_where_the_centroid_loses_an_undamped_mode():
+    angle = 2 * np.pi * 10e-3
+    A = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    model = exposure_model(dataclasses.replace(PLANT, A=A), N)
+    assert steady_gain(model, model.process_noise, R[:1, :1]) is None
+
+
+def test_predicted_moments_and_jacobians_of_coupled_outputs(mimo, with_axes):
+    plant = with_axes(mimo, 2)
+    model = exposure_model(plant, 40)
+    rng = np.random.default_rng(7)
+    x, u = rng.standard_normal((2, 3)), rng.standard_normal((40, 4))
+    h, H = predicted_moments(model, model.response(u), x, (1, 2))
+    for axis in range(2):
+        own = u[:, 2 * axis : 2 * axis + 2]
+        np.testing.assert_allclose(h[axis], brute_moments(plant, x[axis], own, (1, 2)), atol=1e-9)
+        slopes = difference(lambda z, v=own: brute_moments(plant, z, v, (1, 2)), x[axis], h=1e-3)
+        np.testing.assert_allclose(H[axis], slopes, atol=1e-7)
+
+
+# Each of the paper's misprints, as printed: the filter must be none of these.
+
+
+def test_misprint_1_the_innovation_of_the_second_moment():
+    """(20) takes H x for the predicted second moment: twice h(x), as h is quadratic."""
+    model = exposure_model(PLANT, N)
+    x = np.array([[0.5, 0.1]])
+    h, H = predicted_moments(model, model.response(np.zeros((N, 1))), x, (2,))
+    assert h[0, 0] == pytest.approx(brute_moments(PLANT, x[0], np.zeros((N, 1)), (2,))[0])
+    printed = (H[0] @ x[0])[0]
+    assert printed == pytest.approx(2 * h[0, 0])
+
+
+def test_misprint_1_would_ruin_the_estimate():
+    u, moments, states = scenario()
+    errors, printed_errors = [], []
+    A_N, Q = lift(PLANT, N)
+    model = exposure_model(PLANT, N)
+    x, P = PLANT.initial_mean, PLANT.initial_covariance
+    for inputs, y, truth, ours in zip(u, moments, states, our_steps(PLANT, (1, 2), u, moments), strict=True):
+        response = model.response(inputs)
+        h, H = predicted_moments(model, response, x[None], (1, 2))
+        K = P @ H[0].T @ np.linalg.inv(H[0] @ P @ H[0].T + R)
+        x, P = x + K @ (y - [h[0, 0], H[0, 1] @ x]), P - K @ H[0] @ P
+        printed_errors.append(x[0] - truth[0])
+        errors.append(ours.start.mean[0, 0] - truth[0])
+        x, P = A_N @ x + response.end[0], A_N @ P @ A_N.T + Q
+    assert np.linalg.norm(printed_errors) > 1.5 * np.linalg.norm(errors)
+
+
+def test_misprint_2_inputs_move_the_spot_inside_the_exposure():
+    """(12) to (15) know the start state only."""
+    u, x = np.full((N, 1), 0.02), np.array([[0.1, 0.0]])
+    model = exposure_model(PLANT, N)
+    h, H = predicted_moments(model, model.response(u), x, (1, 2))
+    printed_h, printed_H = predicted_moments(model, model.response(0 * u), x, (1, 2))
+    np.testing.assert_allclose(h[0], brute_moments(PLANT, x[0], u, (1, 2)), atol=1e-12)
+    assert (np.abs(h - printed_h) > 5 * np.sqrt(R.diagonal()) / 100).all()
+    slopes = difference(lambda z: brute_moments(PLANT, z, u, (1, 2)), x[0])
+    np.testing.assert_allclose(H[0], slopes, atol=1e-8)
+    assert np.abs(printed_H[0] - slopes).max() > 0.01
+
+
+def test_misprint_3_the_moments_belong_to_the_start_of_their_exposure():
+    """(14) has y(k+N) from x(k); (18) to (20) correct x(k+N) with it. On a moving spot that lags."""
+    quiet = dataclasses.replace(PLANT, process_noise=np.zeros((1, 1)), initial_covariance=np.eye(2) * 0.01)
+    u = np.zeros((1, N, 1))
+    x = np.array([0.4, -1.0])
+    y = brute_moments(quiet, x, u[0], (1, 2))
+    (ours,) = our_steps(quiet, (1, 2), u, [y])
+    A_N, _ = lift(quiet, N)
+    model = exposure_model(quiet, N)
+    np.testing.assert_allclose(ours.end.mean[0], A_N @ ours.start.mean[0], atol=1e-12)
+    h, _ = predicted_moments(model, model.response(u[0]), x[None], (1, 2))
+    np.testing.assert_allclose(h[0], y, atol=1e-12)
+    late, _ = predicted_moments(model, model.response(u[0]), (A_N @ x)[None], (1, 2))
+    assert np.abs(late[0] - y).max() > 0.01
+
+
+def test_misprint_4_the_noise_of_an_exposure():
+    """(17) adds B_w W B_w', the noise of one fast step. With it the filter claims far too much."""
+    u, moments, states = scenario(200, seed=3)
+    nees = {}
+    for kind in ("lifted", "printed"):
+        steps = list(our_steps(PLANT, (1,), u, moments, process_noise=kind, gate=False))
+        errors = np.array([s.start.mean[0] for s in steps]) - states
+        nees[kind] = np.mean(
+            [e @ np.linalg.solve(s.start.covariance[0], e) for e, s in zip(errors, steps, strict=True)]
+        )
+    assert nees["printed"] > 3 * nees["lifted"]
+    assert nees["lifted"] < 3
+
+
+def test_at_zero_state_and_input_the_second_moment_says_nothing():
+    """Remark 2: o2 needs an offset, x and -x look alike."""
+    model = exposure_model(PLANT, N)
+    response = model.response(np.zeros((N, 1)))
+    _, H = predicted_moments(model, response, np.zeros((1, 2)), (2,))
+    assert not H.any()
+    x = np.array([[0.3, 0.2]])
+    here, _ = predicted_moments(model, response, x, (2,))
+    there, _ = predicted_moments(model, response, -x, (2,))
+    np.testing.assert_array_equal(here, there)
+
+
+# Trust
+
+
+def test_one_wild_moment_is_gated_and_many_start_the_filter_again():
+    u, moments, _ = scenario(12)
+    moments[4:9] += 50.0
+    statuses = [Status(int(s.status[0])) for s in our_steps(PLANT, (1, 2), u, moments)]
+    gated = [Status.GATED, Status.GATED, Status.DIVERGED, Status.GATED, Status.GATED]
+    assert statuses == [Status.OK] * 4 + gated + [Status.OK] * 3
+
+
+def test_a_filter_that_was_lost_starts_again_from_the_plant_and_finds_the_spot():
+    u, moments, states = scenario(30)
+    lost = BlurFilter(PLANT, PathMoments(1, (1, 2)))
+    lost.belief = dataclasses.replace(lost.belief, mean=np.array([[9.0, 0.0]]), covariance=np.eye(2)[None] * 1e-6)
+    model = exposure_model(PLANT, N)
+    statuses = []
+    for inputs, y in zip(u, moments, strict=True):
+        step = lost.step(model, model.response(inputs), Measurement(value=y[None], covariance=R[None]))
+        statuses.append(Status(int(step.status[0])))
+    assert statuses[2:4] == [Status.DIVERGED, Status.REINITIALISED]
+    assert set(statuses[4:]) == {Status.OK}
+    assert abs(step.start.mean[0, 0] - states[-1, 0]) < 0.3
+
+
+def test_nothing_makes_it_nan_or_its_covariance_indefinite():
+    u, moments, _ = scenario(40)
+    moments = moments * np.random.default_rng(1).choice([0, 1, -1e3, 1e6, 1e150], moments.shape)
+    for orders in ORDERS.values():
+        for step in our_steps(PLANT, orders, u, moments, gate=False):
+            assert np.isfinite(step.nis).all()
+            for belief in (step.start, step.end):
+                assert np.isfinite(belief.mean).all()
+                assert np.linalg.eigvalsh(belief.covariance[0]).min() >= -1e-12
+
+
+def test_a_gap_is_bridged_as_the_steps_one_by_one_would():
+    u = np.random.default_rng(2).standard_normal((77, 1)) * 0.01
+    once, stepwise = BlurFilter(PLANT, None), BlurFilter(PLANT, None)
+    once.bridge(u)
+    for k in range(77):
+        stepwise.bridge(u[k : k + 1])
+    np.testing.assert_allclose(once.belief.mean, stepwise.belief.mean, atol=1e-12)
+    np.testing.assert_allclose(once.belief.covariance, stepwise.belief.covariance, atol=1e-12)
+
+
+def test_innovations_of_a_linear_world_are_consistent():
+    """Moments made from the model itself: NIS is chi-square."""
+    rng = np.random.default_rng(9)
+    axes = 4000
+    plant = dataclasses.replace(PLANT, axes=axes)
+    model = exposure_model(plant, N)
+    root = np.linalg.cholesky(plant.initial_covariance)
+    x = rng.standard_normal((axes, 2)) @ root.T
+    y = x @ model.mean_row.T + np.sqrt(R[0, 0]) * rng.standard_normal((axes, 1))
+    step = BlurFilter(plant, PathMoments(1, (1,))).step(
+        model, model.response(np.zeros((N, axes))), Measurement(value=y, covariance=R[None, :1, :1])
+    )
+    assert stats.kstest(step.nis, stats.chi2(1).cdf).pvalue > 1e-3
+    errors = step.start.mean - x
+    nees = np.einsum("ai,aij,aj->a", errors, np.linalg.inv(step.start.covariance), errors)
+    assert stats.kstest(nees, stats.chi2(2).cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("orders", ORDERS.values(), ids=ORDERS)
+@pytest.mark.parametrize("axes", [1, 7])
+@pytest.mark.parametrize("which", ["paper", "coupled"])
+def test_an_axis_does_not_depend_on_those_beside_it(orders, axes, which, mimo, with_axes):
+    plant = PLANT if which == "paper" else mimo
+    rng = np.random.default_rng(6)
+    count = plant.n_outputs * len(orders)
+    u = 0.01 * rng.standard_normal((10, 50, 64 * plant.n_inputs))
+    y = 0.3 * rng.standard_normal((10, 64, count))
+    y[5, ::3] = 1e6  # some are gated
+
+    def steps(n_axes):
+        filter_ = BlurFilter(with_axes(plant, n_axes), PathMoments(plant.n_outputs, orders))
+        model = exposure_model(filter_.plant, 50)
+        filter_.bridge(u[0, :13, : n_axes * plant.n_inputs])
+        for inputs, moments in zip(u, y, strict=True):
+            response = model.response(inputs[:, : n_axes * plant.n_inputs])
+            noise = np.broadcast_to(0.01 * np.eye(count), (n_axes, count, count))
+            yield filter_.step(model, response, Measurement(value=moments[:n_axes], covariance=noise))
+
+    for few, many in zip(steps(axes), steps(64), strict=True):
+        for ours, theirs in (
+            (few.start.mean, many.start.mean),
+            (few.end.mean, many.end.mean),
+            (few.start.covariance, many.start.covariance),
+            (few.end.covariance, many.end.covariance),
+            (few.nis, many.nis),
+            (few.status, many.status),
+        ):
+            np.testing.assert_array_equal(ours, theirs[:axes])
+
+
+def test_what_is_believed_without_a_camera_settles_and_moves_on_with_gaps():
+    """The covariance is not computed again where it no longer changes; a gap, or another exposure, changes it."""
+    cold = dataclasses.replace(PLANT, initial_covariance=np.zeros((2, 2)))
+    filter_, model = BlurFilter(cold, PathMoments(1, (1,))), exposure_model(cold, N)
+    response = model.response(np.zeros((N, 1)))
+    expected = np.zeros((2, 2))
+    for _ in range(100):
+        filter_.step(model, response, None)
+        expected = model.transition @ expected @ model.transition.T + model.process_noise
+        np.testing.assert_allclose(filter_._unseen.covariance[0], expected, rtol=1e-10, atol=1e-12)
+    filter_.bridge(np.zeros((7, 1)))
+    transition, noise = lift(cold, 7)
+    expected = transition @ expected @ transition.T + noise
+    np.testing.assert_allclose(filter_._unseen.covariance[0], expected, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("gain", [None, np.array([[0.3, 0.1], [2.0, -1.0]])])
+def test_written_out_it_is_the_correction_in_matrices(gain):
+    rng = np.random.default_rng(3)
+    plant = dataclasses.replace(PLANT, axes=50)
+    model = exposure_model(plant, N)
+    roots = rng.standard_normal((2, 50, 2, 2))
+    P, noise = roots @ roots.swapaxes(-1, -2)
+    prior, y = Belief(rng.standard_normal((50, 2)), P), rng.standard_normal((50, 2))
+    response = model.response(0.01 * rng.standard_normal((N, 50)))
+    ours = PathMoments(1, (1, 2), gain).correct(model, response, prior, Measurement(value=y, covariance=noise))
+    h, H = predicted_moments(model, response, prior.mean, (1, 2))
+    theirs = corrected(prior, y - h, H, noise, gain)
+    np.testing.assert_allclose(ours.posterior.mean, theirs.posterior.mean, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, rtol=1e-7, atol=1e-11)
+    np.testing.assert_allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-9)
+    np.testing.assert_allclose(ours.nis, theirs.nis, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("rank", "first", "correlation"),
+    [*((rank, 2.0, correlation) for rank in (0, 1, 2) for correlation in (0.0, 0.9)), (1, 0.0, 0.0), (2, 0.0, 0.0)],
+)
+@pytest.mark.parametrize("one_noise", [True, False])
+def test_the_short_correction_is_josephs(rank, first, correlation, one_noise):
+    """Two states, two measurements: singular priors, correlated noise or none, one for all axes or one for each."""
+    rng, axes = np.random.default_rng(3), 500
+    model = exposure_model(dataclasses.replace(PLANT, axes=axes), N)
+    response = model.response(rng.normal(0, 0.01, (N, axes)))
+    root = rng.standard_normal((axes, 2, rank))
+    prior = Belief(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2))
+    noise = 1e-3 * np.array([[first, correlation], [correlation, 1.0]])
+    noises = np.broadcast_to(noise, (axes, 2, 2)) if one_noise else noise * rng.uniform(0.5, 2, (axes, 1, 1))
+    moments = rng.standard_normal((axes, 2))
+    ours = PathMoments(1, (1, 2)).correct(model, response, prior, Measurement(value=moments, covariance=noises))
+    h, H = predicted_moments(model, response, prior.mean, (1, 2))
+    josephs = corrected(prior, moments - h, H, noises)
+    np.testing.assert_allclose(ours.posterior.mean, josephs.posterior.mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(ours.posterior.covariance, josephs.posterior.covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(ours.innovation_covariance, josephs.innovation_covariance, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ours.nis, josephs.nis, rtol=1e-7)
+    assert np.linalg.eigvalsh(ours.posterior.covariance).min() > -1e-12
+
+
+@pytest.mark.parametrize("blocks", [3, 40])
+@pytest.mark.parametrize("rank", [2, 5])
+@pytest.mark.parametrize("fixed", [False, True])
+def test_by_blocks_it_is_the_same_correction(blocks, rank, fixed):
+    """Few states, measurements whose noise is shared within blocks of two; priors that may be singular."""
+    rng, axes, n, m = np.random.default_rng(2), 3, 5, 2 * blocks
+    root = rng.standard_normal((axes, n, rank))
+    prior = Belief(rng.standard_normal((axes, n)), root @ root.swapaxes(1, 2))
+    R = rng.standard_normal((axes, blocks, 2, 2))
+    R = 1e-3 * (R @ R.swapaxes(2, 3) + np.eye(2))
+    H, innovation = rng.standard_normal((axes, m, n)), rng.standard_normal((axes, m))
+    gain = 0.01 * rng.standard_normal((n, m)) if fixed else None
+    ours = corrected_by_blocks(prior, innovation, H, R, gain)
+    theirs = corrected(prior, innovation, H, np.array([linalg.block_diag(*each) for each in R]), gain)
+    np.testing.assert_allclose(ours.posterior.mean, theirs.posterior.mean, rtol=1e-9, atol=1e-9)
+    scale = np.abs(theirs.posterior.covariance).max()
+    np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, atol=1e-9 * scale)
+    np.testing.assert_allclose(ours.nis, theirs.nis, rtol=1e-9)
+    whole = theirs.innovation_covariance
+    np.testing.assert_allclose(
+        ours.innovation_covariance, whole if m <= 32 else np.einsum("amm->am", whole), rtol=1e-9, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("orders", [(1,), (2,), (1, 2)])
+def test_many_moments_at_once_are_the_same_moments(mimo, orders):
+    rng = np.random.default_rng(4)
+    model = exposure_model(dataclasses.replace(mimo, C=rng.standard_normal((7, 3))), 30)
+    response = model.response(rng.standard_normal((30, model.plant.axes * model.plant.n_inputs)))
+    state = rng.standard_normal((model.plant.axes, 3))
+    for ours, theirs in zip(
+        many_moments(model, response, state, orders), predicted_moments(model, response, state, orders), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-12)
+
+
+def test_the_gain_of_many_outputs_is_that_of_all_of_them(mimo):
+    rng = np.random.default_rng(5)
+    model = exposure_model(dataclasses.replace(mimo, C=rng.standard_normal((12, 3))), 30)
+    blocks = rng.standard_normal((6, 2, 2))
+    noise = blocks @ blocks.swapaxes(1, 2) + 0.1 * np.eye(2)
+    ours = steady_gain(model, model.process_noise, noise)
+    theirs = steady_gain(model, model.process_noise, linalg.block_diag(*noise))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-10)

@@ -1,0 +1,423 @@
+"""Compiled code against its twins in NumPy, on frames of every kind; and nothing left to compile in a session."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from aolink.estimation import exposure_model, make_estimator
+from aolink.estimation.compiled import forget_stale, small
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.moments.windowed import Profile
+from aolink.estimation.pixels import likelihood, modes
+from aolink.estimation.pixels.filter import HypothesisFilter
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, log_determinant, single
+from aolink.estimation.pixels.importance import importance_corrected
+from aolink.estimation.pixels.modes import (
+    Modes,
+    broad,
+    find_modes,
+    innovation,
+    modes_of,
+    spread_starts,
+    whitened,
+    without_repeats,
+)
+from aolink.estimation.pixels.updates import MIXTURE, PROFILE, explored
+from aolink.optics.camera import to_density
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+LIVELY = load_rig("section-vi-lively")
+
+
+def changed(rig, **sensor):
+    return dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, **sensor))
+
+
+def exposures_of(rig, count, seed):
+    steps = count * rig.timing.exposure_steps
+    return simulate(rig, count, seed=seed, inputs=np.zeros((steps, rig.n_inputs)))
+
+
+def side_by_side(rig, axes):
+    return dataclasses.replace(rig, plant=dataclasses.replace(rig.plant, axes=axes))
+
+
+AXES = 12
+KINDS = {
+    "lively": changed(LIVELY, noise_density=0.01),
+    "bright": changed(LIVELY, noise_density=0.001),
+    "shot noise": changed(LIVELY, noise_density=0.001, photoelectrons=300.0),
+    "few pixels": changed(LIVELY, pixels=16, kernel=dataclasses.replace(LIVELY.sensor.kernel, sigma=0.1)),
+    "fine pixels": changed(LIVELY, pixels=160, noise_density=0.001),
+    "dark pixels": changed(LIVELY, noise_density=0.01),
+    "between steps": dataclasses.replace(
+        changed(LIVELY, noise_density=0.01), timing=dataclasses.replace(LIVELY.timing, exposure_offset=0.4)
+    ),
+    "jitter": load_rig("jitter"),
+}
+
+
+def looked_at(kind):
+    """A view of many axes and a prior of their start states; the first of them is of a spot beyond the sensor."""
+    rig = side_by_side(KINDS[kind], AXES)
+    (exposure,) = exposures_of(rig, 1, 5)
+    sensor = rig.sensor
+    density = to_density(sensor, exposure.pixels).reshape(AXES, -1)
+    mask = np.ones(density.shape, dtype=bool)
+    if kind == "dark pixels":
+        mask[:, ::7], mask[3], mask[4, :20] = False, False, False
+    model = exposure_model(rig.plant, exposure.n_steps, exposure.start_offset)
+    measured = Profile(density=np.where(mask, density, 0.0), mask=mask)
+    view = likelihood.PixelView(
+        sensor, model, model.response(exposure.inputs), measured, likelihood.reduction(model, sensor)
+    )  # fmt: skip
+    assert view.compiled
+    n, P = rig.plant.n_states, rig.plant.initial_covariance / 9
+    away = np.random.default_rng(1).standard_normal((AXES, n)) @ np.linalg.cholesky(P + 1e-12 * np.eye(n)).T
+    mean = exposure.truth.start_state.reshape(AXES, n) + away
+    mean[0, 0] += 30.0
+    in_numpy = view.part(slice(None))
+    in_numpy.compiled = False
+    return view, in_numpy, Belief(mean, np.tile(P, (AXES, 1, 1)))
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def pair(request):
+    return looked_at(request.param)
+
+
+def test_likelihood_of_many_points(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    rng = np.random.default_rng(2)
+    t = prior.mean[:, None] + rng.standard_normal((AXES, 40, view.reduced.size)) * 0.3
+    f = in_numpy.predicted(t)
+    ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)
+    # An error of the light by 2e-7 of the brightest pixel moves it by what that is of a pixel's noise, times residuals.
+    noise = np.sqrt(view.read_noise)
+    residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
+    assert np.all(np.abs(ours - theirs) < 2e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
+
+
+def test_windowed_moments(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    ours, theirs = broad(view, prior), broad(in_numpy, prior)
+    sd = np.sqrt(np.einsum("aii->ai", theirs.covariance))
+    np.testing.assert_allclose(ours.mean / sd, theirs.mean / sd, atol=3e-5)
+    np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-5 * sd.max() ** 2)
+
+
+def test_starts(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    wide = broad(in_numpy, prior)
+    (ours, squares), (theirs, their_squares) = (spread_starts(each, prior, wide) for each in (view, in_numpy))
+    np.testing.assert_allclose(squares, their_squares, atol=1e-9 * their_squares.max())
+    np.testing.assert_allclose(ours[:, 0], theirs[:, 0], atol=1e-6)
+    # A direction is one whichever way it points.
+    both = np.sort(ours[:, 1:3], axis=1), np.sort(theirs[:, 1:3], axis=1)
+    assert np.quantile(np.abs(both[0] - both[1]), 0.9) < 1e-4
+
+
+def test_every_start_leads_to_the_same_mode(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    starts, _ = spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    for k in range(starts.shape[1]):
+        ours, theirs = (find_modes(each, prior, starts[:, k : k + 1], 40, 1e-4) for each in (view, in_numpy))
+        # A long search may end in another mode, as one that begins 1e-6 away may.
+        settled = np.abs(ours.objective - theirs.objective) < 0.02
+        assert settled.mean() > 0.6
+        sd = np.sqrt(np.einsum("asii->asi", theirs.covariance))
+        apart = np.abs(ours.mean - theirs.mean) / sd
+        assert np.quantile(apart[settled], 0.95) < 0.15
+        assert np.quantile(np.abs(ours.log_evidence - theirs.log_evidence)[settled], 0.95) < 0.15
+        scaled = (ours.covariance - theirs.covariance) / (sd[..., :, None] * sd[..., None, :])
+        assert np.quantile(np.abs(scaled[settled]), 0.95) < 0.1
+
+
+def test_reversals(pair):
+    """With no pass of the search modes are where it starts, and after them the reversals of the best."""
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    starts, _ = spread_starts(in_numpy, prior, broad(in_numpy, prior))
+    starts = np.ascontiguousarray(starts[:, :3])
+    found = modes._found_compiled(
+        view.line, prior, starts, np.full(AXES, 3), view.whole_nodes, modes._reversed_precision(view), passes=0
+    )
+    own = find_modes(in_numpy, prior, starts, passes=0)
+    best = own.mean[np.arange(AXES), np.argmin(found.objective[:, :3], axis=1)]
+    expected = modes.reversed_starts(in_numpy, prior, best[:, None])
+    ours = whitened(prior, found.mean[:, 3:])
+    there = np.isfinite(found.log_evidence[:, 3:])
+    assert there.mean() > 0.3
+    assert len(set(np.argmin(found.objective[1:, :3], axis=1))) > 1
+    np.testing.assert_allclose(ours[there], expected[there], atol=1e-4 * np.abs(expected[there]).max())
+
+
+def test_all_modes_together(pair):
+    """With searches that end next to a mode that is known: the same modes that matter."""
+    view, in_numpy, state = pair
+    prior, some = view.reduced.prior(state), slice(1, None)  # not the one beyond the sensor
+    prior = Belief(prior.mean[some], prior.covariance[some])
+    wide = broad(in_numpy.part(some), prior)
+    ours, theirs = (without_repeats(modes_of(each.part(some), prior, wide)) for each in (view, in_numpy))
+    found = 0
+    for axis in range(AXES - 1):
+        most = theirs.log_evidence[axis].max()
+        for k in np.flatnonzero(theirs.log_evidence[axis] > most - 3):
+            white = np.linalg.solve(
+                np.linalg.cholesky(theirs.covariance[axis, k]), (ours.mean - theirs.mean[:, [k]])[axis].T
+            )
+            near = np.isfinite(ours.log_evidence[axis]) & ((white**2).sum(axis=0) < 1)
+            found += near.any()
+            assert near.any() or k != np.argmax(theirs.log_evidence[axis]) or ours.log_evidence[axis].max() > most - 0.5
+    assert found > 0.8 * np.sum(theirs.log_evidence > theirs.log_evidence.max(axis=1)[:, None] - 3)
+
+
+def test_a_mode_is_where_the_gradient_is_zero(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    start = whitened(prior, broad(view, prior).mean[:, None])
+    found = find_modes(view, prior, start, 60, 1e-5)
+    t, root = found.mean[1:], np.linalg.cholesky(found.covariance[1:, 0])
+    inverse, rest = np.linalg.inv(prior.covariance[1:]), in_numpy.part(slice(1, None))
+
+    def objective(points):
+        away = points - prior.mean[1:, None]
+        return 0.5 * np.einsum("aki,aij,akj->ak", away, inverse, away) - rest.log_likelihood(rest.predicted(points))
+
+    np.testing.assert_allclose(objective(t), found.objective[1:], atol=1e-3)
+    for k in range(t.shape[2]):
+        step = 1e-3 * root[:, None, :, k]
+        slope = (objective(t + step) - objective(t - step)) / 2e-3
+        assert np.quantile(np.abs(slope), 0.9) < 0.05
+
+
+def test_repeats():
+    rng = np.random.default_rng(3)
+    mean, root = rng.standard_normal((20, 7, 3)) * 0.4, np.linalg.cholesky(0.3 * np.eye(3) + 0.1)
+    evidence, distance, objective = rng.standard_normal((3, 20, 7))
+    evidence[0, 2] = -np.inf
+    modes = Modes(mean, np.tile(root @ root.T, (20, 7, 1, 1)), evidence, distance, objective)
+    ours, kept = without_repeats(modes), []
+    for axis in range(20):
+        own: list[int] = []
+        for j in range(7):
+            white = np.linalg.solve(root, (mean[axis, own] - mean[axis, j]).T)
+            if np.isfinite(evidence[axis, j]) and not np.any(np.sum(white**2, axis=0) < 0.49):
+                own.append(j)
+        kept.append(own)
+        there = slice(0, len(own))
+        for field in ("mean", "covariance", "log_evidence", "distance", "objective"):
+            np.testing.assert_array_equal(getattr(ours, field)[axis, there], getattr(modes, field)[axis, own])
+        assert np.all(ours.log_evidence[axis, len(own) :] == -np.inf)
+        assert ours.best[axis] == np.argmin(objective[axis, own])
+    assert ours.mean.shape[1] == max(map(len, kept))
+    assert 20 < 140 - sum(map(len, kept)) < 120
+
+
+def test_innovation(pair):
+    view, in_numpy, state = pair
+    prior = view.reduced.prior(state)
+    found = find_modes(view, prior, whitened(prior, broad(view, prior).mean[:, None]))
+    ours, theirs = (innovation(each, prior, found) for each in (view, in_numpy))
+    # Of a direction of next to no information it is the noise along any direction of the pixels.
+    information = np.einsum("aii->ai", theirs.covariance) - 1
+    tells = information > 1e-5 * information[:, :1]
+    np.testing.assert_allclose(ours.value[tells] ** 2, theirs.value[tells] ** 2, rtol=0.02, atol=0.02)
+    np.testing.assert_array_equal(ours.believed, theirs.believed)
+    np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=5e-3, atol=1e-3)
+
+
+def test_importance_sampling_with_the_same_points(pair):
+    view, in_numpy, state = pair
+    some = slice(1, 7)  # not the one beyond the sensor, where no point counts
+    prior = single(Belief(state.mean[some], state.covariance[some]))
+    _, proposal = explored(view.part(some), prior)
+    proposal = proposal.ordered()
+    (ours, points), (theirs, their_points) = (
+        importance_corrected(each.part(some), prior, proposal, 1.0, np.full(6, 100.0)) for each in (view, in_numpy)
+    )
+    np.testing.assert_allclose(points, their_points, rtol=0.02)
+    weights = (np.exp(each.ordered().log_weight) for each in (ours, theirs))
+    np.testing.assert_allclose(*weights, atol=2e-3)
+    sd = np.sqrt(np.einsum("aii->ai", theirs.belief.covariance))
+    np.testing.assert_allclose(ours.belief.mean / sd, theirs.belief.mean / sd, atol=5e-3)
+    np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.belief.covariance)) / sd, 1.0, atol=5e-3)
+
+
+def test_maps_of_mixtures():
+    rng = np.random.default_rng(8)
+    root, rows = rng.standard_normal((5, 4, 3, 3)), rng.standard_normal((2, 3))
+    weight = rng.uniform(0.1, 1, (5, 4))
+    weight[1, 2] = 0.0
+    with np.errstate(divide="ignore"):
+        m = Hypotheses(
+            np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((5, 4, 3)), root @ root.swapaxes(-1, -2)
+        )
+    own, seen = m.belief, m.mapped(rows, np.diag([0.5, 2.0]))
+    w = np.exp(m.log_weight)
+    mean = np.einsum("ac,aci->ai", w, m.mean)
+    away = m.mean - mean[:, None]
+    np.testing.assert_allclose(own.mean, mean, atol=1e-12)
+    spread = np.einsum("ac,acij->aij", w, m.covariance) + np.einsum("ac,aci,acj->aij", w, away, away)
+    np.testing.assert_allclose(own.covariance, spread, atol=1e-12)
+    np.testing.assert_allclose(seen.belief.mean, mean @ rows.T, atol=1e-12)
+    np.testing.assert_allclose(seen.belief.covariance, rows @ spread @ rows.T + np.diag([0.5, 2.0]), atol=1e-12)
+
+
+def merged_once(m):
+    """The two components whose merger costs least are one, in each axis."""
+    axes, count = m.log_weight.shape
+    first, second = np.triu_indices(count, 1)
+    w = np.exp(m.log_weight)
+    total = w[:, first] + w[:, second]
+    share = w[:, second] / np.where(total > 0, total, 1.0)
+    away = m.mean[:, second] - m.mean[:, first]
+    P, Q = m.covariance[:, first], m.covariance[:, second]
+    outer = away[..., :, None] * away[..., None, :]
+    a, b = share[..., None, None], (share * (1 - share))[..., None, None]
+    merged = (1 - a) * P + a * Q + b * outer
+    logs = log_determinant(m.covariance)
+    cost = 0.5 * (total * log_determinant(merged) - w[:, first] * logs[:, first] - w[:, second] * logs[:, second])
+    chosen = np.argmin(cost, axis=1)
+    rows, i, j = np.arange(axes), first[chosen], second[chosen]
+    mean, covariance, log_weight = m.mean.copy(), m.covariance.copy(), m.log_weight.copy()
+    mean[rows, i] += share[rows, chosen][:, None] * away[rows, chosen]
+    covariance[rows, i] = merged[rows, chosen]
+    log_weight[rows, i] = np.logaddexp(log_weight[rows, i], log_weight[rows, j])
+    keep = np.ones((axes, count), dtype=bool)
+    keep[rows, j] = False
+
+    def kept(values):
+        return values[keep].reshape(axes, count - 1, *values.shape[2:])
+
+    return Hypotheses(kept(log_weight), kept(mean), kept(covariance))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mergers(seed):
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((9, 8, 3, 3)) * 0.5
+    weight = rng.uniform(0.1, 1, (9, 8))
+    m = Hypotheses(
+        np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((9, 8, 3)),
+        root @ root.swapaxes(-1, -2) + 0.1 * np.eye(3),
+    )  # fmt: skip
+    slow = m
+    for _ in range(5):
+        slow = merged_once(slow)
+    fast, order = m.reduced(3), np.argsort(-slow.log_weight, axis=1)
+    rows = np.arange(9)[:, None]
+    np.testing.assert_allclose(fast.log_weight, slow.log_weight[rows, order], rtol=1e-9)
+    np.testing.assert_allclose(fast.mean, slow.mean[rows, order], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(fast.covariance, slow.covariance[rows, order], rtol=1e-7, atol=1e-9)
+    # What costs nothing to merge is merged, however few there are.
+    twice = Hypotheses(
+        *(np.concatenate([each, each], axis=1) for each in (m.log_weight - np.log(2), m.mean, m.covariance))
+    )
+    assert twice.reduced(16, 1e-6).mean.shape[1] == 8
+
+
+def test_small_matrices_are_those_of_numpy():
+    rng = np.random.default_rng(5)
+    for n in (1, 2, 5, 12):
+        a = rng.standard_normal((n, n))
+        a = a @ a.T + 0.1 * np.eye(n)
+        root, inverse, x = np.empty((n, n)), np.empty((n, n)), rng.standard_normal(n)
+        small.cholesky(a, root)
+        np.testing.assert_allclose(root, np.linalg.cholesky(a), rtol=1e-7, atol=1e-9)
+        small.lower_inverse(root, inverse)
+        np.testing.assert_allclose(inverse @ root, np.eye(n), atol=1e-9)
+        solved = x.copy()
+        small.solve(root, solved)
+        np.testing.assert_allclose(a @ solved, x, rtol=1e-6, atol=1e-8)
+        solved = x.copy()
+        small.lower_solve(root, solved)
+        np.testing.assert_allclose(root @ solved, x, rtol=1e-6, atol=1e-8)
+        values, vectors, worked = np.empty(n), np.empty((n, n)), a.copy()
+        small.eigh(worked, values, vectors)
+        np.testing.assert_allclose(values, np.linalg.eigvalsh(a)[::-1], rtol=1e-9)
+        np.testing.assert_allclose(vectors @ a @ vectors.T, np.diag(values), atol=1e-9 * values[0])
+        np.testing.assert_allclose(vectors @ vectors.T, np.eye(n), atol=1e-12)
+    x = np.append(-np.geomspace(1e-9, 39, 200), 0.0)
+    np.testing.assert_allclose([small.decay(each) for each in x], np.exp(x), rtol=3e-9)
+    assert small.decay(-np.inf) == small.decay(-41.0) < 5e-18
+    assert np.isnan(small.decay(np.nan))
+
+
+FIRST_SESSION = """
+import dataclasses, sys
+from aolink.estimation import make_estimator
+from aolink.estimation.compiled import joint, line, mixtures, modes, moments, small
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+def overloads():
+    each = [value for module in (small, line, modes, moments, mixtures, joint) for value in vars(module).values()]
+    return sum(len(value.signatures) for value in each if hasattr(value, "signatures"))
+
+rig, name = load_rig(sys.argv[1]), sys.argv[2]
+rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=float(sys.argv[3])))
+assert overloads() == 0
+estimator = make_estimator(rig, name)
+before = overloads()
+several = 0
+for exposure in simulate(rig, int(sys.argv[4]), seed=2):
+    estimator.step(exposure)
+    several += estimator.several is not None and estimator.several[0]
+print(before, overloads(), several)
+"""
+
+
+def first_session(rig, name, noise, exposures):
+    """In a process of its own: this one has compiled before."""
+    arguments = [sys.executable, "-c", FIRST_SESSION, rig, name, str(noise), str(exposures)]
+    out = subprocess.run(arguments, capture_output=True, text=True, check=True).stdout
+    return map(int, out.split())
+
+
+@pytest.mark.parametrize("name", ["profile", "mixture"])
+def test_nothing_is_compiled_in_a_session(name):
+    before, after, several = first_session("section-vi-lively", name, 0.003, 30)
+    assert before == after > 4
+    assert several
+
+
+@pytest.mark.parametrize(
+    ("rig", "name"), [("membrane-12x12", "profile"), ("membrane-12x12", "moments"), ("single-lenslet", "mixture")]
+)
+def test_nothing_is_compiled_in_a_session_of_spots(rig, name):
+    before, after, _ = first_session(rig, name, 1e-3, 4)
+    assert before == after > 2
+
+
+def test_machine_code_is_not_older_than_any_source(tmp_path):
+    kept = tmp_path / "__pycache__"
+    kept.mkdir()
+    files = kept / "of_old.nbi", tmp_path / "one.py", tmp_path / "two.py", kept / "of_new.nbi"
+    for age, name in enumerate(files):
+        name.touch()
+        os.utime(name, (age, age))
+    forget_stale(tmp_path)
+    assert [each.name for each in kept.iterdir()] == ["of_new.nbi"]
+    forget_stale(tmp_path / "not there")
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+def test_a_plant_without_process_noise(updates):
+    plant = dataclasses.replace(LIVELY.plant, process_noise=0.0 * LIVELY.plant.process_noise)
+    HypothesisFilter(plant, LIVELY.sensor, updates).warm_up(updates)
+    rig = dataclasses.replace(LIVELY, plant=plant)
+    name = "profile" if updates is PROFILE else "mixture"
+    estimator = make_estimator(rig, name)
+    for exposure in simulate(rig, 12, seed=2):
+        estimate = estimator.step(exposure)
+    assert np.sqrt(np.mean((estimate.path - exposure.truth.path) ** 2)) < 0.03

@@ -1,0 +1,94 @@
+"""Mixtures of Gaussians against scipy's densities and against their own moments."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import special, stats
+
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, joined, log_sum, single
+
+
+def mixture(seed, axes=3, components=5, n=3):
+    rng = np.random.default_rng(seed)
+    roots = rng.standard_normal((axes, components, n, n))
+    logs = rng.standard_normal((axes, components)) * 2
+    return Hypotheses(
+        logs - special.logsumexp(logs, axis=1, keepdims=True),
+        rng.standard_normal((axes, components, n)) * 2,
+        roots @ roots.swapaxes(-1, -2) + 0.01 * np.eye(n),
+    )
+
+
+def test_density_is_that_of_scipy():
+    m = mixture(1)
+    points = np.random.default_rng(2).standard_normal((3, 7, 3))
+    for a in range(3):
+        each = [
+            stats.multivariate_normal(m.mean[a, c], m.covariance[a, c]).logpdf(points[a]) + m.log_weight[a, c]
+            for c in range(5)
+        ]
+        np.testing.assert_allclose(m.log_density(points)[a], special.logsumexp(each, axis=0), rtol=1e-7)
+
+
+def test_moments_are_those_of_samples():
+    m = mixture(3, axes=1)
+    rng = np.random.default_rng(4)
+    chosen = rng.choice(5, 200_000, p=np.exp(m.log_weight[0]))
+    drawn = m.mean[0, chosen] + np.einsum(
+        "kij,kj->ki", np.linalg.cholesky(m.covariance[0])[chosen], rng.standard_normal((len(chosen), 3))
+    )
+    np.testing.assert_allclose(m.belief.mean[0], drawn.mean(axis=0), atol=0.03)
+    np.testing.assert_allclose(m.belief.covariance[0], np.cov(drawn.T), rtol=0.05, atol=0.1)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000), most=st.integers(1, 5), gone=st.booleans())
+def test_merging_keeps_weight_mean_and_covariance(seed, most, gone):
+    m = mixture(seed)
+    if gone:
+        m.log_weight[:, 2] = -np.inf
+        m = Hypotheses(m.log_weight - log_sum(m.log_weight, axis=1)[:, None], m.mean, m.covariance)
+    less = m.reduced(most)
+    assert less.mean.shape == (3, min(most, 5 - gone), 3)
+    np.testing.assert_allclose(np.exp(less.log_weight).sum(axis=1), 1.0)
+    np.testing.assert_allclose(less.belief.mean, m.belief.mean, atol=1e-9)
+    np.testing.assert_allclose(less.belief.covariance, m.belief.covariance, atol=1e-8)
+    assert np.linalg.eigvalsh(less.covariance).min() > 0
+
+
+def test_twins_are_merged_first():
+    m = mixture(5, axes=1, components=3)
+    twins = joined(m, Hypotheses(m.log_weight[:, 1:2], m.mean[:, 1:2] + 1e-6, m.covariance[:, 1:2]))
+    less = twins.reduced(3)
+    weights = np.exp(m.log_weight[0]) * [1, 2, 1]
+    order = np.argsort(-weights)  # the heaviest comes first
+    np.testing.assert_allclose(less.mean[0], m.mean[0, order], atol=1e-5)
+    np.testing.assert_allclose(np.exp(less.log_weight[0]), weights[order] / weights.sum())
+
+
+def test_what_is_known_for_certain_has_a_root():
+    P = np.array([[[1.0, 0.0], [0.0, 0.0]]])
+    root = cholesky(P)
+    np.testing.assert_allclose(root @ root.swapaxes(-1, -2), P, atol=1e-9)
+    one = single(Belief(np.zeros((1, 2)), P))
+    assert one.log_density(np.array([[[0.5, 0.0]]])) > one.log_density(np.array([[[0.5, 1e-3]]]))
+
+
+@pytest.mark.parametrize("axes", [1, 7])
+def test_an_axis_does_not_depend_on_those_beside_it(axes):
+    m, points = mixture(6, axes=7), np.random.default_rng(7).standard_normal((7, 9, 3))
+    alone = m.part(slice(3, 4)) if axes == 1 else m
+    at = 0 if axes == 1 else 3
+    some = points[3:4] if axes == 1 else points
+    assert alone.log_density(some)[at].tobytes() == m.log_density(points)[3].tobytes()
+    assert alone.reduced(2).mean[at].tobytes() == m.reduced(2).mean[3].tobytes()
+
+
+def test_what_is_not_there_does_not_change_a_bit_of_a_sum():
+    rng = np.random.default_rng(4)
+    values = rng.standard_normal((200, 6))
+    for more in (1, 3, 10):
+        padded = np.concatenate([values, np.full((200, more), -np.inf)], axis=1)
+        assert log_sum(padded, axis=1).tobytes() == log_sum(values, axis=1).tobytes()

@@ -1,0 +1,145 @@
+"""Pixels as a function of few coefficients: against the optics' own frames, finite differences and sampling."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aolink.estimation import exposure_model, make_estimator
+from aolink.estimation.frames.measure import measure
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.pixels import likelihood
+from aolink.optics.kernel import exposure_density
+from aolink.optics.plane import exposure_density_2d
+from aolink.optics.sensor import Kernel
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+LINE = load_rig("section-vi-lively")
+PLANE = load_rig("single-lenslet")
+ROUND = Kernel(shape="gaussian", sigma=0.13)
+TILTED = Kernel(shape="gaussian", sigma=0.13, matrix=((0.15, 0.05), (0.05, 0.09)))
+
+
+def tip_tilt(kernel):
+    """One spot, both directions moved by one copy of a plant."""
+    plant = PLANE.plant
+    both = dataclasses.replace(
+        plant, A=np.kron(np.eye(2), plant.A), B=np.kron(np.eye(2), plant.B), B_w=np.kron(np.eye(2), plant.B_w),
+        C=np.kron(np.eye(2), plant.C), process_noise=10 * np.eye(2), initial_mean=np.zeros(4),
+        initial_covariance=np.kron(np.eye(2), plant.initial_covariance), axes=1,
+    )  # fmt: skip
+    return dataclasses.replace(PLANE, plant=both, sensor=dataclasses.replace(PLANE.sensor, kernel=kernel))
+
+
+def rig_of(kind):
+    return {"line": LINE, "round": tip_tilt(ROUND), "tilted": tip_tilt(TILTED)}[kind]
+
+
+def view_of(rig, *, photoelectrons=0.0, seed=1, **how):
+    rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, photoelectrons=photoelectrons))
+    (exposure,) = simulate(rig, 1, seed=seed)
+    spots = rig.plant.n_outputs // 2
+    looks = WindowedSpots(rig.sensor, spots) if spots else WindowedMoments(rig.sensor)
+    measured, _ = measure(rig, exposure, looks, make_estimator(rig, "moments").options)
+    model = exposure_model(rig.plant, exposure.n_steps)
+    reduced = likelihood.reduction(model, rig.sensor, **how)
+    return likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced), model
+
+
+def some_points(view, count=3, seed=2):
+    return 0.15 * np.random.default_rng(seed).standard_normal((1, count, view.reduced.size))
+
+
+@pytest.mark.parametrize("kind", ["line", "round", "tilted"])
+def test_predicted_pixels_are_those_of_the_optics(kind):
+    rig = rig_of(kind)
+    view, _ = view_of(rig, left_out=0.0, all_steps=True)
+    t = some_points(view)
+    edges = rig.sensor.profile.edges
+    for path, predicted in zip(view.paths(t)[0], view.predicted(t)[0], strict=True):
+        if kind == "line":
+            expected = exposure_density(rig.sensor.kernel, edges, path[0])
+        else:
+            expected = exposure_density_2d(rig.sensor.kernel.covariance, edges, edges, path.T[None]).ravel()
+        np.testing.assert_allclose(predicted, expected, atol=1e-6 * expected.max())
+
+
+@pytest.mark.parametrize("kind", ["line", "round", "tilted"])
+def test_their_slope_is_that_of_finite_differences(kind):
+    view, _ = view_of(rig_of(kind))
+    t, h = some_points(view), 1e-6
+    f, J = view.linearised(t)
+    np.testing.assert_allclose(f, view.predicted(t), atol=1e-12)
+    for k, step in enumerate(h * np.eye(view.reduced.size)):
+        difference = (view.predicted(t + step) - view.predicted(t - step)) / (2 * h)
+        np.testing.assert_allclose(J[..., k], difference, atol=1e-8 * np.abs(J).max())
+
+
+@pytest.mark.parametrize("photoelectrons", [0.0, 300.0])
+def test_score_and_information_are_those_of_the_likelihood(photoelectrons):
+    view, _ = view_of(LINE, photoelectrons=photoelectrons)
+    f = view.predicted(some_points(view, 1))
+    score, information = view.information(f)
+    h = 1e-5
+    for pixel in np.argsort(f[0, 0])[-3:]:
+        step = h * np.eye(f.shape[-1])[pixel]
+        slope = (view.log_likelihood(f + step) - view.log_likelihood(f - step)) / (2 * h)
+        np.testing.assert_allclose(score[..., pixel], slope, rtol=1e-4, atol=1e-6)
+    # Fisher: the variance of the score under the model itself.
+    rng, sd = np.random.default_rng(3), np.sqrt(view.read_noise + view.gain * np.maximum(f, 0))
+    scores = []
+    for _ in range(4000):
+        view.y = (f + sd * rng.standard_normal(f.shape))[:, 0]
+        scores.append(view.information(f)[0])
+    np.testing.assert_allclose(np.var(scores, axis=0), information, rtol=0.15)
+
+
+def test_masked_pixels_say_nothing():
+    view, _ = view_of(LINE)
+    f = view.predicted(some_points(view))
+    view.mask = view.mask.copy()
+    view.mask[0, 20] = False
+    before = view.log_likelihood(f)
+    view.y = view.y.copy()
+    view.y[0, 20] += 100
+    np.testing.assert_array_equal(view.log_likelihood(f), before)
+    assert (view.information(f)[1][..., 20] == 0).all()
+
+
+@pytest.mark.parametrize("kind", ["line", "round"])
+def test_what_the_reduction_leaves_out_is_small_and_accounted_for(kind):
+    rig = rig_of(kind)
+    model = exposure_model(rig.plant, 200)
+    reduced = likelihood.reduction(model, rig.sensor)
+    n = rig.plant.n_states
+    assert reduced.size < model.n_coefficients
+    rest = np.einsum("oki,ij,okj->ok", model.basis, reduced.left_out, model.basis)
+    least = np.linalg.eigvalsh(rig.sensor.kernel.covariance)[0]
+    assert np.sqrt(rest.mean()) <= 0.1 * np.sqrt(least)
+    assert reduced.widening == pytest.approx(rest.mean(axis=1).sum() / model.plant.n_outputs)
+    # Coefficients and end state without a measurement are the prior's.
+    state = Belief(rig.plant.initial_mean[None], rig.plant.initial_covariance[None])
+    t = reduced.prior(state)
+    after = reduced.coefficients(t)
+    expected = np.eye(model.n_coefficients)
+    expected[:n, :n] = rig.plant.initial_covariance
+    np.testing.assert_allclose(after.covariance[0], expected, atol=1e-12)
+    A, Q = model.transition, model.process_noise
+    np.testing.assert_allclose(reduced.end(t).covariance[0], A @ state.covariance[0] @ A.T + Q, atol=1e-9)
+
+
+def test_fewer_nodes_and_coefficients_cost_less_than_the_noise():
+    """Chi-square that the reduction adds where V is 0.001, mean over paths of the plant."""
+    rig = dataclasses.replace(LINE, sensor=dataclasses.replace(LINE.sensor, noise_density=0.001))
+    coarse, _ = view_of(rig)
+    fine, _ = view_of(rig, left_out=0.0, all_steps=True)
+    rng = np.random.default_rng(4)
+    full = 0.1 * rng.standard_normal((1, 50, fine.reduced.size))
+    full[..., 2:] *= 10
+    z = full @ fine.reduced.expand.T
+    few = z @ coarse.reduced.expand
+    added = (fine.predicted(full) - coarse.predicted(few)) ** 2 / fine.read_noise
+    assert added.sum(axis=-1).mean() < 1.0

@@ -1,0 +1,429 @@
+"""The estimators of pixels: modes against the gradient and against sampling, claims, faults, independence of axes."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_discrete_lyapunov
+
+from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation.frames.measure import measure
+from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.pixels import likelihood
+from aolink.estimation.pixels.filter import HypothesisFilter
+from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, single
+from aolink.estimation.pixels.importance import importance_corrected
+from aolink.estimation.pixels.modes import broad, find_modes, whitened
+from aolink.estimation.pixels.updates import MIXTURE, PROFILE, explored
+from aolink.optics.camera import to_counts
+from aolink.optics.kernel import exposure_density
+from aolink.rig import load_rig
+from aolink.simulation.model import simulate
+
+RIG = load_rig("section-vi-lively")
+UPDATES = {"profile": PROFILE, "mixture": MIXTURE}
+PIXEL_ESTIMATORS = list(UPDATES)
+
+
+def quiet(rig, V):
+    return dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=V))
+
+
+def seen(rig=RIG, *, width=1.0, seed=3):
+    """One exposure, with a prior of its start state so many times as wide as the plant's own, about the truth."""
+    (exposure,) = simulate(rig, 1, seed=seed)
+    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor), make_estimator(rig, "moments").options)
+    model = exposure_model(rig.plant, exposure.n_steps)
+    reduced = likelihood.reduction(model, rig.sensor)
+    view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
+    P = rig.plant.initial_covariance * width**2
+    offset = np.linalg.cholesky(P) @ np.random.default_rng(seed).standard_normal(len(P))
+    return view, Belief(exposure.truth.start_state + offset, P[None])
+
+
+def by_importance(view, state, count=60_000, seed=1):
+    """Mean and covariance of the posterior of t by plain importance sampling from the prior; and how many count."""
+    prior = view.reduced.prior(state)
+    e = np.random.default_rng(seed).standard_normal((count, view.reduced.size))
+    t = prior.mean + e @ cholesky(prior.covariance)[0].T
+    logs = np.concatenate([view.log_likelihood(view.predicted(part[None]))[0] for part in np.split(t, 20)])
+    w = np.exp(logs - logs.max())
+    w /= w.sum()
+    mean = w @ t
+    return mean, (w[:, None] * (t - mean)).T @ (t - mean), 1 / (w @ w)
+
+
+# Modes
+
+
+def assert_near(ours, mean, covariance, means, sds):
+    """Means within so many standard deviations, and those within such a part of themselves."""
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(ours.mean[0] / sd, mean / sd, atol=means)
+    np.testing.assert_allclose(np.sqrt(np.diag(ours.covariance[0])) / sd, 1.0, atol=sds)
+
+
+def test_the_gradient_is_zero_at_a_mode():
+    view, state = seen(quiet(RIG, 0.001), width=0.3)
+    prior = view.reduced.prior(state)
+    start = whitened(prior, broad(view, prior).mean[:, None])
+    view.compiled = False  # its error function is exact; what is compiled has a test of its own
+    modes = find_modes(view, prior, start, passes=60, converged=1e-5)
+    inverse = np.linalg.inv(prior.covariance[0])
+
+    def objective(t):
+        away = t - prior.mean[0]
+        return 0.5 * away @ inverse @ away - view.log_likelihood(view.predicted(t[None, None]))[0, 0]
+
+    t, root = modes.mean[0, 0], np.linalg.cholesky(modes.covariance[0, 0])
+    assert objective(t) == pytest.approx(modes.objective[0, 0], abs=1e-6)
+    for direction in root.T:  # one standard deviation each
+        slope = (objective(t + 1e-4 * direction) - objective(t - 1e-4 * direction)) / 2e-4
+        assert abs(slope) < 0.05
+    assert objective(t) < min(objective(t + s * d) for d in root.T for s in (-0.5, 0.5))
+
+
+@pytest.mark.parametrize("photoelectrons", [0.0, 500.0])
+def test_posterior_is_that_of_importance_sampling(photoelectrons):
+    """Where the spot moves by less than the kernel's width, the posterior is a Gaussian."""
+    rig = load_rig("section-vi")
+    rig = dataclasses.replace(
+        rig, sensor=dataclasses.replace(rig.sensor, noise_density=0.005, photoelectrons=photoelectrons)
+    )
+    view, state = seen(rig)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 300
+    update = PROFILE.update(view, single(state), state, 0)
+    assert_near(update.coefficients, mean, covariance, 0.25, 0.15)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
+    view, state = seen(quiet(RIG, 0.01), width=0.5, seed=seed)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 100
+    _, proposal = explored(view, single(state))
+    after, points = importance_corrected(view, single(state), proposal, 1.0, np.array([100.0]))
+    assert points[0] > 40
+    assert_near(after.belief, mean, covariance, 0.3, 0.25)
+
+
+@pytest.mark.parametrize("seed", [10, 11])
+def test_profile_is_the_mean_of_the_posterior_where_it_has_several_modes(seed):
+    """Gaussians about the modes alone are up to 0.7 standard deviations off."""
+    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=seed)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 200
+    update = PROFILE.update(view, single(state), state, 0)
+    assert update.several[0]
+    assert_near(update.coefficients, mean, covariance, 0.45, 0.35)
+
+
+def test_profile_carries_as_many_gaussians_as_it_takes():
+    """One of a posterior that is Gaussian; of one with two readings more, whose density is that of the points."""
+    one, state = seen(quiet(load_rig("section-vi"), 0.005))
+    assert PROFILE.update(one, single(state), state, 0).end.mean.shape[1] == 1
+    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=10)
+    end = PROFILE.update(view, single(state), state, 0).end
+    assert 1 < end.mean.shape[1] <= 3
+    whole = single(end.belief)
+    points = np.concatenate([end.mean[0], whole.mean[0]])[None]
+    assert np.abs(end.log_density(points) - whole.log_density(points)).max() > 0.05
+
+
+def test_many_points_are_to_count_where_there_is_a_second_mode(monkeypatch):
+    asked = []
+
+    def noted(view, prior, proposal, share, enough):
+        asked.append((share, enough))
+        return importance_corrected(view, prior, proposal, share, enough)
+
+    monkeypatch.setattr("aolink.estimation.pixels.importance.importance_corrected", noted)
+    one, state = seen(quiet(load_rig("section-vi"), 0.005))
+    two, other = seen(quiet(RIG, 0.003), width=0.5, seed=10)
+    PROFILE.update(one, single(state), state, 0)
+    PROFILE.update(two, single(other), other, 0)
+    MIXTURE.update(one, single(state), state, 0)
+    assert [(share, enough.tolist()) for share, enough in asked] == [(0.25, [25.0]), (0.25, [100.0]), (1.0, [100.0])]
+
+
+def test_evidence_of_a_mode_has_the_weight_of_its_prior():
+    view, state = seen(quiet(RIG, 0.01), width=0.3)
+    apart = state.mean[:, None] + np.array([[0.0, 0.0], [0.1, 3.0]])
+    both = np.repeat(state.covariance[:, None], 2, axis=1) / 4
+    weights = np.log([[0.5, 0.5], [0.9, 0.1]])
+    each = [explored(view, Hypotheses(log_weight[None], apart, both))[0] for log_weight in weights]
+    assert len({modes.mean.shape for modes in each}) == 1
+    # Whose prior led to a mode: those are told apart by what the other weight made of it.
+    change = np.sort(each[1].log_evidence[0] - each[0].log_evidence[0])
+    np.testing.assert_allclose(each[0].mean, each[1].mean)
+    assert change[0] == pytest.approx(np.log(0.1 / 0.5), abs=1e-9)
+    assert change[-1] == pytest.approx(np.log(0.9 / 0.5), abs=1e-9)
+    assert np.all(np.isclose(change, change[0]) | np.isclose(change, change[-1]))
+
+
+def test_points_are_drawn_from_the_wide_gaussian_too():
+    view, state = seen(quiet(RIG, 0.01), width=0.5)
+    _, proposal = explored(view, single(state))
+    prior = view.reduced.prior(state)
+    wide = broad(view, prior)
+    same = np.abs(proposal.mean[0] - wide.mean[0]).max(axis=1) < 1e-12
+    assert np.exp(proposal.log_weight[0, same]).sum() == pytest.approx(0.3)
+
+
+def test_a_path_and_its_reversal_are_two_readings():
+    """From a start state at rest, with no preference, a fast sweep may have gone either way."""
+    rig = quiet(RIG, 0.001)
+    model = exposure_model(rig.plant, 200)
+    reduced = likelihood.reduction(model, rig.sensor)
+    path = np.linspace(-0.2, 0.2, 200)
+    rng = np.random.default_rng(1)
+    density = exposure_density(rig.sensor.kernel, rig.sensor.edges, path) + 0.14 * rng.standard_normal(40)
+    measured = Profile(density=density[None], mask=np.ones((1, 40), bool))
+    view = likelihood.PixelView(rig.sensor, model, model.response(np.zeros((200, 1))), measured, reduced)
+    P = np.diag([0.04, 25.0])
+    state = Belief(np.zeros((1, 2)), P[None])
+    update = PROFILE.update(view, single(state), state, 0)
+    assert update.several[0]
+    modes, _ = explored(view, single(state))
+    there = np.isfinite(modes.log_evidence[0])
+    ends = view.paths(modes.mean)[0, there][:, 0, [0, -1]]
+    evidence = modes.log_evidence[0, there]
+    forth, back = evidence[ends[:, 1] > ends[:, 0]].max(), evidence[ends[:, 1] < ends[:, 0]].max()
+    assert abs(forth - back) < 3.0
+    np.testing.assert_allclose(np.sort(ends[np.argmax(evidence)]), [-0.2, 0.2], atol=0.06)
+
+
+# What they are good for
+
+
+def squared(exposures, estimates, skip=5):
+    return np.array([np.mean((e.path - x.truth.path) ** 2) for x, e in zip(exposures, estimates, strict=True)])[skip:]
+
+
+@pytest.mark.parametrize("V", [0.1, 0.01, 0.001])
+def test_better_than_o1_and_right_about_it(V):
+    rig = quiet(RIG, V)
+    exposures = simulate(rig, 45, seed=8, inputs=np.zeros((9_000, 1)))
+    found = run(rig, exposures, ["o1", "moments", *PIXEL_ESTIMATORS])
+    o1, moments = (squared(exposures, found[name]).mean() for name in ("o1", "moments"))
+    for name in PIXEL_ESTIMATORS:
+        ours = squared(exposures, found[name]).mean()
+        assert ours < 0.5 * o1
+        assert ours < 1.1 * moments
+        result = score(exposures, found[name], 5)
+        assert 1.0 < result.start_nees.mean < 3.2
+        assert 1.0 < result.end_nees.mean < 3.2
+        inside = [np.abs(e.path - x.truth.path) < 1.96 * e.path_sd for x, e in zip(exposures, found[name], strict=True)]
+        assert 0.9 < np.mean(inside[5:]) < 0.995
+        assert {e.status for e in found[name]} == {Status.OK}
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_order_matters(name):
+    """Frames fed in another order must ruin the estimate: it is the frames that it lives by."""
+    exposures = simulate(RIG, 24, seed=9)
+    order = np.random.default_rng(1).permutation(24)
+    shuffled = [dataclasses.replace(e, pixels=exposures[k].pixels) for e, k in zip(exposures, order, strict=True)]
+    right, wrong = (squared(exposures, run(RIG, each, [name])[name]).mean() for each in (exposures, shuffled))
+    assert wrong > 9 * right
+
+
+# Trust
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_missing_and_saturated_pixels_are_left_out(name):
+    exposures = simulate(RIG, 24, seed=5)
+    holed = []
+    for e in exposures:
+        pixels_, mask = e.pixels.copy(), e.mask.copy()
+        pixels_[0, 17], pixels_[0, 25] = 0, 65535
+        mask[0, 17] = False
+        holed.append(dataclasses.replace(e, pixels=pixels_, mask=mask))
+    whole, given = (run(RIG, series, [name])[name] for series in (exposures, holed))
+    assert {e.status for e in given} == {Status.OK}
+    assert "left out" in given[0].reason
+    assert squared(exposures, given).mean() < 1.5 * squared(exposures, whole).mean()
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
+    exposures = simulate(RIG, 24, seed=6)
+    moved = exposures[:10]
+    for e in exposures[10:]:
+        path = np.clip(e.truth.path - 0.8 * np.sign(e.truth.path.mean()), -0.9, 0.9)
+        noise = np.random.default_rng(e.frame_id).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
+        moved.append(
+            dataclasses.replace(
+                e, pixels=to_counts(RIG.sensor, exposure_density(RIG.sensor.kernel, RIG.sensor.edges, path) + noise)
+            )
+        )
+    estimates = run(RIG, moved, [name])[name]
+    statuses = [e.status for e in estimates]
+    assert set(statuses[:10]) == {Status.OK}
+    assert statuses[10] == Status.GATED
+    assert {Status.DIVERGED, Status.REINITIALISED} & set(statuses[10:])
+    for e in estimates:
+        assert np.isfinite(e.path).all()
+        assert np.linalg.eigvalsh(e.coefficient_covariance[0]).min() > -1e-12
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+@pytest.mark.parametrize("axes", [1, 7])
+def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
+    rng = np.random.default_rng(4)
+    paths = rng.uniform(-0.3, 0.3, (2, 40, 1)) + 0.1 * np.sin(np.linspace(0, 6, 200))
+    density = exposure_density(RIG.sensor.kernel, RIG.sensor.edges, paths) + 0.3 * rng.standard_normal((2, 40, 40))
+
+    def estimates(rows):
+        plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(40))))
+        own = HypothesisFilter(plant, RIG.sensor, UPDATES[name])
+        model = exposure_model(plant, 200)
+        response = model.response(np.zeros((200, plant.axes)))
+        return [own.step(model, response, Profile(density=d[rows], mask=np.ones(d[rows].shape, bool))) for d in density]
+
+    some = slice(3, 3 + axes)
+    for alone, together in zip(estimates(some), estimates(slice(0, 40)), strict=True):
+        assert alone.coefficients.mean.tobytes() == together.coefficients.mean[some].tobytes()
+        assert alone.coefficients.covariance.tobytes() == together.coefficients.covariance[some].tobytes()
+        assert alone.nis.tobytes() == together.nis[some].tobytes()
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_nor_do_its_nodes(name):
+    """One axis of three is commanded; the others are looked at as coarsely as alone."""
+    density = np.random.default_rng(3).standard_normal((3, 40)) * 0.3 + exposure_density(
+        RIG.sensor.kernel, RIG.sensor.edges, np.zeros(2)
+    )
+    jump = np.zeros((200, 3))
+    jump[60:, 1] = 2.0
+
+    def estimates(rows):
+        plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(3))))
+        own, model = HypothesisFilter(plant, RIG.sensor, UPDATES[name]), exposure_model(plant, 200)
+        measured = Profile(density=density[rows], mask=np.ones(density[rows].shape, bool))
+        return own.step(model, model.response(jump[:, rows]), measured)
+
+    level = likelihood.reduction(exposure_model(RIG.plant, 200), RIG.sensor).resolution.of(
+        exposure_model(dataclasses.replace(RIG.plant, axes=3), 200).response(jump).path
+    )
+    assert level[1] > level[0] == level[2] == 0
+    together = estimates(slice(0, 3))
+    for k in range(3):
+        alone = estimates(slice(k, k + 1))
+        assert alone.coefficients.mean.tobytes() == together.coefficients.mean[k : k + 1].tobytes()
+        assert alone.end.covariance.tobytes() == together.end.covariance[k : k + 1].tobytes()
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_what_commands_left_in_the_state_is_foreseen(name):
+    """A quiet mirror that was kicked rings on by many widths of the kernel, with no input any more."""
+    w = 2 * np.pi * 3.0
+    A = expm(np.array([[0.0, 1.0], [-(w**2), -0.01 * w]]) * 1e-3)
+    noise, kick = np.array([[1e-4]]), np.array([[0.0], [1.0]])
+    rig = quiet(load_rig("section-vi"), 0.01)
+    plant = dataclasses.replace(
+        rig.plant, A=A, B=kick, B_w=kick, process_noise=noise,
+        initial_covariance=solve_discrete_lyapunov(A, kick @ noise @ kick.T),
+    )  # fmt: skip
+    rig, inputs = dataclasses.replace(rig, plant=plant), np.zeros((12 * 200, 1))
+    inputs[450] = 5.0
+    exposures = simulate(rig, 12, seed=3, inputs=inputs)
+    assert np.mean([np.ptp(e.truth.path) for e in exposures[3:]]) > 6 * np.sqrt(rig.sensor.kernel.variance)
+    error = np.sqrt(squared(exposures, run(rig, exposures, [name])[name], 3).mean())
+    assert error < 0.01
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_a_lost_mode_is_found_again(name):
+    """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
+    rig = load_rig("jitter")
+    how, found = WindowedMoments(rig.sensor), []
+    for seed in range(1, 7):
+        filter_, errors = HypothesisFilter(rig.plant, rig.sensor, UPDATES[name]), []
+        for k, exposure in enumerate(simulate(rig, 9, seed=seed)):
+            if k == 5:
+                h = filter_.belief
+                filter_.belief = Hypotheses(h.log_weight, -h.mean, 0.3 * h.covariance)
+            model = exposure_model(rig.plant, exposure.n_steps)
+            measured, _ = measure(rig, exposure, how, make_estimator(rig, "moments").options)
+            response = model.response(exposure.inputs)
+            posterior = filter_.step(model, response, measured)
+            path = model.path(posterior.coefficients.mean, response.path)
+            errors.append(np.sqrt(np.mean((path[0] - exposure.truth.path) ** 2)))
+        found.append(max(errors[7:]) < 2.5 * np.sqrt(np.mean(np.square(errors[1:5]))))
+    assert sum(found) >= 5
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+def test_where_few_points_count_others_are_annealed(updates, monkeypatch):
+    view, state = seen(quiet(RIG, 0.003), width=0.5, seed=11)
+    mean, covariance, effective = by_importance(view, state)
+    assert effective > 200
+    monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
+    done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
+    assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
+    assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
+    end = view.reduced.end(Belief(mean[None], covariance[None]))
+    np.testing.assert_allclose(done.end.belief.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+@pytest.mark.parametrize("anneal", [False, True])
+def test_a_single_coefficient(updates, anneal, monkeypatch):
+    """Of one state without process noise the posterior is an integral over a line."""
+    noise = 0.0 * RIG.plant.process_noise
+    one = np.ones((1, 1))
+    plant = dataclasses.replace(
+        RIG.plant, A=0.999 * one, B=one, B_w=one, C=one, process_noise=noise, initial_mean=np.zeros(1),
+        initial_covariance=0.25 * one,
+    )  # fmt: skip
+    view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
+    assert view.reduced.size == 1
+    if anneal:
+        monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
+    else:
+        monkeypatch.delattr("aolink.estimation.pixels.importance.annealed")
+    t = np.linspace(-3, 3, 60_001)
+    log = view.log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
+    w = np.exp(log - log.max())
+    w /= w.sum()
+    mean = w @ t
+    sd = np.sqrt(w @ (t - mean) ** 2)
+    update = updates.update(view, single(state), state, 0)
+    assert abs(update.coefficients.mean[0, 0] - mean) < 0.2 * sd
+    assert np.sqrt(update.coefficients.covariance[0, 0, 0]) == pytest.approx(sd, rel=0.25)
+
+
+@pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
+def test_an_unstable_plant_does_not_end_in_infinity(name):
+    """What it would be without a camera grows without end; what the camera says of it does not."""
+    plant = dataclasses.replace(
+        RIG.plant, A=np.array([[1.02, 0.001], [0.0, 0.99]]), process_noise=np.array([[0.1]]),
+        initial_covariance=np.diag([1e-4, 1e-2]),
+    )  # fmt: skip
+    rig = dataclasses.replace(RIG, plant=plant)
+    model = exposure_model(plant, 200)
+    density = exposure_density(rig.sensor.kernel, rig.sensor.edges, np.zeros((1, 200)))
+    centred = Profile(density=density, mask=np.ones_like(density, dtype=bool))
+    filter_ = HypothesisFilter(plant, rig.sensor, UPDATES[name])
+    for _ in range(150):
+        filter_.step(model, model.response(np.zeros((200, 1))), centred)
+    assert np.isfinite(filter_.belief.mean).all()
+    # A posterior mean is trusted however unstable the plant is, and what would be without a camera is a number.
+    assert (filter_.step(model, model.response(np.zeros((200, 1))), centred).status == Status.OK).all()
+    assert np.isfinite(filter_._unseen.covariance).all()
+
+
+@pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
+def test_a_frame_that_cannot_be_believed_is_not_annealed(updates, monkeypatch):
+    view, state = seen(quiet(RIG, 0.001), width=0.3)
+    lie = view.part(slice(None))
+    lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
+    monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
+    monkeypatch.delattr("aolink.estimation.pixels.importance.annealed")
+    assert not updates.update(lie, single(state), state, 0).innovation.believed[0]
+    with pytest.raises(NameError):
+        updates.update(view, single(state), state, 0)

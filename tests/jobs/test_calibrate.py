@@ -1,0 +1,517 @@
+"""Calibration: the truth of simulated cameras within its own standard deviations; frames that are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import tomllib
+from collections.abc import Callable
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from aolink.calibration import Calibration, Frames, Kind, Measured, calibrate, calibrated_text
+from aolink.calibration.measure import pixel_statistics
+from aolink.errors import CalibrationError, RigError
+from aolink.jobs.demo import simulated_rig
+from aolink.optics.sensor import Kernel
+from aolink.recording.reader import Recording
+from aolink.rig import Rig, load_rig, parse_light, parse_rig
+from aolink.session import record
+from aolink.simulation.model import RigModel
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+LIVELY = load_rig("section-vi-lively")
+SEEDS = 60
+
+
+def camera(photoelectrons: float, noise_density: float = 0.01, **sensor: object) -> Rig:
+    """A rig whose exposures take one fast step, which is quick to simulate and the same to a camera at rest."""
+    timing = dataclasses.replace(LIVELY.timing, exposure_steps=1, frame_period_steps=1)
+    values = {"photoelectrons": photoelectrons, "noise_density": noise_density, **sensor}
+    return dataclasses.replace(LIVELY, timing=timing, sensor=dataclasses.replace(LIVELY.sensor, **values))  # type: ignore[arg-type]
+
+
+def shoot(rig: Rig, seed: int, lights: str, frames: int = 100) -> tuple[list[Frames], float]:
+    """Frames under one light after the other, and where the spot was under the last one."""
+    row = parse_light(lights, "lights")
+    rig = dataclasses.replace(rig, simulation=dataclasses.replace(rig.simulation, light=row))
+    model, shot = RigModel(rig, seed), []
+    for light in row:
+        model.start_camera(model.step, frames)
+        taken = model.advance(np.zeros((frames * rig.timing.frame_period_steps, 1)))
+        kind: Kind = "still" if light.kind == "moving" else light.kind
+        shot.append(Frames(kind=kind, counts=np.array([f.pixels[0] for f in taken]), source=f"{kind}.mcap"))
+    return shot, float(taken[0].truth.path[0, 0])
+
+
+def pulls(rig: Rig, seed: int, lights: str) -> list[float]:
+    """Error over standard deviation: black level, V, gain, counts per density, sigma, position."""
+    shot, position = shoot(rig, seed, lights)
+    found, sensor = calibrate(rig, shot), rig.sensor
+    gain = sensor.counts_per_density / (sensor.photoelectrons * sensor.pixel_width) if sensor.photoelectrons else 0.0
+    assert found.gain is not None
+    assert found.counts_per_density is not None
+    assert found.kernel_sigma is not None
+    assert found.spot is not None
+    pairs = [
+        (found.black_level, sensor.black_level),
+        (found.noise_density, sensor.noise_density),
+        (found.gain, gain),
+        (found.counts_per_density, sensor.counts_per_density),
+        (found.kernel_sigma, sensor.kernel.sigma),
+        (Measured(found.spot.positions[0], found.spot.position_sds[0]), position),
+    ]
+    return [(measured.value - true) / measured.sd for measured, true in pairs]
+
+
+@pytest.mark.parametrize(
+    ("photoelectrons", "noise_density", "lights"),
+    [
+        (0, 0.01, "dark,still"),
+        (0, 0.1, "dark,flat:4,still"),
+        (1000, 0.01, "dark,still"),
+        (300, 0.001, "dark,flat:4,flat:8,still"),
+        (20_000, 0.0001, "dark,flat:4,still"),
+    ],
+)
+def test_the_truth_is_found_and_the_standard_deviations_are_right(
+    photoelectrons: float, noise_density: float, lights: str
+) -> None:
+    rig = camera(photoelectrons, noise_density)
+    table = np.array([pulls(rig, seed, lights) for seed in range(SEEDS)])
+    assert np.abs(table).max() < 4.5
+    assert np.abs(table.mean(axis=0)).max() < 4 / np.sqrt(SEEDS)
+    # Sums of squares of 60 unit normals: outside of these bounds with probability 1e-4.
+    squares = (table**2).sum(axis=0)
+    assert squares.min() > 25
+    assert squares.max() < 112
+
+
+def test_the_chi_square_of_a_gaussian_spot_is_that_of_its_freedom() -> None:
+    fits = [calibrate(camera(1000), shoot(camera(1000), seed, "dark,flat:8,still")[0]).spot for seed in range(SEEDS)]
+    total, freedom = sum(f.chi_square for f in fits if f), sum(f.freedom for f in fits if f)
+    assert abs(total - freedom) < 5 * np.sqrt(2 * freedom)
+    assert all(f and f.gaussian for f in fits)
+
+
+def test_photoelectrons_are_those_of_the_whole_spot() -> None:
+    for seed in range(10):
+        found = calibrate(camera(1000), shoot(camera(1000), seed, "dark,flat:4,flat:10,still")[0]).photoelectrons
+        assert found is not None
+        assert abs(found.value - 1000) < 4 * found.sd < 400
+
+
+def test_several_still_spots_are_fitted_together() -> None:
+    rig, shot = camera(0), [shoot(camera(0), seed, "dark,still")[0] for seed in range(4)]
+    one = calibrate(rig, shot[0])
+    four = calibrate(rig, [shot[0][0], *(each[1] for each in shot)])
+    assert one.kernel_sigma is not None
+    assert four.kernel_sigma is not None
+    assert four.spot is not None
+    assert len(four.spot.positions) == 4
+    assert abs(four.kernel_sigma.value - 0.05) < 4 * four.kernel_sigma.sd
+    assert four.kernel_sigma.sd < 0.8 * one.kernel_sigma.sd
+
+
+def test_successive_differences_give_the_variance_and_how_well() -> None:
+    rng = np.random.default_rng(3)
+    pattern, drift = rng.normal(0, 500, 4000), np.linspace(0, 60, 25)[:, None]
+    counts = np.rint(20_000 + pattern + drift + rng.normal(0, 40, (25, 4000))).astype(np.uint16)
+    for steady in (True, False):
+        found = pixel_statistics([counts], steady=steady)
+        assert found.variance.mean() == pytest.approx(1600, rel=0.02)
+        assert (found.variance / 1600).var() == pytest.approx(found.spread, rel=0.1)
+
+
+def changed(shot: list[Frames], change: Callable[[Kind, NDArray[np.float64]], NDArray[np.float64]]) -> list[Frames]:
+    return [
+        dataclasses.replace(
+            f, counts=np.clip(np.rint(change(f.kind, f.counts.astype(np.float64))), 0, 65535).astype(np.uint16)
+        )
+        for f in shot
+    ]
+
+
+ALL = "dark,flat:4,flat:8,still"
+
+
+def assert_true(found: Calibration, rig: Rig, *, skip: str = "") -> None:
+    truth = {"noise_density": 0.001, "counts_per_density": 2000, "photoelectrons": 1000, "kernel.sigma": 0.05}
+    for name, true in truth.items():
+        if name != skip:
+            value = found.values[f"sensor.{name}"]
+            assert abs(value.value - true) < 4 * value.sd, name
+
+
+def test_hot_pixels_are_left_out_and_named() -> None:
+    def heat(kind: Kind, counts: NDArray[np.float64]) -> NDArray[np.float64]:
+        counts[:, 7] += 9000
+        counts[:, 30] = 65535
+        return counts
+
+    rig = camera(1000, 0.001)
+    found = calibrate(rig, changed(shoot(rig, 1, ALL)[0], heat))
+    assert found.hot_pixels == (7, 30)
+    assert_true(found, rig)
+
+
+def test_a_fixed_pattern_does_not_become_noise() -> None:
+    rig, pattern = camera(1000, 0.001), np.random.default_rng(5).normal(0, 300, 40)
+    found = calibrate(rig, changed(shoot(rig, 1, ALL)[0], lambda kind, counts: counts + pattern))
+    assert any("fixed pattern" in note for note in found.notes)
+    assert_true(found, rig)
+    assert found.spot is not None
+    assert found.spot.gaussian
+
+
+def test_a_flat_that_flickers_does_not_become_shot_noise() -> None:
+    rig, flicker = camera(1000, 0.001), np.random.default_rng(6).normal(1, 0.1, (100, 1))
+    shot = changed(shoot(rig, 1, ALL)[0], lambda k, c: c if k != "flat" else 20_000 + (c - 20_000) * flicker)
+    assert_true(calibrate(rig, shot), rig)
+
+
+def test_a_spot_that_flickers_is_said_so() -> None:
+    rig, flicker = camera(1000, 0.001), np.random.default_rng(6).normal(1, 0.15, (100, 1))
+    shot = changed(shoot(rig, 1, ALL)[0], lambda k, c: c if k != "still" else 20_000 + (c - 20_000) * flicker)
+    assert any("the light of the spot flickers by 1" in note for note in calibrate(rig, shot).notes)
+
+
+def test_a_kernel_that_is_not_gaussian_is_said_so_and_its_total_is_right() -> None:
+    rig = camera(1000, 0.001)
+    ghost = changed(shoot(rig, 1, ALL)[0], lambda k, c: c if k != "still" else c + 0.3 * np.roll(c - 20_000, 3, axis=1))
+    found = calibrate(rig, ghost)
+    assert found.spot is not None
+    assert not found.spot.gaussian
+    assert any("the spot is not a Gaussian: chi-square" in note for note in found.notes)
+    assert found.counts_per_density is not None
+    assert abs(found.counts_per_density.value - 2600) < 4 * found.counts_per_density.sd < 400
+
+
+def test_a_spot_within_a_pixel_keeps_the_width_of_the_file() -> None:
+    rig = camera(0, 0.01, kernel=Kernel(shape="gaussian", sigma=0.005))
+    shots = (shoot(rig, seed, "dark,still") for seed in range(99))
+    shot = next(frames for frames, position in shots if abs((position / 0.05) % 1 - 0.5) < 0.2)
+    found = calibrate(rig, shot)
+    assert found.kernel_sigma is None
+    assert any("too narrow for the pixels to tell its width" in note for note in found.notes)
+
+
+def test_a_camera_without_noise_is_said_to_hide_it() -> None:
+    rig = camera(0, 1e-10)
+    found = calibrate(rig, shoot(rig, 1, "dark,flat:4,still")[0])
+    assert found.noise_density.value < 1e-6
+    assert any("the read noise is under half a count" in note for note in found.notes)
+    assert found.counts_per_density is not None
+    assert found.counts_per_density.value == pytest.approx(2000, rel=1e-3)
+
+
+def test_what_was_not_shown_is_not_known_and_said_so() -> None:
+    rig = camera(1000)
+    dark, flat, still = shoot(rig, 2, "dark,flat:8,still")[0]
+    assert set(calibrate(rig, [dark]).values) == {"sensor.black_level", "sensor.noise_density"}
+    assert "without a still spot, counts_per_density and kernel.sigma stay" in calibrate(rig, [dark]).notes[0]
+    assert "without flat or still frames, photoelectrons stays" in calibrate(rig, [dark]).notes[1]
+    assert set(calibrate(rig, [dark, flat]).values) == {
+        "sensor.black_level", "sensor.noise_density", "sensor.photoelectrons",
+    }  # fmt: skip
+    alone = calibrate(rig, [dark, still])
+    assert len(alone.values) == 5
+    assert "photoelectrons comes from the still spot's own pixels" in alone.notes[0]
+
+
+def test_shot_noise_that_is_not_seen_takes_only_an_impossible_value_out() -> None:
+    shot = shoot(camera(0), 1, "dark,flat:8,still")[0]
+    for told, expected in ((0.0, None), (1e9, None), (10.0, 0.0)):
+        found = calibrate(camera(told), shot).photoelectrons
+        assert (found and found.value) == expected
+
+
+def relabelled(lights: str, *kinds: Kind) -> list[Frames]:
+    shot = shoot(camera(1000), 4, lights, 40)[0]
+    return [dataclasses.replace(f, kind=kind, source=f"{kind}.mcap") for f, kind in zip(shot, kinds, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("lights", "kinds", "message"),
+    [
+        ("flat:4,still", ("flat", "still"), "there are no dark frames, .*: cover the camera"),
+        ("still", ("dark",), r"dark.mcap is said to be dark, but there is light on pixels \d+ to \d+: cover"),
+        ("dark,still", ("dark", "flat"), r"flat.mcap is said to be flat, but its pixels differ by \d+%: take the spot"),
+        ("dark,dark", ("dark", "flat"), "flat.mcap is said to be flat, but is no brighter than the dark frames"),
+        ("flat:4,dark", ("dark", "flat"), "flat.mcap is said to be flat, but is no brighter than the dark frames"),
+        ("dark,flat:4", ("dark", "still"), "still.mcap is said to show a resting spot, but there is light everywhere"),
+        ("dark,dark", ("dark", "still"), "still.mcap is said to show a resting spot, but there is none: is the light"),
+        ("dark,flat:40", ("dark", "flat"), r"flat.mcap is saturated: 40 pixels are at full scale \(65535\) .*; lower"),
+    ],
+)
+def test_frames_that_are_not_what_they_are_said_to_be(lights: str, kinds: tuple[Kind, ...], message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        calibrate(camera(1000), relabelled(lights, *kinds))
+
+
+def test_a_spot_that_moves_is_refused() -> None:
+    for name, seed in product(("section-vi", "section-vi-lively"), range(3)):
+        rig = load_rig(name)
+        rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, noise_density=0.01))
+        with pytest.raises(
+            CalibrationError, match=r"the spot moves by 0.\d+ \(standard deviation, .*: park the mirror"
+        ):
+            calibrate(rig, shoot(rig, seed, "dark,moving", 40)[0])
+
+
+def test_too_few_frames_and_a_low_black_level() -> None:
+    with pytest.raises(CalibrationError, match=r"dark.mcap holds 9 whole frames, at least 10 are needed .*: record"):
+        calibrate(camera(0), shoot(camera(0), 1, "dark", 9)[0])
+    low = camera(0, black_level=500)
+    with pytest.raises(CalibrationError, match=r"dark.mcap is saturated: 40 pixels are at zero .*; raise the camera's"):
+        calibrate(low, shoot(low, 1, "dark")[0])
+
+
+def test_a_spot_beside_the_sensor_is_refused() -> None:
+    rig = camera(0)
+    _, position = shoot(rig, 1, "still", 10)
+    for shift in (0.0, 0.04):
+        rig = camera(0, field=(position - shift, position - shift + 2))
+        with pytest.raises(
+            CalibrationError, match=r"the spot is at the edge of the sensor or beyond .*: move it inward"
+        ):
+            calibrate(rig, shoot(rig, 1, "dark,still")[0])
+
+
+def test_a_dark_level_that_has_moved_is_refused() -> None:
+    shot = shoot(camera(0), 1, "dark,still")[0]
+    for sign, what in ((1, "less than the dark level away from the spot"), (-1, "light everywhere")):
+        moved = changed(shot, lambda kind, counts, sign=sign: counts + sign * 1000 * (kind == "dark"))  # type: ignore[misc]
+        with pytest.raises(CalibrationError, match=f"but there is {what}: shield the sensor"):
+            calibrate(camera(0), moved)
+
+
+# The text of the rig file.
+
+
+@cache
+def found() -> Calibration:
+    return calibrate(camera(1000), shoot(camera(1000), 1, ALL)[0])
+
+
+HEAD, TAIL = LIVELY.toml.split("[sensor]")[0], "[mirror]" + LIVELY.toml.split("[mirror]")[1]
+COMMENT = st.text(st.characters(min_codepoint=32, max_codepoint=0x24F, exclude_categories=["Cc"]), max_size=20)
+KEYS = {
+    "kind": '"line"', "pixels": "40", "field": "[-1.0, 1.0]", "noise_density": "1e-2", "bit_depth": "16",
+    "black_level": "20_000", "counts_per_density": "2000", "photoelectrons": "0.0",
+}  # fmt: skip
+OPTIONAL = ("black_level", "photoelectrons", "bit_depth")
+LOOKALIKES = ("# black_level = 3", "# sigma = 0.05", "", "# [calibration]", "  # counts_per_density=2")
+
+
+@st.composite
+def rig_texts(draw: st.DrawFn) -> str:
+    """Rig files in the many ways in which one may write the same sensor."""
+    names = draw(st.permutations([k for k in KEYS if k not in OPTIONAL or draw(st.booleans())]))
+    kernel = 'kernel = {{ shape = "gaussian", {sigma} = 0.05 }}'.format(
+        sigma=draw(st.sampled_from(["sigma", '"sigma"']))
+    )
+    if draw(st.booleans()):
+        inline = ", ".join([*(f"{name} = {KEYS[name]}" for name in names), kernel])
+        return (
+            f'summary = """\nblack_level = 4\n[calibration]\n"""\nsensor = {{ {inline} }}\n'
+            + HEAD.split('"""')[0].replace("summary = ", "")
+            + HEAD.split('"""')[2]
+            + TAIL
+        )
+    lines = []
+    for name in names:
+        quote, space = draw(st.sampled_from(["", '"', "'"])), draw(st.sampled_from(["", " ", "\t"]))
+        lines += [f"{space}{quote}{name}{quote}{space}={space}{KEYS[name]} # {draw(COMMENT)}"]
+        lines += draw(st.lists(st.sampled_from(LOOKALIKES), max_size=2))
+    lines.append(kernel if draw(st.booleans()) else '[sensor.kernel]\nshape = "gaussian"\nsigma=0.05')
+    text = HEAD + "\n".join(["[sensor]", *lines, TAIL])
+    return text if draw(st.booleans()) else text.rstrip("\n").replace("\n", "\r\n")
+
+
+@given(text=rig_texts())
+@settings(max_examples=60, deadline=None)
+def test_only_the_values_change(text: str) -> None:
+    rig = parse_rig(text)
+    new = calibrated_text(text, rig, found(), ["dark dark.mcap sha256:00"])
+    before, after = tomllib.loads(text), tomllib.loads(new)
+    table = after.pop("calibration")
+    assert table["sources"] == ["dark dark.mcap sha256:00"]
+    for key, value in found().values.items():
+        *path, name = key.removeprefix("sensor.").split(".")
+        for side in (before, after):
+            section = side["sensor"][path[0]] if path else side["sensor"]
+            written = section.pop(name, None)
+        assert abs(written - value.value) <= 0.02 * value.sd
+    assert after == before
+    # What is not a number of the sensor stays, letter by letter.
+    numbers = {"noise_density", "black_level", "counts_per_density", "photoelectrons", "sigma"}
+    ours = new.splitlines()
+    for line in text.splitlines():
+        if not numbers & {word.strip("\"' \t{") for part in line.split("#")[0].split(",") for word in part.split("=")}:
+            assert line in ours
+        elif "{" not in line and "#" in line and not line.lstrip().startswith("#"):
+            assert any(each.endswith(line[line.index("#") :]) for each in ours)
+    assert new.count("\r\n") in (0, new.count("\n"))
+    # And doing it again changes nothing.
+    assert calibrated_text(new, parse_rig(new), found(), ["dark dark.mcap sha256:00"]) == new
+
+
+def test_the_calibration_is_in_the_rig_and_what_was_not_measured_again_stays() -> None:
+    text = calibrated_text(LIVELY.toml, LIVELY, found(), ["dark a sha256:1", "flat b sha256:2", "still c sha256:3"])
+    rig = parse_rig(text + "\n# the end\n")
+    assert rig.calibration is not None
+    assert (rig.calibration.dark_frames, rig.calibration.flat_frames, rig.calibration.still_frames) == (100, 200, 100)
+    sigma = found().kernel_sigma
+    assert sigma is not None
+    assert rig.calibration.kernel_sigma_sd == pytest.approx(sigma.sd, rel=0.01)
+    dark = calibrate(rig, shoot(camera(1000), 2, "dark")[0])
+    again = calibrated_text(rig.toml, rig, dark, ["dark d sha256:4"])
+    table = parse_rig(again).calibration
+    assert table is not None
+    assert table.kernel_sigma_sd == rig.calibration.kernel_sigma_sd
+    assert table.black_level_sd != rig.calibration.black_level_sd
+    assert table.sources == ("flat b sha256:2", "still c sha256:3", "dark d sha256:4")
+    assert again.endswith("\n\n# the end\n")
+
+
+def test_a_calibration_that_is_no_table_of_its_own_is_left_alone() -> None:
+    text = f"calibration = {{ dark_frames = 3 }}\n{LIVELY.toml}"
+    with pytest.raises(RigError, match="take it out by hand"):
+        calibrated_text(text, parse_rig(text), found(), [])
+
+
+# The command line, over real pseudo terminals.
+
+TRUE = LIVELY.toml.replace("photoelectrons = 0 ", "photoelectrons = 500 ").replace(
+    "exposure_steps = 200", "exposure_steps = 20"
+)
+WRONG = (
+    TRUE.replace("black_level = 20000", "black_level = 15000").replace("noise_density = 0.01", "noise_density = 0.5")
+    .replace("counts_per_density = 2000", "counts_per_density = 700").replace("sigma = 0.05", "sigma = 0.2")
+)  # fmt: skip
+
+
+def assert_calibrated(path: Path) -> None:
+    rig, truth = load_rig(path), parse_rig(TRUE).sensor
+    table = rig.calibration
+    assert table is not None
+    for value, true, sd in (
+        (rig.sensor.black_level, truth.black_level, table.black_level_sd),
+        (rig.sensor.noise_density, truth.noise_density, table.noise_density_sd),
+        (rig.sensor.counts_per_density, truth.counts_per_density, table.counts_per_density_sd),
+        (rig.sensor.photoelectrons, truth.photoelectrons, table.photoelectrons_sd),
+        (rig.sensor.kernel.sigma, truth.kernel.sigma, table.kernel_sigma_sd),
+    ):
+        assert sd is not None
+        assert abs(value - true) < 4.1 * sd
+
+
+def test_the_device_form_asks_records_and_writes_the_rig_file(aolink: Run, tmp_path: Path) -> None:
+    (tmp_path / "true.toml").write_text(TRUE)
+    (tmp_path / "my.toml").write_text(WRONG)
+    arguments = ["--rig", "my.toml", "-o", "out.toml", "--frames", "60", "--keep", "kept"]
+    with simulated_rig(tmp_path / "true.toml", "--light", "dark,flat:4,flat:8,still") as (camera_port, mirror_port):
+        devices = ["--camera", camera_port, "--mirror", mirror_port]
+        result = aolink("calibrate", *devices, *arguments, input="\n\n\n\n")
+    assert result.returncode == 0, result.stderr
+    assert "dark: cover the camera, then press Enter: flat: " in result.stderr
+    assert "Calibration from frames: 60 dark, 120 flat, 60 still" in result.stdout
+    assert_calibrated(tmp_path / "out.toml")
+    assert (tmp_path / "my.toml").read_text() == WRONG
+
+    files = [tmp_path / "kept" / f"{name}.mcap" for name in ("dark", "flat-1", "flat-2", "still")]
+    assert [Recording(path).metadata["calibration"] for path in files] == ["dark", "flat", "flat", "still"]
+    inputs = np.concatenate([exposure.inputs for exposure in Recording(files[3]).exposures()])
+    assert np.ptp(inputs) == 0
+
+    again = aolink("calibrate", *files, "--rig", "my.toml", "-o", "again.toml", "--json")
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "again.toml").read_text() == (tmp_path / "out.toml").read_text()
+    assert '"sensor.black_level": {"file": 15000.0' in again.stdout
+    refused = aolink("calibrate", *files, "--rig", "my.toml", "-o", "again.toml")
+    assert (refused.returncode, "again.toml exists and is not overwritten" in refused.stderr) == (1, True)
+    assert aolink("calibrate", *files, "--rig", "my.toml", "-o", "again.toml", "--overwrite").returncode == 0
+    aside = aolink("calibrate", *files, "--rig", "section-vi", "-o", "c.toml")
+    assert aside.returncode == 8
+    assert "dark.mcap is of another rig: its timing.exposure_steps is 20, the rig file has 200" in aside.stderr
+
+
+def test_kinds_can_be_skipped_and_nobody_there_is_an_error(aolink: Run, tmp_path: Path) -> None:
+    (tmp_path / "true.toml").write_text(TRUE)
+    common = ["--rig", "true.toml", "--frames", "40"]
+    with simulated_rig(tmp_path / "true.toml", "--light", "dark,still,dark") as (camera_port, mirror_port):
+        devices = ["--camera", camera_port, "--mirror", mirror_port]
+        result = aolink("calibrate", *devices, *common, "-o", "out.toml", input="\ns\n\n")
+        assert result.returncode == 0, result.stderr
+        assert "40 dark, 0 flat, 40 still" in result.stdout
+        (tmp_path / "tmp").mkdir()
+        own_tmp = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+        alone = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n", env=own_tmp)
+        assert (alone.returncode, "nobody answers: run `aolink calibrate` on a terminal" in alone.stderr) == (8, True)
+        few = aolink("calibrate", *devices, *common[:2], "-o", "b.toml", "--frames", "3", input="\n\n\n\n")
+        assert (few.returncode, "--frames 3 is too few: at least 10" in few.stderr) == (8, True)
+        unlit = aolink("calibrate", *devices, *common, "-o", "b.toml", input="\n\n\n\n", env=own_tmp)
+        assert unlit.returncode == 8
+        refused, _, kept = unlit.stderr.rpartition("; `aolink calibrate` takes what was recorded: ")
+        assert refused.endswith(
+            "aolink: flat-1.mcap is said to be flat, but is no brighter than the dark frames:"
+            " is the light on? Record both again"
+        )
+        # Whoever covered and lit the camera need not do it again.
+        assert sorted(Path(each).name for each in kept.split()) == [
+            "dark.mcap",
+            "flat-1.mcap",
+            "flat-2.mcap",
+            "still.mcap",
+        ]
+        again = aolink("calibrate", kept.split()[0], *common[:2], "-o", "dark.toml")
+        assert again.returncode == 0, again.stderr
+    nowhere = aolink("calibrate", "--camera", "x", "--mirror", "x", *common, "-o", "no/b.toml")
+    assert (nowhere.returncode, "there is no folder no; make it" in nowhere.stderr) == (1, True)
+    assert not (tmp_path / "b.toml").exists()
+    assert aolink("calibrate", *common[:2], "-o", "b.toml").returncode == 2
+
+
+def test_nobody_is_asked_for_anything_before_the_ports_are_tried(aolink: Run, tmp_path: Path) -> None:
+    (tmp_path / "tmp").mkdir()
+    own_tmp = {**os.environ, "TMPDIR": str(tmp_path / "tmp")}
+    arguments = ["--rig", "section-vi", "-o", "out.toml"]
+    with simulated_rig("section-vi") as (camera, mirror):
+        for ports, message in (
+            ((camera, "/dev/nowhere"), "there is no port /dev/nowhere"),
+            ((mirror, camera), "the device on the camera port is a mirror"),
+        ):
+            result = aolink(
+                "calibrate", "--camera", ports[0], "--mirror", ports[1], *arguments, input="\n", env=own_tmp
+            )
+            assert result.returncode in (3, 4)
+            assert result.stderr.startswith(f"aolink: {message}"), result.stderr
+    assert not list((tmp_path / "tmp").iterdir())
+
+
+def test_frames_are_recorded_apart_and_marked(aolink: Run, tmp_path: Path) -> None:
+    rig = load_rig("section-vi-lively")
+    with simulated_rig("section-vi-lively", "--light", "dark") as ports:
+        result = aolink(
+            "record", "--camera", ports[0], "--mirror", ports[1], "--rig", "section-vi-lively", "--calibration", "dark",
+            "--exposures", "12", "-o", "dark.mcap",
+        )  # fmt: skip
+        record(rig, *ports, tmp_path / "plain.mcap", exposures=2)
+    assert result.returncode == 0, result.stderr
+    assert Recording(tmp_path / "dark.mcap").metadata["calibration"] == "dark"
+    assert "calibration" not in Recording(tmp_path / "plain.mcap").metadata
+    assert aolink("calibrate", "dark.mcap", "--rig", "section-vi-lively", "-o", "out.toml").returncode == 0
+    plain = aolink("calibrate", "plain.mcap", "--rig", "section-vi-lively", "-o", "b.toml")
+    assert plain.returncode == 8
+    assert (
+        "plain.mcap is not marked as a recording for calibration: make one with `aolink record --cali" in plain.stderr
+    )

@@ -1,0 +1,97 @@
+"""`aolink rig --check`: what a lab user gets wrong is named before anything runs."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from aolink.jobs.check_rig import check_rig
+from aolink.rig import builtin_rigs, load_rig, parse_rig
+
+SECTION_VI = load_rig("section-vi").toml
+
+
+def found(severity: str, **values: str) -> dict[str, str]:
+    """Key and message of what the check says of section-vi with some values changed."""
+    text = SECTION_VI.replace("[mirror]", "[mirror]\nwatchdog_s = 1.0\nqueue_steps = 400")
+    text = text.replace("exposure_offset = 0 ", "frame_period_steps = 200\nexposure_offset = 0 ")
+    text = text.replace("[simulation]", "[simulation]\nlatency_s = 1e-4")
+    for key, value in values.items():
+        text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
+        assert count == 1, key
+    return {f.key: f.message for f in check_rig(parse_rig(text)) if f.severity == severity}
+
+
+@pytest.mark.parametrize(
+    ("values", "key", "message"),
+    [
+        ({"sigma": "50"}, "sensor.kernel.sigma", r"wider than the field: its sd is 35\.4, the field 2 wide"),
+        ({"field": "[-0.01, 0.01]"}, "sensor.kernel.sigma", "wider than the field"),
+        ({"noise_density": "10"}, "sensor.noise_density", r"lost in the noise: resting, .* by 0\.84 sd"),
+        ({"counts_per_density": "0.01"}, "sensor.counts_per_density", "the read-out rounds it away"),
+        ({"process_noise": "1e6"}, "plant.process_noise", "more than the field is wide"),
+        ({"amplitude": "0.04"}, "drive.amplitude", "lower drive.amplitude or widen sensor.field"),
+        ({"counts_per_density": "1e-300"}, "rig", "too large or too small to compute with"),
+    ],
+)
+def test_what_cannot_work_is_an_error(values: dict[str, str], key: str, message: str) -> None:
+    assert re.search(message, found("error", **values)[key])
+    assert found("error") == {}
+
+
+@pytest.mark.parametrize(
+    ("values", "key", "message"),
+    [
+        ({"fast_step_s": "1.0"}, "timing.fast_step_s", "1 Hz are not what a fast mirror takes"),
+        ({"fast_step_s": "1e-9"}, "timing.fast_step_s", "1 GHz are not what a fast mirror takes"),
+        ({"fast_step_s": "1.0"}, "timing.exposure_steps", "200 steps of 1 s takes 200 s"),
+        ({"exposure_steps": "1"}, "timing.exposure_steps", "no motion that its blur could tell"),
+        ({"frame_period_steps": "100000"}, "timing.frame_period_steps", "looks for 0.002 of the time"),
+        ({"fast_step_s": "1e-6"}, "timing.frame_period_steps", "5 kHz are more than a host takes"),
+        ({"sigma": "0.8"}, "sensor.kernel.sigma", "every frame cuts the spot off"),
+        ({"sigma": "0.02"}, "sensor.kernel.sigma", "under a third of a pixel"),
+        ({"black_level": "100"}, "sensor.black_level", "clipped at zero"),
+        ({"photoelectrons": "1"}, "sensor.photoelectrons", "4e.04 counts for each photo-electron"),
+        ({"process_noise": "100"}, "sensor.field", "beyond the field"),
+        ({"process_noise": "0"}, "plant.process_noise", "never look"),
+        ({"amplitude": "0", "process_noise": "1e-6"}, "plant.process_noise", "no blur to learn from"),
+        ({"period_s": "0.15", "amplitude": "0.05", "fast_step_s": "0.02"}, "drive.period_s", "7.5 fast steps"),
+        (
+            {"A": "[[0.5, 0.0], [0.0, 0.9]]", "B": "[[4.0], [1.0]]", "amplitude": "0.05", "period_s": "0.01"},
+            "timing.fast_step_s",
+            "jumps by",
+        ),
+        ({"fast_step_s": "1e-5"}, "mirror.queue_steps", "lasts 4 ms"),
+        ({"watchdog_s": "0.06"}, "mirror.watchdog_s", "parks after 60 ms .* a block of commands lasts 50 ms"),
+        ({"watchdog_s": "500"}, "mirror.watchdog_s", "goes on for 500 s"),
+        ({"dac_bits": "3"}, "mirror.dac_bits", "round the drive by up to"),
+        ({"clock_drift_ppm": "20000"}, "simulation.clock_drift_ppm", "broken clock"),
+        ({"latency_s": "2"}, "simulation.latency_s", "2 s one way"),
+    ],
+)
+def test_what_is_probably_a_slip_is_a_warning(values: dict[str, str], key: str, message: str) -> None:
+    assert re.search(message, found("warning", **values)[key])
+    assert found("warning") == {}
+
+
+def test_the_numbers_that_a_rig_comes_to_are_stated() -> None:
+    """By hand for section-vi: sd of the kernel sigma/sqrt(2), noise sqrt(V/D), peak erf(D/2/sigma)/D = 10.41."""
+    told = found("info")
+    assert "a fast step of 1 ms (1 kHz); exposures of 200 steps, 200 ms, one every 200 ms (5 Hz)" in told["timing"]
+    assert "40 pixels of 0.05 over the field [-1, 1]" in told["sensor"]
+    assert "is 0.0354, 0.707 pixels" in told["sensor"]
+    assert (
+        "signal to noise 7.36 in the brightest pixel of a resting spot (20820 counts over 2828)"
+        in (told["sensor.noise_density"])
+    )
+    assert "blocks of 50 steps, 50 ms; the device queues 400 ms" in told["mirror"]
+
+
+@pytest.mark.parametrize("name", builtin_rigs())
+def test_the_rigs_that_come_along_have_no_error(name: str) -> None:
+    findings = check_rig(load_rig(name))
+    assert not [f for f in findings if f.severity == "error"]
+    # Its actuators at rest in one place are alike, and the lenslets do not see all of them.
+    expected = ["plant.C"] if name == "membrane-12x12" else []
+    assert [f.key for f in findings if f.severity == "warning"] == expected

@@ -1,0 +1,94 @@
+"""Linear algebra by one thread, against NumPy's; and who else is given one."""
+
+from threading import Thread
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from threadpoolctl import threadpool_info
+
+from aolink.numerics import single_thread
+
+sizes = st.integers(0, 130)
+
+
+def random(*shape: int) -> np.ndarray:
+    return np.random.default_rng(sum(shape)).standard_normal(shape)
+
+
+@settings(deadline=None, max_examples=40)
+@given(sizes, sizes, sizes)
+def test_products_are_those_of_whole_matrices(n: int, k: int, m: int) -> None:
+    a, b = random(n, k), random(k, m)
+    np.testing.assert_allclose(single_thread.matmul(a, b), a @ b, atol=1e-12)
+    np.testing.assert_allclose(single_thread.matmul(b.T, a.T), b.T @ a.T, atol=1e-12)
+    np.testing.assert_allclose(
+        single_thread.matvec(a, b[:, 0] if m else np.zeros(k)), a @ (b[:, 0] if m else np.zeros(k)), atol=1e-12
+    )
+    gram = single_thread.gram(a)
+    np.testing.assert_allclose(gram, a.T @ a, atol=1e-12)
+    np.testing.assert_array_equal(gram, gram.T)
+
+
+@pytest.mark.parametrize("n", [1, 47, 48, 49, 200])
+def test_the_inverse_of_a_root_gives_the_inverse(n: int) -> None:
+    a = random(n, n + 5)
+    a = a @ a.T
+    W = single_thread.inverse_root(a)
+    np.testing.assert_array_equal(W, np.tril(W))
+    np.testing.assert_allclose(W @ np.linalg.cholesky(a), np.eye(n), atol=1e-8)
+    np.testing.assert_allclose(single_thread.inverse(a) @ a, np.eye(n), atol=1e-7)
+    x = random(n)
+    np.testing.assert_allclose(single_thread.solve(a, a @ x), x, atol=1e-7)
+
+
+def test_a_matrix_without_a_root_is_refused() -> None:
+    a = np.eye(100)
+    a[70, 70] = -1
+    with pytest.raises(np.linalg.LinAlgError):
+        single_thread.inverse_root(a)
+
+
+@pytest.mark.parametrize("share", [0.01, 1.0])
+def test_congruence_by_entries_and_whole(share: float) -> None:
+    a, p = random(90, 150) * (np.random.default_rng(1).random((90, 150)) < share), random(150, 150)
+    p = p + p.T
+    np.testing.assert_allclose(single_thread.congruence(a, p), a @ p @ a.T, atol=1e-11)
+    np.testing.assert_array_equal(single_thread.congruences(a, p[None])[0], single_thread.congruence(a, p))
+
+
+@pytest.mark.parametrize("touched", [0, 60, 149, 150])
+def test_congruence_of_what_is_independent_at_its_end(touched: int) -> None:
+    a, p = random(90, 150), np.eye(150)
+    a[:, :40] *= np.random.default_rng(2).random((90, 40)) < 0.02
+    own = random(touched, touched)
+    p[:touched, :touched] = own + own.T
+    np.testing.assert_allclose(single_thread.congruence(a, p), a @ p @ a.T, atol=1e-11)
+
+
+def blas_threads() -> set[int]:
+    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+
+def test_one_thread_as_long_as_anybody_is_inside() -> None:
+    before, seen = blas_threads(), []
+    if before == {1}:
+        pytest.skip("BLAS was told to have one thread when it was loaded")
+
+    def other() -> None:
+        with single_thread.by_one_thread:
+            seen.append(blas_threads())
+        seen.append(blas_threads())
+
+    thread = Thread(target=other)
+    with single_thread.by_one_thread:
+        thread.start()
+        single_thread.matmul(np.eye(3), np.eye(3))
+        assert blas_threads() == {1}
+        assert not seen
+    thread.join()
+    assert seen == [{1}, before]
+    with pytest.raises(np.linalg.LinAlgError):
+        single_thread.inverse(-np.eye(3))
+    assert blas_threads() == before

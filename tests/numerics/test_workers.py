@@ -1,0 +1,123 @@
+"""Processes end with the one that started them, in whatever way that ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from aolink.recording.reader import Recording
+from tests.conftest import Session
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+_PATIENCE_S = 60.0
+
+
+def all_end(processes: list[psutil.Process]) -> bool:
+    """Whether they all do. A process that has ended and that nobody has asked about counts as ended."""
+    deadline = time.monotonic() + _PATIENCE_S
+    while any(each.is_running() and each.status() != psutil.STATUS_ZOMBIE for each in processes):
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen([sys.executable, "-m", "aolink", *words], cwd=folder, **quiet)  # type: ignore[call-overload, no-any-return]
+
+
+def wait_for(true: Callable[[], object], process: subprocess.Popen[bytes]) -> None:
+    deadline = time.monotonic() + _PATIENCE_S
+    while not true():
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_the_workers_of_a_killed_batch_end_and_the_next_run_does_it_all(
+    aolink: Run, recorded: Session, tmp_path: Path
+) -> None:
+    shutil.copy(recorded.path, tmp_path / "a.mcap")
+    batch = ("estimate", "a.mcap", "-e", "o1", "--set", "plant.process_noise=1,2,3,4,5,6", "--jobs", "2", "-o", "out")
+    with started(tmp_path, *batch) as process:
+        wait_for(lambda: [*tmp_path.glob("out/*.partial"), *tmp_path.glob("out/.*.partial")], process)
+        children = psutil.Process(process.pid).children(recursive=True)
+        assert len(children) >= 2
+        process.kill()
+    assert all_end(children)
+    assert not [*tmp_path.glob("out/.*")], "the workers remove what they had begun"
+    again = aolink(*batch, "--json")
+    assert again.returncode == 0, again.stderr
+    assert [row["error"] for row in json.loads(again.stdout)] == [None] * 6
+    assert all(Recording(path).complete for path in tmp_path.glob("out/*.mcap"))
+    assert not [*tmp_path.glob("out/.*")]
+
+
+def test_workers_that_have_nothing_to_do_end_as_well(tmp_path: Path) -> None:
+    program = (
+        "import os, sys\n"
+        "from aolink.numerics.workers import processes\n"
+        "if __name__ == '__main__':\n"
+        "    with processes(2) as pool:\n"
+        "        print(*{pool.submit(os.getpid).result() for _ in range(20)}, flush=True)\n"
+        "        sys.stdin.read()\n"
+    )
+    (tmp_path / "program.py").write_text(program)
+    with subprocess.Popen(
+        [sys.executable, "program.py"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=tmp_path
+    ) as process:
+        assert process.stdout is not None
+        workers = [psutil.Process(int(word)) for word in process.stdout.readline().split()]
+        process.kill()
+    assert workers
+    assert all_end(workers)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_what_a_terminal_sends_to_all_is_for_the_parent_alone(
+    recorded: Session, tmp_path: Path, number: signal.Signals
+) -> None:
+    """A terminal sends Ctrl-C and its own end to every process; jobs on the way are ended in good order, not killed."""
+    shutil.copy(recorded.path, tmp_path / "a.mcap")
+    values = ",".join(str(1 + k) for k in range(100))
+    words = ["estimate", "a.mcap", "-e", "o1", "--set", f"plant.process_noise={values}", "--jobs", "2", "-o", "out"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "aolink", *words], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True, start_new_session=True,
+    ) as process:  # fmt: skip
+        deadline = time.monotonic() + _PATIENCE_S
+        while not [*tmp_path.glob("out/*.mcap")]:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        os.killpg(process.pid, number)
+        _, errors = process.communicate(timeout=_PATIENCE_S)
+    assert (process.returncode, errors) == (128 + number, f"aolink: interrupted by {number.name}\n")
+    assert not [*tmp_path.glob("out/.*")]
+
+
+def test_the_simulated_rig_of_a_killed_demo_ends(tmp_path: Path) -> None:
+    with started(tmp_path, "demo", "--rig", "tip-tilt", "--exposures", "100000") as process:
+        wait_for(lambda: [*tmp_path.glob("demo-*/session.mcap")], process)
+        children = psutil.Process(process.pid).children(recursive=True)
+        assert children
+        process.kill()
+    assert all_end(children)
+
+
+def test_the_viewer_of_a_killed_command_ends(recorded: Session, tmp_path: Path) -> None:
+    with started(tmp_path, "view", str(recorded.path), "--web") as process:
+        wait_for(lambda: psutil.Process(process.pid).children(recursive=True), process)
+        children = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
+    assert all_end(children)
