@@ -152,7 +152,7 @@ def test_one_spot_with_slopes_as_stated_has_a_consistent_estimate(tmp_path: Path
     [
         ("sd = 0.039", "sd = 0", "plant.unmodelled.sd = 0 must be above 0"),
         ("sd = 0.039", "", "plant.unmodelled.sd is missing"),
-        ("correlation_s = 0.022", "time_s = 0.022", "plant.unmodelled"),
+        ("correlation_s = 0.026", "time_s = 0.026", "plant.unmodelled"),
     ],
 )
 def test_what_is_wrong_in_the_table_is_named(old: str, new: str, message: str) -> None:
