@@ -7,7 +7,7 @@ from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -25,6 +25,9 @@ from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, 
 from aolink.rig import Rig, parse_rig
 from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
+
+if TYPE_CHECKING:
+    from aolink.restoration import RestoredPictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +51,6 @@ class RawMessage(NamedTuple):
     log_time_ns: int
     sequence: int
     data: bytes
-
-
-class RestoredPictures(NamedTuple):
-    """An exposure's pictures without their blur, as they are recorded."""
-
-    info: schemas_pb2.Restoration
-    scene: NDArray[np.float32] | None
-    """Intensity, (rows, columns)."""
-    spots: NDArray[np.float32] | None
-    """Share of a spot's light, (rows, columns) of the camera's frame."""
 
 
 class Recording:
@@ -256,14 +249,14 @@ class Recording:
     def restored(self) -> Iterator[RestoredPictures]:
         """What `aolink deblur` wrote, exposure by exposure."""
         info: schemas_pb2.Restoration | None = None
-        pictures: dict[str, NDArray[np.float32]] = {}
+        pictures: dict[str, RawImage] = {}
         for recorded in self.messages(topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS):
             if isinstance(recorded.message, schemas_pb2.Restoration):
                 if info is not None:
                     yield _restored(info, pictures)
                 info, pictures = recorded.message, {}
             elif isinstance(recorded.message, RawImage):
-                pictures[recorded.topic] = convert.picture_from_float_image(recorded.message)
+                pictures[recorded.topic] = recorded.message
         if info is not None:
             yield _restored(info, pictures)
 
@@ -374,8 +367,10 @@ class Recording:
         self._losses.setdefault(loss.offset, loss)
 
 
-def _restored(info: schemas_pb2.Restoration, pictures: dict[str, NDArray[np.float32]]) -> RestoredPictures:
-    return RestoredPictures(info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS))
+def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:
+    return convert.restored_from_messages(
+        info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
+    )
 
 
 def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:

@@ -17,7 +17,7 @@ from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.plain import plain_data
 from aolink.recording import schemas_pb2 as schemas
-from aolink.recording.reader import RestoredPictures
+from aolink.restoration import RestoredPictures
 from aolink.rig import Rig, load_rig
 from aolink.wire import messages_pb2 as wire
 
