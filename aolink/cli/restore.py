@@ -90,7 +90,7 @@ def _deblur_recording(
     from aolink.recording.deblur import write_deblurred
 
     recording = open_recording(file)
-    with progress_bar(stderr, recording.counts.get("/camera/image", 0)) as tell:
+    with progress_bar(stderr, recording.n_frames) as tell:
         summary = write_deblurred(
             recording, out, estimator=estimator, method=method, overwrite=overwrite,
             workers=os.cpu_count() or 1, progress=lambda n: tell("deblur", n),

@@ -23,7 +23,7 @@ from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
-from aolink.wire.messages_pb2 import Applied, CommandBlock
+from aolink.wire.messages_pb2 import Applied
 from aolink.wire.runs_pb2 import Run
 
 if TYPE_CHECKING:
@@ -138,6 +138,11 @@ class Recording:
     def estimators(self) -> list[str]:
         """Names of the estimators whose results are in the file."""
         return [name.removeprefix(topics.ESTIMATE) for name in self.counts if name.startswith(topics.ESTIMATE)]
+
+    @property
+    def n_frames(self) -> int:
+        """How many of the camera's frames are in the file."""
+        return self.counts.get(topics.IMAGE, 0)
 
     def skipped(self, estimator: str) -> frozenset[int]:
         """Frame ids of the exposures that an estimator had no time for in the session."""
@@ -392,10 +397,7 @@ def _scene_shape(rig: Rig) -> tuple[int, int]:
     return rig.scene.shape if rig.scene else (0, 0)
 
 
-_RUNS = {
-    topics.COMMAND: CommandBlock.DESCRIPTOR.full_name,
-    topics.APPLIED: Applied.DESCRIPTOR.full_name,
-}
+_RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in topics.TOPICS if row.belongs_to == "steps"}
 """Where runs of steps are, and the schema that they have there."""
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
 _BESIDE = frozenset({topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE})

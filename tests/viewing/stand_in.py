@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -100,7 +101,7 @@ class StandIn:
 
     @property
     def counts(self) -> dict[str, int]:
-        return {"/estimation/o3": self.n} if self.without_time else {}
+        return Counter(each.topic for each in self.messages())
 
     def skipped(self, name: str) -> frozenset[int]:
         return frozenset(self.without_time if name == "o3" else ())
