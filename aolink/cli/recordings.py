@@ -171,7 +171,6 @@ def _estimate_one(
     from aolink.recording.reestimate import (
         check_has_exposures,
         kept_estimators,
-        recorded_estimates,
         reestimated,
         scored_and_compared,
         write_reestimated,
@@ -190,7 +189,7 @@ def _estimate_one(
                     only=only, overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
                 )  # fmt: skip
                 written = Recording(output)
-                each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
+                each = zip(*(written.iter_estimates(name) for name in names), strict=True)
                 series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
             else:
                 series = reestimated(recording, names, lambda n: tell("estimate", n), engine.value)

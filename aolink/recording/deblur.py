@@ -22,7 +22,7 @@ from aolink.optics.scene import scene_motion
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.reader import RawMessage, Recording
-from aolink.recording.reestimate import check_has_exposures, recorded_estimates, reestimated
+from aolink.recording.reestimate import check_has_exposures, reestimated
 from aolink.restoration import RestoredPictures, deblur, find_method
 from aolink.restoration.deblur import blurred_psnr, psnr
 from aolink.rig import Rig
@@ -137,7 +137,7 @@ def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Esti
         for exposure, (estimate,) in reestimated(recording, [name]):
             yield replace(exposure, truth=None), estimate
         return
-    recorded = recorded_estimates(recording, name)
+    recorded = recording.iter_estimates(name)
     ahead = next(recorded, None)
     for exposure in recording.exposures():
         while ahead is not None and ahead.frame_id < exposure.frame_id:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -273,17 +274,29 @@ class Recording:
             raise RecordingError(
                 f"{self.path} holds no estimates of {name} (it has: {known}): `aolink estimate` makes them"
             )
-        latest: dict[int, Exposure] = {}
-        messages: list[schemas_pb2.Estimate] = []
-        for recorded, exposures in self.assembled(topic):
-            if recorded is not None and isinstance(recorded.message, schemas_pb2.Estimate):
-                messages.append(recorded.message)
-            latest.update((exposure.frame_id, exposure) for exposure in exposures)
-        return [
-            convert.estimate_from_message(message, self.model, latest[message.frame_id])
-            for message in messages
-            if message.frame_id in latest
-        ]
+        return list(self.iter_estimates(name))
+
+    def iter_estimates(self, name: str) -> Iterator[Estimate]:
+        """As `estimates`, one by one: the file is read only as far as they are asked for. None is no error here."""
+        exposures: dict[int, Exposure] = {}
+        waiting: deque[schemas_pb2.Estimate] = deque()
+        for recorded, completed in self.assembled(topics.estimate_topic(name), topics.estimation_topic(name)):
+            received = None if recorded is None else recorded.message
+            if isinstance(received, schemas_pb2.Estimate):
+                waiting.append(received)
+            elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
+                exposures.pop(received.frame_id, None)
+            exposures.update((exposure.frame_id, exposure) for exposure in completed)
+            # At the end of the recording, an exposure that has not come will not; nor will one of the part before this.
+            first = next(iter(exposures), 0)
+            while waiting and (recorded is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
+                message = waiting.popleft()
+                if message.frame_id not in exposures:
+                    continue
+                yield convert.estimate_from_message(message, self.model, exposures[message.frame_id])
+                # Estimates come in the order of their exposures: what is before this one has had its own.
+                for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
+                    del exposures[frame_id]
 
     def _survey(self, *, check: bool) -> str | None:
         """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
