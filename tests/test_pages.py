@@ -13,6 +13,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from PIL import Image
 from aolink.cli.common import app
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
-from aolink.rig import load_rig
+from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 
 ROOT = Path(__file__).parents[1]
@@ -91,12 +92,13 @@ def code_blocks(page: Path) -> Iterator[CodeBlock]:
 BLOCKS = [block for page in PAGES for block in code_blocks(page)]
 NO_CODE = {
     "estimator   RMSE start": "test_demo_figures.py runs the demo and compares",
-    "files, signals": "test_the_architecture_names_what_there_is",
+    "errors, files, signals": "test_the_architecture_names_what_there_is",
     "Copyright (c)": "a licence",
 }
 """How indented blocks begin that are no commands, and what holds them."""
 SHELL = [block for block in BLOCKS if not block.language and not block.text.startswith(tuple(NO_CODE))]
 PYTHON = [block for block in BLOCKS if block.language == "python"]
+TOML = [block for block in BLOCKS if block.language == "toml"]
 
 
 def commands(block: CodeBlock) -> Iterator[str]:
@@ -185,8 +187,18 @@ def test_a_block_of_python_works(block: CodeBlock, laboratory: Path, tmp_path: P
         assert len(list(Recording(made))) > 0
 
 
+@pytest.mark.parametrize("block", TOML, ids=str)
+def test_a_block_of_toml_is_a_rig_or_stands_in_the_example_package(block: CodeBlock) -> None:
+    if "[project.entry-points" not in block.text:
+        parse_rig(block.text)
+        return
+    package = tomllib.loads((ROOT / "tests" / "example_package" / "pyproject.toml").read_text())
+    for group, named in tomllib.loads(block.text)["project"]["entry-points"].items():
+        assert named.items() <= package["project"]["entry-points"][group].items()
+
+
 def test_every_block_is_of_a_kind_that_is_tried() -> None:
-    assert {block.language for block in BLOCKS} == {"", "python"}
+    assert {block.language for block in BLOCKS} == {"", "python", "toml", "text"}, "text is for equations"
     assert SHELL
     assert PYTHON
     for start in NO_CODE:
@@ -195,13 +207,13 @@ def test_every_block_is_of_a_kind_that_is_tried() -> None:
 
 def test_the_architecture_names_what_there_is() -> None:
     """README's list of the layers: each of its names is a module, and every module is in it."""
-    (block,) = [block for block in BLOCKS if block.text.startswith("files, signals")]
+    (block,) = [block for block in BLOCKS if block.text.startswith("errors, files, signals")]
     named = {name for line in block.text.splitlines() for name in re.split(r", ", re.split(r" {2,}", line)[0])}
     there = {
         path.stem for path in (ROOT / "aolink").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
     }
     assert named <= there
-    assert there - named == {"__init__", "__main__", "errors", "simulation", "terminal", "toml_table"}
+    assert there - named == {"__init__", "__main__", "plain", "simulation", "units"}
 
 
 def test_commands_in_the_text_have_the_options_that_they_are_given() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -51,3 +52,20 @@ def test_topics_are_written_in_the_table_alone() -> None:
         }  # of entities' paths
         texts = {each.value for each in found if isinstance(each, ast.Constant) and each not in parts}
         assert not texts & {row.name for row in TOPICS}, path
+
+
+def test_the_rooms_page_has_the_table() -> None:
+    def cell(text: str) -> str:
+        return f"`{text}`" if text else ""
+
+    page = (HOUSE / "recording" / "README.md").read_text()
+    found = [re.sub(r" +", " ", line) for line in page.splitlines() if line.startswith("| `")]
+    assert found == [
+        re.sub(
+            r" +",
+            " ",
+            f"| {cell(row.name)} | `{row.message.DESCRIPTOR.name}` | {row.belongs_to} | {cell(row.after)}"
+            f" | {'yes' if row.repeatable else ''} | {row.shown_by} |",
+        )
+        for row in TOPICS
+    ]

@@ -340,3 +340,10 @@ def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr in readers:
                 asked |= {each.value for each in call.args[:1] if isinstance(each, ast.Constant)}
     assert asked == KEYS
+
+
+def test_the_rooms_page_names_every_key() -> None:
+    page = (Path(tables.__file__).parent / "README.md").read_text()
+    top = {"drive", "lenslets", "mirror", "plant", "scene", "sensor", "simulation", "timing"}
+    named = set(re.findall(r"\b[A-Za-z_0-9]+\b", "".join(re.findall(r"`[^`]+`", page))))
+    assert named | top >= KEYS
