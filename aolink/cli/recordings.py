@@ -171,7 +171,6 @@ def _estimate_one(
     from aolink.recording.reestimate import (
         check_has_exposures,
         kept_estimators,
-        recorded_estimates,
         reestimated,
         scored_and_compared,
         write_reestimated,
@@ -180,7 +179,7 @@ def _estimate_one(
     recording = model.applied_to(open_recording(file))
     check_has_exposures(recording)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
-    total, known = recording.counts.get("/camera/image", 0), recording.damage
+    total, known = recording.n_frames, recording.damage
     try:
         get_ready(recording.rig, names)
         with progress_bar(stderr, total) as tell:
@@ -190,7 +189,7 @@ def _estimate_one(
                     only=only, overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
                 )  # fmt: skip
                 written = Recording(output)
-                each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
+                each = zip(*(written.iter_estimates(name) for name in names), strict=True)
                 series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
             else:
                 series = reestimated(recording, names, lambda n: tell("estimate", n), engine.value)
@@ -255,7 +254,7 @@ def compare(
     with TemporaryDirectory(prefix="aolink-") as folder:
         if second is None:
             second = Path(folder) / first.name
-            with progress_bar(stderr, one.counts.get("/camera/image", 0)) as tell:
+            with progress_bar(stderr, one.n_frames) as tell:
                 write_reestimated(one, one.estimators, second, progress=lambda n: tell("estimate", n), as_recorded=True)
         two = open_recording(second)
         total = sum(one.counts.values()) + sum(two.counts.values())

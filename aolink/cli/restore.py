@@ -6,9 +6,10 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperOption
 
 from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, stderr, stdout
 from aolink.cli.terminal import progress_bar
@@ -16,9 +17,28 @@ from aolink.errors import RestorationError
 from aolink.files import check_target
 
 
+class _NamingMethods(TyperCommand):
+    """Its help names the methods that there are: packages are searched for them when somebody reads it."""
+
+    def format_help(self, *arguments: Any, **named: Any) -> None:
+        from aolink.restoration import METHODS, find_method
+
+        def told(name: str) -> str:
+            try:
+                return f"{name} ({find_method(name).summary})"
+            except RestorationError as error:
+                return f"{name} ({error})"
+
+        for each in self.params:
+            if isinstance(each, TyperOption) and each.name == "method":
+                each.help = f"{'; '.join(map(told, METHODS))}."
+        super().format_help(*arguments, **named)
+
+
 @app.command(
+    cls=_NamingMethods,
     epilog="Example: aolink deblur session.mcap -e moments -o sharp.mcap"
-    "  |  aolink deblur --image moved.png --psf psf.csv -o sharp.png"
+    "  |  aolink deblur --image moved.png --psf psf.csv -o sharp.png",
 )
 def deblur(
     out: Annotated[
@@ -47,10 +67,7 @@ def deblur(
             " is where the scene stays in place.",
         ),
     ] = None,
-    method: Annotated[
-        str,
-        typer.Option(help="tv, gauss_markov, pnp (slow); on lines: smoother, lag, filter, predictor, inverse."),
-    ] = "tv",
+    method: Annotated[str, typer.Option(help="The restoration method.")] = "tv",
     noise_sd: Annotated[
         float | None, typer.Option(help="Of --image's noise, in its own counts; found in it if not given.")
     ] = None,
@@ -71,12 +88,11 @@ def _deblur_recording(
 ) -> None:  # fmt: skip
     from aolink.cli import tables
     from aolink.recording.deblur import write_deblurred
-    from aolink.restoration import checked_method
 
     recording = open_recording(file)
-    with progress_bar(stderr, recording.counts.get("/camera/image", 0)) as tell:
+    with progress_bar(stderr, recording.n_frames) as tell:
         summary = write_deblurred(
-            recording, out, estimator=estimator, method=checked_method(method), overwrite=overwrite,
+            recording, out, estimator=estimator, method=method, overwrite=overwrite,
             workers=os.cpu_count() or 1, progress=lambda n: tell("deblur", n),
         )  # fmt: skip
     if as_json:
@@ -94,7 +110,7 @@ def _deblur_picture(
     import numpy as np
 
     from aolink.optics.pictures import finite_pixels, read_picture, read_psf, write_picture
-    from aolink.restoration import checked_method, restore
+    from aolink.restoration import find_method, restore
 
     check_target(out, overwrite=overwrite, sources=[image, psf], error=RestorationError)
     whole = read_picture(image)
@@ -102,7 +118,7 @@ def _deblur_picture(
     picture = whole[..., :3] if whole.ndim == 3 and whole.shape[2] == 4 else whole
     seen = finite_pixels(picture)
     missing = 0 if seen is None else int((~seen).sum())
-    restored = restore(picture, read_psf(psf), method=checked_method(method), noise_sd=noise_sd, mask=seen)
+    restored = restore(picture, read_psf(psf), method=method, noise_sd=noise_sd, mask=seen)
     made = restored.image if picture is whole else np.dstack([restored.image, whole[..., 3]])
     write_picture(out, made, overwrite=overwrite, sources=[image, psf])
     if as_json:
@@ -111,6 +127,6 @@ def _deblur_picture(
         print(json.dumps({"out": str(out), **told}))
     else:
         noise = "" if math.isnan(restored.noise_sd) else f", noise sd {restored.noise_sd:.3g}"
-        scanned = f", scanned {restored.direction}s" if method == "inverse" else ""
+        scanned = f", scanned {restored.direction}s" if "direction" in find_method(method).parameters else ""
         filled = f", {missing} pixels that are not numbers filled in" if missing else ""
         stdout.print(f"{out}: {method}{noise}{scanned}{filled}", markup=False)

@@ -332,7 +332,7 @@ def replay(
     scorers = {name: Scorer() for name in names}
     viewer = viewing.live_viewer(recording.rig, names, recording.true_scene) if view else nullcontext()
     with viewer as shown, StopRequest().installed() as stop:
-        total = recording.counts.get("/camera/image", 0)
+        total = recording.n_frames
         with progress_bar(stderr, total if end is None and not start else None) as tell:
             series = replay_recording(
                 recording, names, rate=rate, start_s=start, end_s=math.inf if end is None else end, stop=stop
@@ -366,6 +366,7 @@ def _replay_to_rig(
     from aolink.cli import tables
     from aolink.recording.compare import compare
     from aolink.recording.reader import Recording
+    from aolink.recording.topics import TOPICS
     from aolink.session.replay import RecordedCommands
 
     commands = RecordedCommands(recording)
@@ -377,7 +378,7 @@ def _replay_to_rig(
         )  # fmt: skip
     for warning in report.warnings:
         stderr.print(f"aolink: warning: {escape(warning)}")
-    only = ("/mirror/", "/camera/", "/estimate/", "/truth")
+    only = [row.name for row in TOPICS if row.repeatable]
     found = compare(recording, Recording(output), only=only, relative_to_start=True)
     if as_json:
         print(json.dumps(tables.comparison_as_json(found, same_rig=True), allow_nan=False))

@@ -18,17 +18,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import tomlkit
-from tomlkit.exceptions import TOMLKitError
-
 from aolink.errors import AolinkError, RecordingError, RigError
 from aolink.estimation import Engine, Scorer
 from aolink.files import remove_unfinished, writing
 from aolink.numerics.workers import processes
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import check_has_exposures, fill_reestimated, recorded_estimates
+from aolink.recording.reestimate import check_has_exposures, fill_reestimated
 from aolink.rig import parse_rig
-from aolink.rig.toml_table import did_you_mean
+from aolink.rig.edit import with_value
 
 COLUMNS = (
     "recording", "model", "estimator", "exposures", "path_rmse", "start_rmse", "end_rmse",
@@ -54,7 +51,10 @@ class Model:
         """The rig file to use for a recording that was made with ``recorded``. Raises RigError for a key it lacks."""
         text = recorded if self.rig_text is None else self.rig_text
         for key, value in self.changes:
-            text = _with_value(text, key, value)
+            try:
+                text = with_value(text, key, value)
+            except RigError as error:
+                raise RigError(f"--set {error}") from None
         return text
 
     def applied_to(self, recording: Recording) -> Recording:
@@ -335,7 +335,7 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     seconds = time.perf_counter() - begin
     written = Recording(target)
     scorers, not_ok = {name: Scorer() for name in names}, dict.fromkeys(names, 0)
-    each = zip(*(recorded_estimates(written, name) for name in names), strict=True)
+    each = zip(*(written.iter_estimates(name) for name in names), strict=True)
     count = 0
     for exposure, estimates in zip(written.exposures(), each, strict=True):
         count += 1
@@ -384,20 +384,3 @@ def _values(text: str, setting: str) -> list[Any]:
 
 def _short(value: Any) -> str:
     return str(value).replace(" ", "")
-
-
-def _with_value(text: str, key: str, value: Any) -> str:
-    try:
-        document = tomlkit.parse(text)
-    except TOMLKitError as error:
-        raise RigError(f"not valid TOML: {error}") from None
-    table: Any = document
-    *path, name = key.split(".")
-    for part in [*path, name]:
-        if not hasattr(table, "get") or part not in table:
-            known = list(table) if hasattr(table, "get") else []
-            why = did_you_mean([part], known) or f"known there: {', '.join(known) or 'none'}"
-            raise RigError(f"--set {key}: the rig file has no such key: {why}")
-        parent, table = table, table[part]
-    parent[name] = value
-    return tomlkit.dumps(document)

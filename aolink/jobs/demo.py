@@ -20,7 +20,7 @@ from aolink.files import writing
 from aolink.optics.sensor import Sensor
 from aolink.recording.deblur import Summary, write_deblurred
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import first_difference, recorded_estimates, reestimate
+from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import Rig
 from aolink.session import Report, record
 
@@ -161,7 +161,7 @@ def run_demo(
         differences = {
             name: difference
             for name, again in offline.items()
-            if (difference := first_difference(list(recorded_estimates(recording, name)), again))
+            if (difference := first_difference(list(recording.iter_estimates(name)), again))
         }
     deblurred, deblurred_recording = None, None
     if rig.scene is not None:

@@ -280,15 +280,15 @@ def _from_start(messages: Iterator[tuple[str, Message]], recording: Recording) -
 def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[_Key, Message, int | None]]:
     """Each message with a name that its counterpart has too, and the exposure that it belongs to."""
     places: dict[str, int] = {}
-    exposures: dict[str, int] = {}
+    exposures: dict[str, int | None] = {}
     for topic, message in messages:
         frame_id = None
-        if isinstance(message, schemas_pb2.ExposureInfo | schemas_pb2.Restoration):
-            exposures |= dict.fromkeys(topics.PICTURES.get(topic, ()), message.frame_id)
-        if topic in exposures:
-            frame_id = exposures[topic]
-        elif isinstance(value := getattr(message, "frame_id", None), int):
-            frame_id = value
+        row = topics.find(topic, message)
+        if row.after:
+            frame_id = exposures.get(topic)
+        elif row.belongs_to == "exposure":
+            frame_id = message.frame_id  # type: ignore[attr-defined] # as the table says
+            exposures |= dict.fromkeys(topics.PICTURES.get(topic, ()), frame_id)
         if frame_id is not None:
             name = str(frame_id)
         elif isinstance(message, wire.Applied) and message.source == wire.Applied.AWAITED:

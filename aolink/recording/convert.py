@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -16,6 +17,9 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure, Truth
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
+
+if TYPE_CHECKING:
+    from aolink.restoration import RestoredPictures
 
 _COUNTS = np.dtype("<u2")
 _MOST_STEPS = 1_000_000
@@ -47,6 +51,27 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
     image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
     image.data = frame.pixels.astype("<u2").tobytes()
     return info, image
+
+
+def restoration_message(done: RestoredPictures) -> pb.Restoration:
+    """What is known about an exposure's restored pictures, as it is recorded."""
+    return pb.Restoration(
+        frame_id=done.frame_id, estimator=done.estimator, method=done.method, scene_noise_sd=done.scene_noise_sd,
+        path_noise_sd=done.path_noise_sd, reason=done.reason,
+    )  # fmt: skip
+
+
+def restored_from_messages(
+    info: pb.Restoration, scene: RawImage | None, spots: RawImage | None
+) -> RestoredPictures:  # fmt: skip
+    """Inverse of `restoration_message` and `float_image`."""
+    from aolink.restoration import RestoredPictures  # it takes a second that few who read a recording need to spend
+
+    return RestoredPictures(
+        frame_id=info.frame_id, estimator=info.estimator, method=info.method, scene_noise_sd=info.scene_noise_sd,
+        path_noise_sd=info.path_noise_sd, reason=info.reason, scene=scene and picture_from_float_image(scene),
+        spots=spots and picture_from_float_image(spots),
+    )  # fmt: skip
 
 
 def float_image(picture: NDArray[np.float32], time_ns: int) -> RawImage:

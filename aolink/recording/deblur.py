@@ -1,13 +1,9 @@
-"""The pictures of a recording without their blur: each restored with the path that its exposure's estimate gives.
-
-Neither the truth nor the true scene is read for it; the latter tells afterwards how good it is.
-"""
+"""A recording with its pictures restored: each with the path that its exposure's estimate gives."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -17,23 +13,19 @@ import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from aolink.errors import RecordingError, RestorationError
+from aolink.errors import RecordingError
 from aolink.estimation import Estimate, Scorer
-from aolink.estimation.motion import coefficient_roots, motion
-from aolink.exposure import Exposure, step_shares
+from aolink.exposure import Exposure
 from aolink.files import writing
 from aolink.numerics.workers import processes
-from aolink.optics.camera import is_saturated, to_density
-from aolink.optics.scene import SceneSensor, scene_motion
-from aolink.optics.sensor import Kernel, SpotSensor
+from aolink.optics.scene import scene_motion
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
-from aolink.recording.reader import RawMessage, Recording, RestoredPictures
-from aolink.recording.reestimate import check_has_exposures, recorded_estimates, reestimated
-from aolink.restoration import Method, Psf, Restored, motion_psf_by_root, restore
+from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.reestimate import check_has_exposures, reestimated
+from aolink.restoration import RestoredPictures, deblur, find_method
+from aolink.restoration.deblur import blurred_psnr, psnr
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 _AHEAD = 4
 """Exposures for each worker that are handed out before the first of them is written."""
@@ -55,99 +47,8 @@ class Summary:
     """Of the estimates whose paths the pictures were restored with."""
 
 
-def estimated_psfs(
-    exposure: Exposure, estimate: Estimate, mixes: Iterable[FloatArray], kernel: Kernel, pixel_scale: float
-) -> Iterator[Psf]:
-    """The PSF, with its uncertainty, of each of some sums of outputs: see `motion`."""
-    roots, offset = coefficient_roots(estimate), exposure.start_offset
-    shares = step_shares(exposure.n_steps, offset)
-    for mix in mixes:
-        path, root = motion(estimate, mix, roots, after=offset > 0)
-        yield motion_psf_by_root(path, root, kernel, pixel_scale, shares)
-
-
-def scene_psf(rig: Rig, exposure: Exposure, estimate: Estimate) -> Psf:
-    """The PSF of a rig's picture sensor by an estimate, with its uncertainty."""
-    assert rig.scene is not None
-    mix = scene_motion(rig.n_outputs)
-    return next(estimated_psfs(exposure, estimate, [mix], rig.scene.kernel, rig.scene.pixel_scale))
-
-
-def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method = "tv") -> RestoredPictures:
-    """Restore what an exposure's sensors saw, with the path of its estimate; intensities are cut at 0 and 1."""
-    scene = spots = None
-    noise, added, reasons = math.nan, math.nan, list[str]()
-    if rig.scene is not None:
-        try:
-            done = _restored_scene(rig, exposure, estimate, method)
-            scene, noise, added = _unit(done.image), done.noise_sd, done.psf_noise_sd
-        except RestorationError as error:
-            reasons.append(f"scene: {error}")
-    try:
-        spots = _unit(_restored_spots(rig, exposure, estimate, method))
-    except RestorationError as error:
-        reasons.append(f"spot: {error}")
-    info = schemas_pb2.Restoration(
-        frame_id=exposure.frame_id, estimator=estimate.estimator, method=method, scene_noise_sd=noise,
-        path_noise_sd=added, reason="; ".join(reasons),
-    )  # fmt: skip
-    return RestoredPictures(info, scene, spots)
-
-
-def _restored_scene(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method) -> Restored:
-    assert rig.scene is not None
-    if exposure.scene is None:
-        raise RestorationError("the picture never came")
-    counts = exposure.scene.pixels
-    good = exposure.scene.mask & ~rig.scene.is_saturated(counts)
-    return restore(rig.scene.to_intensity(counts), scene_psf(rig, exposure, estimate), method=method, mask=good)
-
-
-def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: Method) -> FloatArray:
-    sensor = rig.sensor
-    share = to_density(sensor, exposure.pixels) * sensor.pixel_size
-    good = exposure.mask & ~is_saturated(sensor, exposure.pixels)
-    mixes = np.eye(rig.n_outputs).reshape(-1, 2 if isinstance(sensor, SpotSensor) else 1, rig.n_outputs)
-    psfs = estimated_psfs(exposure, estimate, mixes, sensor.kernel, sensor.pixel_width)
-    if not isinstance(sensor, SpotSensor):
-        return np.asarray(restore(share, next(psfs), method=method, mask=good).image)
-    out, (height, width) = np.zeros_like(share), sensor.window
-    for psf, place in zip(psfs, sensor.lit, strict=False):
-        row, column = divmod(int(place), sensor.grid[1])
-        window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
-        out[window] = restore(share[window], psf, method=method, mask=good[window]).image
-    return out
-
-
-def _unit(image: FloatArray) -> NDArray[np.float32]:
-    return np.clip(image, 0.0, 1.0).astype(np.float32)
-
-
-def psnr(picture: FloatArray, scene: FloatArray, mask: NDArray[np.bool_] | None = None) -> float:
-    """Peak signal-to-noise ratio, dB, for a peak of one."""
-    error = (picture - scene)[... if mask is None else mask]
-    return float(-10 * np.log10(np.mean(error**2))) if error.size else math.nan
-
-
-def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: NDArray[np.intp], scene: FloatArray) -> float:
-    """`psnr` of a scene as it came, against the true one moved as it is in the mean: no blur is mistaken for a shift.
-
-    Parameters
-    ----------
-    shift_px:
-        Mean displacement along x, or x and y, whole pixels.
-    """
-    assert exposure.scene is not None
-    x, y = int(shift_px[0]), int(shift_px[1]) if len(shift_px) > 1 else 0
-    rows, columns = sensor.shape
-    kept = np.zeros(sensor.shape, dtype=bool)
-    kept[max(y, 0) : rows + min(y, 0), max(x, 0) : columns + min(x, 0)] = True
-    moved = np.roll(scene, (y, x), axis=(0, 1))
-    return psnr(sensor.to_intensity(exposure.scene.pixels), moved, kept & exposure.scene.mask)
-
-
 def write_deblurred(
-    recording: Recording, path: Path, *, estimator: str, method: Method = "tv", overwrite: bool = False,
+    recording: Recording, path: Path, *, estimator: str, method: str = "tv", overwrite: bool = False,
     workers: int = 0, progress: Callable[[int], None] = lambda exposures: None,
 ) -> Summary:  # fmt: skip
     """Copy a recording with its pictures restored.
@@ -161,8 +62,11 @@ def write_deblurred(
         There is no exposure; ``path`` exists and not ``overwrite``, or cannot be written.
     EstimatorError
         There is no such estimator, or it cannot work on this rig.
+    RestorationError
+        There is no such method.
     """
     check_has_exposures(recording)
+    find_method(method)
     made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
     held = next(made, None)  # whether the estimator can work shows before the file is made
     notes = {
@@ -233,7 +137,7 @@ def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Esti
         for exposure, (estimate,) in reestimated(recording, [name]):
             yield replace(exposure, truth=None), estimate
         return
-    recorded = recorded_estimates(recording, name)
+    recorded = recording.iter_estimates(name)
     ahead = next(recorded, None)
     for exposure in recording.exposures():
         while ahead is not None and ahead.frame_id < exposure.frame_id:
@@ -243,7 +147,7 @@ def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Esti
 
 
 def _deblurred(
-    rig: Rig, series: Iterator[tuple[Exposure, Estimate]], method: Method, workers: int
+    rig: Rig, series: Iterator[tuple[Exposure, Estimate]], method: str, workers: int
 ) -> Iterator[tuple[Exposure, Estimate, RestoredPictures]]:
     if not workers:
         for exposure, estimate in series:
@@ -261,7 +165,7 @@ def _deblurred(
 
 
 def _messages(done: RestoredPictures, time_ns: int) -> Iterator[tuple[str, Message]]:
-    yield topics.RESTORATION, done.info
+    yield topics.RESTORATION, convert.restoration_message(done)
     for topic, picture in ((topics.RESTORED_SCENE, done.scene), (topics.RESTORED_SPOTS, done.spots)):
         if picture is not None:
             yield topic, convert.float_image(picture, time_ns)
@@ -274,8 +178,8 @@ def _score(
     summary.exposures += 1
     summary.motion.add(exposure, estimate)
     summary.scenes += done.scene is not None
-    if done.info.reason:
-        summary.reasons[done.info.reason] += 1
+    if done.reason:
+        summary.reasons[done.reason] += 1
     if true_scene is None or rig.scene is None or exposure.scene is None or done.scene is None:
         return
     scene = rig.scene.to_intensity(true_scene)

@@ -22,7 +22,6 @@ from aolink.recording.scan import Loss
 from aolink.recording.writer import begin_recording
 from aolink.wire import messages_pb2 as wire
 
-_ALL_PICTURES = frozenset(picture for pictures in topics.PICTURES.values() for picture in pictures)
 _ALIKE_NS = 2_000_000_000
 """Log times between which the same message in two files is one."""
 
@@ -216,6 +215,7 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
     last_step = -1
     for raw in recording.raw_messages():
         message = _decoded(raw)
+        row = topics.find(raw.topic, message)
         inside = low <= raw.log_time_ns < high
         if raw.topic in topics.PICTURES:
             among = inside if raw.topic == topics.EXPOSURE else getattr(message, "frame_id", None) in frames
@@ -227,16 +227,15 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
                 frames.add(message.frame_id)  # type: ignore[attr-defined]
                 last_step = message.last_step  # type: ignore[attr-defined]
                 yield raw
-        elif raw.topic in _ALL_PICTURES:
+        elif row.after:
             if raw.topic in wanted:
                 yield raw
-        elif raw.topic in (topics.COMMAND, topics.APPLIED):
+        elif isinstance(message, wire.CommandBlock | wire.Applied):
             # Also after the end, until all is known of the last exposure.
-            needed = isinstance(message, wire.CommandBlock | wire.Applied) and message.first_step <= last_step
-            if frames and (inside or needed):
+            if frames and (inside or message.first_step <= last_step):
                 yield raw
-        elif isinstance(frame_id := getattr(message, "frame_id", None), int):
-            if frame_id in frames:
+        elif row.belongs_to == "exposure":
+            if message.frame_id in frames:  # type: ignore[union-attr] # as the table says
                 yield raw
         elif inside and frames:
             yield raw

@@ -19,7 +19,7 @@ class Lead:
 
     def add(self, topic: str, message: Message, log_time_ns: int, sequence: int) -> None:
         """Take the next message."""
-        if topic in (topics.COMMAND, topics.APPLIED):
+        if topics.named(topic).belongs_to == "steps":
             self._kept.append((topic, message, log_time_ns, sequence))
         elif topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
             # Exposures still to come begin after the last step of this one.

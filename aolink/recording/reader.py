@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -23,8 +24,11 @@ from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
-from aolink.wire.messages_pb2 import Applied, CommandBlock
+from aolink.wire.messages_pb2 import Applied
 from aolink.wire.runs_pb2 import Run
+
+if TYPE_CHECKING:
+    from aolink.restoration import RestoredPictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +52,6 @@ class RawMessage(NamedTuple):
     log_time_ns: int
     sequence: int
     data: bytes
-
-
-class RestoredPictures(NamedTuple):
-    """An exposure's pictures without their blur, as they are recorded."""
-
-    info: schemas_pb2.Restoration
-    scene: NDArray[np.float32] | None
-    """Intensity, (rows, columns)."""
-    spots: NDArray[np.float32] | None
-    """Share of a spot's light, (rows, columns) of the camera's frame."""
 
 
 class Recording:
@@ -145,6 +139,11 @@ class Recording:
     def estimators(self) -> list[str]:
         """Names of the estimators whose results are in the file."""
         return [name.removeprefix(topics.ESTIMATE) for name in self.counts if name.startswith(topics.ESTIMATE)]
+
+    @property
+    def n_frames(self) -> int:
+        """How many of the camera's frames are in the file."""
+        return self.counts.get(topics.IMAGE, 0)
 
     def skipped(self, estimator: str) -> frozenset[int]:
         """Frame ids of the exposures that an estimator had no time for in the session."""
@@ -256,14 +255,14 @@ class Recording:
     def restored(self) -> Iterator[RestoredPictures]:
         """What `aolink deblur` wrote, exposure by exposure."""
         info: schemas_pb2.Restoration | None = None
-        pictures: dict[str, NDArray[np.float32]] = {}
+        pictures: dict[str, RawImage] = {}
         for recorded in self.messages(topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS):
             if isinstance(recorded.message, schemas_pb2.Restoration):
                 if info is not None:
                     yield _restored(info, pictures)
                 info, pictures = recorded.message, {}
             elif isinstance(recorded.message, RawImage):
-                pictures[recorded.topic] = convert.picture_from_float_image(recorded.message)
+                pictures[recorded.topic] = recorded.message
         if info is not None:
             yield _restored(info, pictures)
 
@@ -275,17 +274,29 @@ class Recording:
             raise RecordingError(
                 f"{self.path} holds no estimates of {name} (it has: {known}): `aolink estimate` makes them"
             )
-        latest: dict[int, Exposure] = {}
-        messages: list[schemas_pb2.Estimate] = []
-        for recorded, exposures in self.assembled(topic):
-            if recorded is not None and isinstance(recorded.message, schemas_pb2.Estimate):
-                messages.append(recorded.message)
-            latest.update((exposure.frame_id, exposure) for exposure in exposures)
-        return [
-            convert.estimate_from_message(message, self.model, latest[message.frame_id])
-            for message in messages
-            if message.frame_id in latest
-        ]
+        return list(self.iter_estimates(name))
+
+    def iter_estimates(self, name: str) -> Iterator[Estimate]:
+        """As `estimates`, one by one: the file is read only as far as they are asked for. None is no error here."""
+        exposures: dict[int, Exposure] = {}
+        waiting: deque[schemas_pb2.Estimate] = deque()
+        for recorded, completed in self.assembled(topics.estimate_topic(name), topics.estimation_topic(name)):
+            received = None if recorded is None else recorded.message
+            if isinstance(received, schemas_pb2.Estimate):
+                waiting.append(received)
+            elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
+                exposures.pop(received.frame_id, None)
+            exposures.update((exposure.frame_id, exposure) for exposure in completed)
+            # At the end of the recording, an exposure that has not come will not; nor will one of the part before this.
+            first = next(iter(exposures), 0)
+            while waiting and (recorded is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
+                message = waiting.popleft()
+                if message.frame_id not in exposures:
+                    continue
+                yield convert.estimate_from_message(message, self.model, exposures[message.frame_id])
+                # Estimates come in the order of their exposures: what is before this one has had its own.
+                for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
+                    del exposures[frame_id]
 
     def _survey(self, *, check: bool) -> str | None:
         """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
@@ -374,8 +385,10 @@ class Recording:
         self._losses.setdefault(loss.offset, loss)
 
 
-def _restored(info: schemas_pb2.Restoration, pictures: dict[str, NDArray[np.float32]]) -> RestoredPictures:
-    return RestoredPictures(info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS))
+def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:
+    return convert.restored_from_messages(
+        info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
+    )
 
 
 def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:
@@ -397,10 +410,7 @@ def _scene_shape(rig: Rig) -> tuple[int, int]:
     return rig.scene.shape if rig.scene else (0, 0)
 
 
-_RUNS = {
-    topics.COMMAND: CommandBlock.DESCRIPTOR.full_name,
-    topics.APPLIED: Applied.DESCRIPTOR.full_name,
-}
+_RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in topics.TOPICS if row.belongs_to == "steps"}
 """Where runs of steps are, and the schema that they have there."""
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
 _BESIDE = frozenset({topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -63,29 +62,6 @@ def skipped_by(recording: Recording, names: Sequence[str]) -> dict[str, frozense
     return {name: skipped for name in names if (skipped := recording.skipped(name))}
 
 
-def recorded_estimates(recording: Recording, name: str) -> Iterator[Estimate]:
-    """What `Recording.estimates` gives, one by one."""
-    exposures: dict[int, Exposure] = {}
-    waiting: deque[schemas_pb2.Estimate] = deque()
-    for recorded, completed in recording.assembled(topics.estimate_topic(name), topics.estimation_topic(name)):
-        received = None if recorded is None else recorded.message
-        if isinstance(received, schemas_pb2.Estimate):
-            waiting.append(received)
-        elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
-            exposures.pop(received.frame_id, None)
-        exposures.update((exposure.frame_id, exposure) for exposure in completed)
-        # At the end of the recording, an exposure that has not come will not; nor will one of the part before this one.
-        first = next(iter(exposures), 0)
-        while waiting and (recorded is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
-            message = waiting.popleft()
-            if message.frame_id not in exposures:
-                continue
-            yield convert.estimate_from_message(message, recording.model, exposures[message.frame_id])
-            # Estimates come in the order of their exposures: what is before this one has had its own.
-            for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
-                del exposures[frame_id]
-
-
 def scored_and_compared(
     recording: Recording, series: Iterable[tuple[Exposure, Sequence[Estimate]]], names: Sequence[str]
 ) -> tuple[dict[str, Score], dict[str, str | None]]:
@@ -96,9 +72,7 @@ def scored_and_compared(
     scorers = {name: Scorer() for name in names}
     skipped = skipped_by(recording, names)
     made_before = recording.estimators if recording.rig_is_recorded else []
-    recorded = {
-        name: recorded_estimates(recording, name) for name in names if name in made_before and name not in skipped
-    }
+    recorded = {name: recording.iter_estimates(name) for name in names if name in made_before and name not in skipped}
     differences: dict[str, str | None] = dict.fromkeys(recorded)
     for name, frames in skipped.items():
         differences[name] = (

@@ -1,6 +1,10 @@
-"""The topics of a recording, and the schema of each."""
+"""The topics of a recording: one table of what each holds, and the names of what a recording has besides."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
 
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -9,48 +13,94 @@ from google.protobuf.message import Message
 from aolink.recording import schemas_pb2
 from aolink.wire import messages_pb2
 
-IMAGE = "/camera/image"
 EXPOSURE = "/camera/exposure"
-SCENE = "/scene/image"
-"""A second, picture sensor that shares the exposure."""
-SCENE_EXPOSURE = "/scene/exposure"
-RESTORED = "/restored/"
-"""Prefix."""
-RESTORED_SCENE = "/restored/image"
-RESTORED_SPOTS = "/restored/spot"
-RESTORATION = "/restored/exposure"
-PICTURES = {EXPOSURE: (IMAGE,), SCENE_EXPOSURE: (SCENE,), RESTORATION: (RESTORED_SCENE, RESTORED_SPOTS)}
-"""What is known about the pictures of an exposure, and which pictures follow it."""
+IMAGE = "/camera/image"
 COMMAND = "/mirror/command"
 APPLIED = "/mirror/applied"
-CLOCK = "/clock"
-LINK = "/link"
+SCENE_EXPOSURE = "/scene/exposure"
+SCENE = "/scene/image"
 TRUTH = "/truth"
-LATENCY = "/latency"
-LOG = "/log"
 ESTIMATE = "/estimate/"
-"""Prefix; the estimator's name follows."""
 ESTIMATION = "/estimation/"
-"""Prefix as well: what the estimator had time for."""
+RESTORED = "/restored/"
+"""What the topics of restored pictures begin with."""
+RESTORATION = RESTORED + "exposure"
+RESTORED_SCENE = RESTORED + "image"
+RESTORED_SPOTS = RESTORED + "spot"
+LATENCY = "/latency"
+LINK = "/link"
+CLOCK = "/clock"
+LOG = "/log"
 
-SCHEMAS: dict[str, type[Message]] = {
-    message.DESCRIPTOR.full_name: message
-    for message in (
-        RawImage,
-        Log,
-        schemas_pb2.ExposureInfo,
-        schemas_pb2.ClockSample,
-        schemas_pb2.LinkStatistics,
-        schemas_pb2.Latency,
-        schemas_pb2.Estimate,
-        schemas_pb2.Estimation,
-        schemas_pb2.Restoration,
-        messages_pb2.CommandBlock,
-        messages_pb2.Applied,
-        messages_pb2.Truth,
-    )
-}
+
+@dataclass(frozen=True, kw_only=True)
+class Topic:
+    """One row of the table."""
+
+    name: str
+    """One that ends with "/" is a prefix: an estimator's name follows."""
+    message: type[Message]
+    belongs_to: Literal["exposure", "steps", "time"] = "time"
+    """What a message is of: an exposure (by its ``frame_id``), fast steps (from its ``first_step`` on), or nothing but
+    its time. `cut` copies it with that, and `compare` finds its counterpart by it."""
+    after: str = ""
+    """Topic of the message that comes before a picture and says which exposure it is of: a picture does not say it."""
+    repeatable: bool = False
+    """Whether a rig that is given the same commands again gives the same: `aolink replay` to a rig compares these."""
+    shown_by: Literal["", "camera", "devices", "motion", "scene"] = ""
+    """The module of `aolink.viewing` that shows it; '' for none, or as what it belongs to."""
+
+
+TOPICS = (
+    Topic(name=EXPOSURE, message=schemas_pb2.ExposureInfo, belongs_to="exposure", repeatable=True, shown_by="devices"),
+    Topic(name=IMAGE, message=RawImage, belongs_to="exposure", after=EXPOSURE, repeatable=True, shown_by="camera"),
+    Topic(name=COMMAND, message=messages_pb2.CommandBlock, belongs_to="steps", repeatable=True, shown_by="devices"),
+    Topic(name=APPLIED, message=messages_pb2.Applied, belongs_to="steps", repeatable=True, shown_by="devices"),
+    Topic(name=SCENE_EXPOSURE, message=schemas_pb2.ExposureInfo, belongs_to="exposure"),
+    Topic(name=SCENE, message=RawImage, belongs_to="exposure", after=SCENE_EXPOSURE, shown_by="scene"),
+    Topic(name=TRUTH, message=messages_pb2.Truth, belongs_to="exposure", repeatable=True, shown_by="motion"),
+    Topic(name=ESTIMATE, message=schemas_pb2.Estimate, belongs_to="exposure", repeatable=True, shown_by="motion"),
+    Topic(name=ESTIMATION, message=schemas_pb2.Estimation, belongs_to="exposure", shown_by="devices"),
+    Topic(name=RESTORATION, message=schemas_pb2.Restoration, belongs_to="exposure"),
+    Topic(name=RESTORED_SCENE, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene"),
+    Topic(name=RESTORED_SPOTS, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene"),
+    Topic(name=LATENCY, message=schemas_pb2.Latency, belongs_to="exposure", shown_by="devices"),
+    Topic(name=LINK, message=schemas_pb2.LinkStatistics, shown_by="devices"),
+    Topic(name=CLOCK, message=schemas_pb2.ClockSample, shown_by="devices"),
+    Topic(name=LOG, message=Log, shown_by="devices"),
+)
+
+SCHEMAS = {row.message.DESCRIPTOR.full_name: row.message for row in TOPICS}
 """Message class by the full name of its schema."""
+PICTURES = {row.after: tuple(each.name for each in TOPICS if each.after == row.after) for row in TOPICS if row.after}
+"""What is known about the pictures of an exposure, and which pictures follow it."""
+_UNKNOWN = Topic(name="", message=Message)
+
+
+def find(name: str, message: Message | None) -> Topic:
+    """The row of a message; where the topic does not hold such messages, one that belongs to nothing but its time."""
+    row = named(name)
+    return row if isinstance(message, row.message) else _UNKNOWN
+
+
+@lru_cache(maxsize=256)
+def named(name: str) -> Topic:
+    """The row of a topic; one without a name for a topic that aolink does not know."""
+    for row in TOPICS:
+        if name == row.name or (row.name.endswith("/") and name.startswith(row.name)):
+            return row
+    return _UNKNOWN
+
+
+def estimate_topic(estimator: str) -> str:
+    """Topic of an estimator's estimates."""
+    return ESTIMATE + estimator
+
+
+def estimation_topic(estimator: str) -> str:
+    """Topic of what an estimator had time for."""
+    return ESTIMATION + estimator
+
 
 RIG_ATTACHMENT = "rig.toml"
 BASIS_ATTACHMENT = "exposure_basis.npy"
@@ -69,13 +119,3 @@ CALIBRATION = "calibration"
 """Key in the metadata of a session that recorded frames for a calibration: what they show."""
 END_METADATA = "aolink/end"
 """Written at the end: how the session ended, and its counts."""
-
-
-def estimate_topic(name: str) -> str:
-    """Topic of an estimator."""
-    return ESTIMATE + name
-
-
-def estimation_topic(name: str) -> str:
-    """Topic of what an estimator had time for."""
-    return ESTIMATION + name

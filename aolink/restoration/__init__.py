@@ -1,18 +1,37 @@
 """Restoration: from the estimated path to a picture without its blur. Pure: no time, no files, no ports."""
 
+from typing import TYPE_CHECKING, Any
+
+from aolink.restoration.deblur import RestoredPictures, deblur
 from aolink.restoration.inverse import largest_zero, stable_direction
+from aolink.restoration.method import Blurred, Method, Restored
 from aolink.restoration.plug_and_play import non_local_means
 from aolink.restoration.psf import Psf, motion_psf, motion_psf_by_root
-from aolink.restoration.restore import METHODS, Method, Restored, checked_method, restore
+from aolink.restoration.registry import find_method, method_names
+from aolink.restoration.restore import restore
 from aolink.restoration.scanner import Scanner, first_order, from_correlation, measured_correlation
+
+if TYPE_CHECKING:
+    METHODS: tuple[str, ...]
+else:  # the type checker would believe in any name
+
+    def __getattr__(name: str) -> Any:
+        """METHODS, the names: whoever does not ask for them does not wait for a search through the packages."""
+        if name == "METHODS":
+            return method_names()
+        raise AttributeError(f"module 'aolink.restoration' has no attribute {name!r}")
+
 
 __all__ = [
     "METHODS",
+    "Blurred",
     "Method",
     "Psf",
     "Restored",
+    "RestoredPictures",
     "Scanner",
-    "checked_method",
+    "deblur",
+    "find_method",
     "first_order",
     "from_correlation",
     "largest_zero",

@@ -2,70 +2,130 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.errors import RestorationError
+from aolink.restoration import spectrum
 from aolink.restoration.banded import smooth_lines
 from aolink.restoration.inverse import Direction, check_direction, invert_lines, stable_direction
 from aolink.restoration.kalman import LineModel, kalman, line_model, scene_from_states, smooth
-from aolink.restoration.psf import Psf
-from aolink.restoration.scanner import Scanner
+from aolink.restoration.method import Blurred, Restored
+from aolink.restoration.psf import STRAIGHT_PX
+from aolink.restoration.rotation import to_lines
+from aolink.restoration.scanner import Scanner, first_order
+from aolink.restoration.uncertainty import line_variance
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-LINE_METHODS = ("inverse", "predictor", "filter", "lag", "smoother")
 # States of all lines kept at once, numbers.
 _MOST_KEPT = 20_000_000
+_Boundary = float | ArrayLike | None
+
+
+def inverse(
+    picture: Blurred, *, boundary: _Boundary = None, scanner: Scanner | None = None, direction: Direction | None = None
+) -> Restored:
+    """The scene that gives exactly this picture; no noise is thought of, and no scanner used."""
+    values, origin = _without_delay(picture.psf.values, picture.psf.origin[0])
+    way = _checked_direction(direction) or stable_direction(values)
+    check_direction(values, way)
+    lines = _Lines.of(picture, values, origin, boundary, way)
+    columns = lines.rows.shape[1]
+    out = invert_lines(lines.rows, lines.values, lines.known)
+    # What the PSF never brings into the frame is as the last pixel that it does.
+    place = np.arange(columns) + lines.values.shape[-1] - 1 - lines.origin
+    scene = lines.picture(out[:, np.clip(place, 0, out.shape[1] - 1)], picture.planes.shape)
+    return Restored(image=scene, scanner=scanner, direction=way)
+
+
+def why_not_inverse(picture: Blurred) -> str | None:
+    if not picture.psf.on_line:
+        return "the exact inverse needs a motion along the picture's rows or columns: use smoother"
+    if picture.seen is not None:
+        return "the exact inverse cannot do without a pixel: use the method smoother for masked ones"
+    return None
+
+
+def kalman_estimate(
+    picture: Blurred, which: str, *,
+    boundary: _Boundary = None, scanner: Scanner | None = None, direction: Direction | None = None,
+) -> Restored:  # fmt: skip
+    """The Kalman filter's estimate ``which`` of each line: predictor, filter, lag or smoother."""
+    way = _checked_direction(direction) or "forward"
+    back = None
+    if not picture.psf.on_line:
+        planes, seen, back = to_lines(picture.planes, picture.seen, picture.line.angle_rad)
+        picture = replace(picture, planes=planes, psf=picture.line.psf, seen=seen)
+    psf, noise = picture.psf, picture.noise_variance
+    if scanner is None:
+        found = spectrum.correlation_and_variance(spectrum.line_spectrum(picture.whole, psf.mean), noise)
+        scanner = first_order(*found)
+    unexplained = line_variance(psf.modes, scanner)
+    lines = _Lines.of(picture, psf.values, psf.origin[0], boundary, way)
+    scene = lines.picture(_estimated(lines, which, scanner, noise + unexplained), picture.planes.shape)
+    return Restored(
+        image=scene if back is None else back(scene), noise_sd=math.sqrt(noise), psf_noise_sd=math.sqrt(unexplained),
+        scanner=scanner, direction=way,
+    )  # fmt: skip
+
+
+def why_not_lines(picture: Blurred) -> str | None:
+    if picture.psf.on_line or picture.line.deviation_px <= STRAIGHT_PX:
+        return None
+    return (
+        f"the motion is not along a straight line: its light strays from one by {picture.line.deviation_px:.2g} pixels"
+        f" rms, and a method on lines bears {STRAIGHT_PX:g}; use gauss_markov, tv or pnp"
+    )
+
+
+def _checked_direction(direction: Direction | None) -> Direction | None:
+    if direction not in (None, *get_args(Direction)):
+        raise RestorationError(f"direction is {direction!r}, expected one of {', '.join(get_args(Direction))}")
+    return direction
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class LineRequest:
-    """How lines are to be restored; the fields are `restore`'s arguments."""
+class _Lines:
+    """All rows of a picture, in the direction in which they are scanned."""
 
-    method: str
-    psf: Psf
-    noise_variance: float
-    scanner: Scanner | None
-    boundary: float | ArrayLike | None
-    direction: Direction | None
+    rows: FloatArray
+    """(lines, columns)"""
+    values: FloatArray
+    origin: int
     seen: BoolArray | None
+    """(lines, columns)"""
+    known: FloatArray | None
+    """Pixels before each line, (lines or 1, taps - 1)."""
+    direction: Direction
 
+    @classmethod
+    def of(
+        cls, picture: Blurred, values: FloatArray, origin: int, boundary: _Boundary, direction: Direction
+    ) -> _Lines:  # fmt: skip
+        """The rows of a picture with the taps that blurred it."""
+        batch, height, columns = picture.planes.shape
+        known = _known(boundary, height, values.shape[-1] - 1)
+        rows = picture.planes.reshape(batch * height, columns)
+        seen = None if picture.seen is None else np.tile(picture.seen, (batch, 1))
+        if known is not None and len(known) > 1:
+            known = np.tile(known, (batch, 1))
+        if direction == "backward":
+            values = values[::-1, ::-1] if picture.psf.varies else values[::-1]
+            origin = values.shape[-1] - 1 - origin
+            rows = rows[:, ::-1]
+            seen = None if seen is None else seen[:, ::-1]
+            known = None if known is None else known[:, ::-1]
+        return cls(rows=rows, values=values, origin=origin, seen=seen, known=known, direction=direction)
 
-def restore_lines(planes: FloatArray, request: LineRequest) -> tuple[FloatArray, Direction]:
-    """Restore pictures (batch, rows, columns) row by row; the direction in which the rows were scanned."""
-    values, (origin,) = request.psf.values, request.psf.origin
-    batch, rows, columns = planes.shape
-    if request.method == "inverse":
-        values, origin = _without_delay(values, origin)
-        direction = request.direction or stable_direction(values)
-        check_direction(values, direction)
-    else:
-        direction = request.direction or "forward"
-    known = _known(request.boundary, rows, values.shape[-1] - 1)
-    lines = planes.reshape(batch * rows, columns)
-    seen = None if request.seen is None else np.tile(request.seen, (batch, 1))
-    if known is not None and len(known) > 1:
-        known = np.tile(known, (batch, 1))
-    if direction == "backward":
-        values = values[::-1, ::-1] if request.psf.varies else values[::-1]
-        origin = values.shape[-1] - 1 - origin
-        lines = lines[:, ::-1]
-        seen = None if seen is None else seen[:, ::-1]
-        known = None if known is None else known[:, ::-1]
-    if request.method == "inverse":
-        out = invert_lines(lines, values, known)
-        # What the PSF never brings into the frame is as the last pixel that it does.
-        place = np.arange(columns) + values.shape[-1] - 1 - origin
-        out = out[:, np.clip(place, 0, out.shape[1] - 1)]
-    else:
-        out = _estimated(lines, values, origin, seen, known, request)
-    if direction == "backward":
-        out = out[:, ::-1]
-    return np.ascontiguousarray(out).reshape(planes.shape), direction
+    def picture(self, scene: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+        """Restored lines as pictures of a shape (batch, rows, columns)."""
+        return np.ascontiguousarray(scene[:, ::-1] if self.direction == "backward" else scene).reshape(shape)
 
 
 def _without_delay(values: FloatArray, origin: int) -> tuple[FloatArray, int]:
@@ -95,15 +155,11 @@ def _known(boundary: float | ArrayLike | None, rows: int, m: int) -> FloatArray 
     return given
 
 
-def _estimated(
-    lines: FloatArray, values: FloatArray, origin: int, seen: BoolArray | None, known: FloatArray | None,
-    request: LineRequest,
-) -> FloatArray:  # fmt: skip
+def _estimated(scanned: _Lines, which: str, scanner: Scanner, variance: float) -> FloatArray:
     """Filter or smooth lines whose mean is taken out first: the processing is for zero mean."""
+    lines, values, origin, seen, known = scanned.rows, scanned.values, scanned.origin, scanned.seen, scanned.known
     n_lines, columns = lines.shape
     m = values.shape[-1] - 1
-    scanner = request.scanner
-    assert scanner is not None
     light = np.broadcast_to(values.sum(axis=-1), (columns,))
     mean = lines.mean() / light.mean() if seen is None else lines[seen].mean() / light.mean()
     lines = lines - mean * light
@@ -117,8 +173,7 @@ def _estimated(
     # The first state that has seen a pixel, and the first pixel of the frame.
     first, start = (origin, 0) if known is not None else (0, -origin)
     pixels = range(start, start + columns)
-    variance = request.noise_variance
-    if request.method == "smoother" and len(scanner.gamma) == 1:
+    if which == "smoother" and len(scanner.gamma) == 1:
         correlation, power = float(scanner.alpha[0, 0]), float(scanner.gamma[0] ** 2 * scanner.covariance[0, 0])
         whole = smooth_lines(lines, values, correlation, power, variance, seen, known)
         return np.asarray(whole[:, m + pixels.start : m + pixels.stop] + mean)
@@ -129,14 +184,12 @@ def _estimated(
     for k in range(0, n_lines, step):
         some = slice(k, k + step)
         here = model if known is None or len(model.start_mean) == 1 else _of_lines(model, some)
-        result = kalman(
-            here, lines[some], variance, None if seen is None else seen[some], keep=request.method == "smoother"
-        )
-        if request.method == "smoother":
+        result = kalman(here, lines[some], variance, None if seen is None else seen[some], keep=which == "smoother")
+        if which == "smoother":
             states = smooth(here, result)
         else:
-            states = result.predicted if request.method == "predictor" else result.filtered
-        out[some] = scene_from_states(model, states, pixels, lag=m if request.method == "lag" else 0, first=first)
+            states = result.predicted if which == "predictor" else result.filtered
+        out[some] = scene_from_states(model, states, pixels, lag=m if which == "lag" else 0, first=first)
     return np.asarray(out + mean)
 
 

@@ -72,6 +72,11 @@ class Psf:
         return len(self.origin) == 1
 
     @property
+    def mean(self) -> FloatArray:
+        """The values; where each pixel of a line has its own, their mean."""
+        return np.asarray(self.values.mean(axis=0)) if self.varies else self.values
+
+    @property
     def sd(self) -> FloatArray:
         """Standard deviation of each value, shape of ``values``."""
         return np.asarray(np.sqrt((self.modes**2).sum(axis=0)))

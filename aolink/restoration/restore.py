@@ -3,66 +3,31 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from aolink.errors import RestorationError
-from aolink.restoration import spectrum
-from aolink.restoration.inverse import Direction
-from aolink.restoration.lines import LINE_METHODS, LineRequest, restore_lines
-from aolink.restoration.markov import make_solver, plane_solver
-from aolink.restoration.plug_and_play import Denoiser, non_local_means, plug_and_play
-from aolink.restoration.psf import STRAIGHT_PX, Line, Psf, along_line, as_psf
-from aolink.restoration.rotation import to_lines
-from aolink.restoration.scanner import Scanner, first_order
-from aolink.restoration.tv import total_variation
-from aolink.restoration.uncertainty import line_variance, plane_variance
+from aolink.restoration.method import Blurred, Restored
+from aolink.restoration.psf import Psf, as_psf
+from aolink.restoration.registry import check_parameters, find_method
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-Method = Literal["inverse", "predictor", "filter", "lag", "smoother", "gauss_markov", "tv", "pnp"]
-METHODS: tuple[Method, ...] = get_args(Method)
 _COLOURS = (3, 4)
-# Noise below this share of the scene's differences (variances) is taken for as much where conjugate gradients solve:
-# their steps grow with one over its root, and the picture is no sharper for it.
-_SMALLEST_RATIO = 3e-4
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Restored:
-    """A picture without its blur, and what it was restored with."""
-
-    image: NDArray[Any]
-    """Aligned with the scene at no displacement; shape and dtype of the blurred picture."""
-    method: Method
-    noise_sd: float
-    """Standard deviation of the picture's white noise, as given or as found; NaN for the inverse."""
-    psf_noise_sd: float
-    """What the PSF's uncertainty adds to it, root of the added variance."""
-    difference_weight: float
-    """lambda of gauss_markov, tv and pnp, one over the picture's unit squared; NaN for the methods on lines."""
-    scanner: Scanner | None
-    """What the methods on lines took the scene for."""
-    direction: Direction
-    """In which the lines were scanned."""
 
 
 def restore(
     image: ArrayLike,
     psf: Psf | ArrayLike,
     *,
-    method: Method = "tv",
+    method: str = "tv",
     noise_sd: float | None = None,
-    boundary: float | ArrayLike | None = None,
     mask: ArrayLike | None = None,
-    scanner: Scanner | None = None,
-    direction: Direction | None = None,
-    denoise: Denoiser = non_local_means,
+    **parameters: Any,
 ) -> Restored:
     """Take the blur out of a picture.
 
@@ -74,29 +39,32 @@ def restore(
     psf:
         A `Psf`; or plain numbers, which are divided by their sum and centred on tap ``n // 2``.
     method:
-        On lines (a motion along a straight line, at any angle), no line knows of its neighbours: ``inverse`` (exact,
-        for pictures without noise), the Kalman ``predictor``, ``filter``, ``lag`` (by the PSF's length), ``smoother``.
-        On the plane: ``gauss_markov``, ``tv`` (keeps edges), ``pnp`` (plug and play with ``denoise``; slow).
+        A name of `METHODS`. On lines (a motion along a straight line, at any angle), where no line knows of its
+        neighbours: ``inverse`` (exact, for pictures without noise), the Kalman ``predictor``, ``filter``, ``lag`` (by
+        the PSF's length), ``smoother``. On the plane: ``gauss_markov``, ``tv`` (keeps edges), ``pnp`` (plug and play;
+        slow). Installed packages may add others.
     noise_sd:
         Of the picture's white noise, in its own unit; None finds it in the picture.
-    boundary:
-        What the scene is before the first pixel of each line: a value, or (rows, taps - 1) pixels in their order on
-        the line. The inverse takes it for the taps - 1 pixels before the one that c_0 meets. None: unknown,
-        estimated. For methods on lines only; the others need nothing.
     mask:
         True where a pixel is good, (rows, columns); dead and saturated pixels are False and are filled in.
-    scanner:
-        Model of the scene for the Kalman methods, see `first_order`, `from_correlation`; None fits a first-order one.
-    direction:
-        In which lines are scanned. None: the stable one for the inverse, forwards for the others.
-    denoise:
-        For ``pnp``.
+    **parameters:
+        What the method takes besides (`Method.parameters`); None is as if it were not given. The methods on lines take
+
+        ``boundary``: what the scene is before the first pixel of each line: a value, or (rows, taps - 1) pixels in
+        their order on the line. The inverse takes it for the taps - 1 pixels before the one that c_0 meets. None:
+        unknown, estimated.
+
+        ``scanner``: model of the scene, see `first_order`, `from_correlation`; None fits a first-order one.
+
+        ``direction``: in which lines are scanned. None: the stable one for the inverse, forwards for the others.
+
+        ``pnp`` takes ``denoise``: a function of a picture (rows, columns) and its noise's standard deviation.
 
     Raises
     ------
     RestorationError
         A picture or PSF that is empty, of the wrong shape or not finite; a PSF that is negative or wider than the
-        picture; an inverse that is unstable; a path that is not straight, with a method on lines.
+        picture; a method that there is not, or that cannot restore this picture or does not take a parameter.
 
     Examples
     --------
@@ -113,7 +81,9 @@ def restore(
     picture = np.asarray(image)
     psf = as_psf(psf)
     good = _checked_mask(picture, mask)
-    checked_method(method)
+    row = find_method(method)
+    given = {name: value for name, value in parameters.items() if value is not None}
+    check_parameters(row, given)
     planes = _planes(picture, good)
     if not psf.on_line and 1 in psf.values.shape:
         # A motion along one axis is exact on lines.
@@ -121,34 +91,18 @@ def restore(
             turned = None if mask is None else np.asarray(mask).T
             upright = Psf(values=psf.values.T, origin=psf.origin[::-1], modes=psf.modes.swapaxes(1, 2))
             done = restore(
-                picture.swapaxes(0, 1), upright, method=method, noise_sd=noise_sd, boundary=boundary, mask=turned,
-                scanner=scanner, direction=direction, denoise=denoise,
+                picture.swapaxes(0, 1), upright, method=method, noise_sd=noise_sd, mask=turned, **parameters
             )  # fmt: skip
             return replace(done, image=done.image.swapaxes(0, 1))
         psf = Psf(values=psf.values[0], origin=psf.origin[1:], modes=psf.modes[:, 0])
     _check_fit(planes, psf)
     if noise_sd is not None and not (math.isfinite(noise_sd) and noise_sd > 0):
         raise RestorationError(f"noise_sd is {noise_sd}: expected above zero, or method='inverse' where there is none")
-    if direction not in (None, *get_args(Direction)):
-        raise RestorationError(f"direction is {direction!r}, expected one of {', '.join(get_args(Direction))}")
-    if method in LINE_METHODS:
-        done = _on_lines(planes, psf, method, noise_sd, boundary, good, scanner, direction)
-    else:
-        for name, given in (("boundary", boundary), ("scanner", scanner), ("direction", direction)):
-            if given is not None:
-                raise RestorationError(
-                    f"{name} belongs to the methods on lines ({', '.join(LINE_METHODS)}): leave it out"
-                )
-        done = _on_plane(planes, psf, method, noise_sd, good, denoise)
-    return replace(done, image=_as_given(done.image, picture))
-
-
-def checked_method(name: str) -> Method:
-    """The method of a name. Raises RestorationError where there is none."""
-    for method in METHODS:
-        if name == method:
-            return method
-    raise RestorationError(f"method is {name!r}, expected one of {', '.join(METHODS)}")
+    blurred = Blurred(planes=planes, psf=psf, seen=good, given_noise_sd=noise_sd)
+    if reason := row.why_not(blurred):
+        raise RestorationError(reason)
+    done = row.restore(blurred, **given)
+    return replace(done, method=row.name, image=_as_given(done.image, picture))
 
 
 def _checked_mask(picture: NDArray[Any], mask: ArrayLike | None) -> BoolArray | None:
@@ -202,102 +156,3 @@ def _check_fit(planes: FloatArray, psf: Psf) -> None:
         )
     if psf.varies and len(psf.values) != columns:
         raise RestorationError(f"there are PSFs for {len(psf.values)} pixels of a line, the picture has {columns}")
-
-
-def _noise_variance(planes: FloatArray, found: spectrum.Spectrum, noise_sd: float | None) -> float:
-    """As given, or found; above what rounding of the numbers makes."""
-    if noise_sd is not None:
-        return noise_sd**2
-    floor = 1e-6 * max(float(np.ptp(planes)), 1e-6 * float(np.abs(planes).max()), 1e-100)
-    return max(spectrum.noise_variance(found), floor**2)
-
-
-def _mean_psf(psf: Psf) -> FloatArray:
-    return psf.values.mean(axis=0) if psf.varies else psf.values
-
-
-def _filled(planes: FloatArray, good: BoolArray | None) -> FloatArray:
-    """Missing pixels as their nearest neighbours: good enough to find weights with."""
-    if good is None:
-        return planes
-    nearest = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
-    return planes[:, nearest[0], nearest[1]]
-
-
-def _on_plane(
-    planes: FloatArray, psf: Psf, method: Method, noise_sd: float | None, good: BoolArray | None, denoise: Denoiser
-) -> Restored:
-    shape = (planes.shape[1], planes.shape[2])
-    whole = _filled(planes, good)
-    light = spectrum.plane_spectrum(whole, _mean_psf(psf))
-    variance = _noise_variance(whole, light, noise_sd)
-    weight = spectrum.difference_weight(light, variance)
-    modes = psf.modes.mean(axis=1) if psf.varies else psf.modes
-    unexplained = plane_variance(modes, weight)
-    total = variance + unexplained
-    if not psf.on_line or good is not None:
-        total = max(total, _SMALLEST_RATIO / weight)
-    if method == "gauss_markov":
-        solver = make_solver(psf, shape, weight * total, good)
-        scene = solver.solve(solver.project(whole), solver.guess(whole))
-    else:
-        # Total variation does not need the last digits; half of them take half of the time.
-        level = whole.mean()
-        scene, solver = total_variation(
-            lambda kappa: make_solver(psf, shape, kappa, good, single=True), whole - level, total, weight
-        )
-        scene = scene.astype(np.float64) + level
-    if method == "pnp":
-        if psf.varies:
-            raise RestorationError("pnp needs one PSF for the whole picture: use tv")
-        scene = plug_and_play(
-            lambda kappa: plane_solver(psf, shape, kappa, good, white=True), whole, total, scene, denoise
-        )
-    return Restored(
-        image=scene[(slice(None), *solver.frame)], method=method, noise_sd=math.sqrt(variance),
-        psf_noise_sd=math.sqrt(unexplained), difference_weight=weight, scanner=None, direction="forward",
-    )  # fmt: skip
-
-
-def _on_lines(
-    planes: FloatArray, psf: Psf, method: Method, noise_sd: float | None, boundary: float | ArrayLike | None,
-    good: BoolArray | None, scanner: Scanner | None, direction: Direction | None,
-) -> Restored:  # fmt: skip
-    lines, seen, back = planes, good, None
-    if not psf.on_line:
-        if method == "inverse":
-            raise RestorationError("the exact inverse needs a motion along the picture's rows or columns: use smoother")
-        line = _straight(psf, method)
-        psf = line.psf
-        lines, seen, back = to_lines(planes, good, line.angle_rad)
-    if method == "inverse" and seen is not None:
-        raise RestorationError("the exact inverse cannot do without a pixel: use the method smoother for masked ones")
-    variance = unexplained = math.nan
-    if method != "inverse":
-        whole = _filled(lines, seen)
-        variance = _noise_variance(whole, spectrum.plane_spectrum(whole, _mean_psf(psf)), noise_sd)
-        if scanner is None:
-            correlation, power = spectrum.correlation_and_variance(
-                spectrum.line_spectrum(whole, _mean_psf(psf)), variance
-            )
-            scanner = first_order(correlation, power)
-        unexplained = line_variance(psf.modes, scanner)
-    request = LineRequest(
-        method=method, psf=psf, noise_variance=variance + unexplained, scanner=scanner, boundary=boundary,
-        direction=direction, seen=seen,
-    )  # fmt: skip
-    scene, scanned = restore_lines(lines, request)
-    return Restored(
-        image=scene if back is None else back(scene), method=method, noise_sd=math.sqrt(variance),
-        psf_noise_sd=math.sqrt(unexplained), difference_weight=math.nan, scanner=scanner, direction=scanned,
-    )  # fmt: skip
-
-
-def _straight(psf: Psf, method: Method) -> Line:
-    line = along_line(psf)
-    if line.deviation_px > STRAIGHT_PX:
-        raise RestorationError(
-            f"the motion is not along a straight line: its light strays from one by {line.deviation_px:.2g} pixels rms,"
-            f" and {method} bears {STRAIGHT_PX:g}; use gauss_markov, tv or pnp"
-        )
-    return line

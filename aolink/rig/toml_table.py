@@ -29,9 +29,10 @@ still_frames summary tension_n_per_m timing turbulence unmodelled vibration volt
 window zernike_m
 """
 KEYS = frozenset(_KEYS.split())
-"""Every key of every table of a rig file.
+"""Every key of every table of a rig file, kept by hand, and held to what the readers ask for by a test.
 
-Where a key is missing, a key of the file that is not among these is a misspelling of it if the two look alike.
+Where a key is missing, a key of the file that is not among these is a misspelling of it if the two look alike. The
+readers alone could not say so: they have not asked yet for the keys that come after the missing one.
 """
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 import rerun as rr
 
+from aolink.recording import topics
 from aolink.viewing.palette import APPLIED, COMMANDED, estimator_colour, series_colour
 from aolink.viewing.series import Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
@@ -39,15 +40,16 @@ class Timed(Protocol):
     def message(self) -> Any: ...
 
 
-def log_commands(stream: rr.RecordingStream, timebase: Timebase, blocks: Sequence[Any]) -> None:
+def log_commands(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Commands as sent (CommandBlock), at every fast step: ``/mirror/command``, in the mirror's unit."""
+    blocks = [r.message for r in records]
     _send_blocks(stream, "mirror/command", timebase, blocks, Style("commanded", COMMANDED, width=1.0, steps=True))
 
 
-def log_applied(stream: rr.RecordingStream, timebase: Timebase, blocks: Sequence[Any]) -> None:
+def log_applied(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """What the mirror held (Applied), at every fast step: ``/mirror/applied``; and why: ``/status/mirror``."""
     # A report that was asked for again came out of order; what was never reported shows only in the status.
-    blocks = sorted((b for b in blocks if b.source != Applied.AWAITED), key=lambda b: b.first_step)
+    blocks = sorted((r.message for r in records if r.message.source != Applied.AWAITED), key=lambda b: b.first_step)
     if not blocks:
         return
     _send_blocks(stream, "mirror/applied", timebase, blocks, Style("applied", APPLIED, width=3.5, steps=True))
@@ -59,13 +61,14 @@ def log_applied(stream: rr.RecordingStream, timebase: Timebase, blocks: Sequence
     send_states(stream, "status/mirror", timebase.at_steps([b.first_step for b in changes]), names)
 
 
-def log_latency(stream: rr.RecordingStream, timebase: Timebase, latencies: Sequence[Any]) -> None:
+def log_latency(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Time since the end of the exposure at which each step of the loop was done, ms: ``/latency/STEP``.
 
     The lines lie above each other in the order of the steps: the distance between two is one step's time.
     """
-    if not latencies:
+    if not records:
         return
+    latencies = [r.message for r in records]
     frames = np.array([m.frame_id for m in latencies], dtype=np.int64)
     starts = timebase.first_step + (frames - timebase.frame_id) * timebase.frame_period_steps
     times = timebase.at_steps(starts, frames)
@@ -78,12 +81,14 @@ def log_latency(stream: rr.RecordingStream, timebase: Timebase, latencies: Seque
             )
 
 
-def log_estimation(stream: rr.RecordingStream, timebase: Timebase, name: str, accounts: Sequence[Any]) -> None:
+def log_estimation(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """What an estimator had time for: ``/latency/estimation/NAME``, ms for each estimate; ``/status/NAME`` where it
     skipped an exposure.
     """
-    if not accounts:
+    if not records:
         return
+    accounts = [r.message for r in records]
+    name = accounts[0].estimator
     frames = np.array([m.frame_id for m in accounts], dtype=np.int64)
     starts = timebase.first_step + (frames - timebase.frame_id) * timebase.frame_period_steps
     made = np.array([not m.skipped for m in accounts])
@@ -96,10 +101,11 @@ def log_estimation(stream: rr.RecordingStream, timebase: Timebase, name: str, ac
         send_states(stream, f"status/{name}", times, ["SKIPPED"] * int(np.count_nonzero(~made)))
 
 
-def log_drops(stream: rr.RecordingStream, timebase: Timebase, infos: Sequence[Any]) -> None:
+def log_drops(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Frames and chunks lost since the start, from ExposureInfo: ``/link/lost/frames``, ``/link/lost/chunks``."""
-    if not infos:
+    if not records:
         return
+    infos = [r.message for r in records]
     times = timebase.at_steps([m.first_step for m in infos], [m.frame_id for m in infos])
     frames = np.cumsum([m.frames_lost_before for m in infos])
     chunks = np.cumsum([m.chunks_lost for m in infos])
@@ -107,7 +113,7 @@ def log_drops(stream: rr.RecordingStream, timebase: Timebase, infos: Sequence[An
     send_line(stream, "link/lost/chunks", times, chunks, Style("chunks lost", (250, 170, 90), steps=True))
 
 
-def log_link(stream: rr.RecordingStream, timebase: Timebase, records: Iterable[Timed]) -> None:
+def log_link(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Health of each device's link: faults by cause, command round trip and traffic.
 
     ``/link/faults/DEVICE`` and ``/link/faults/DEVICE/CAUSE`` (since the start), ``/link/round_trip/DEVICE`` (ms),
@@ -133,7 +139,7 @@ def log_link(stream: rr.RecordingStream, timebase: Timebase, records: Iterable[T
             send_line(stream, f"link/received/{device}", timebase.at_host(host[1:]), rate, style)
 
 
-def log_clock(stream: rr.RecordingStream, timebase: Timebase, records: Iterable[Timed]) -> None:
+def log_clock(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """The regression of each device's clock on the host's.
 
     ``/clock/sigma/DEVICE`` (standard deviation of the offset, us), ``/clock/offset/DEVICE`` (change of the offset
@@ -152,15 +158,27 @@ def log_clock(stream: rr.RecordingStream, timebase: Timebase, records: Iterable[
             send_line(stream, f"clock/{name}/{device}", times, values, Style(f"{device} {label}", series_colour(d)))
 
 
-def log_log(stream: rr.RecordingStream, timebase: Timebase, records: Iterable[Timed]) -> None:
+def log_log(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """The session's log: ``/log``."""
-    records = list(records)
     if not records:
         return
     times = timebase.at_host([r.log_time_ns for r in records])
     text = [f"{r.message.name}: {r.message.message}" if r.message.name else r.message.message for r in records]
     levels = [_LEVELS.get(r.message.level, "INFO") for r in records]
     stream.send_columns("log", times, rr.TextLog.columns(text=text, level=levels))
+
+
+LOGS: dict[str, Callable[[rr.RecordingStream, Timebase, Sequence[Timed]], None]] = {
+    topics.COMMAND: log_commands,
+    topics.APPLIED: log_applied,
+    topics.EXPOSURE: log_drops,
+    topics.LATENCY: log_latency,
+    topics.ESTIMATION: log_estimation,
+    topics.LINK: log_link,
+    topics.CLOCK: log_clock,
+    topics.LOG: log_log,
+}
+"""What shows the messages of a topic."""
 
 
 def _send_blocks(

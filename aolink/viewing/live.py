@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from aolink.errors import ViewerError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
-from aolink.recording.deblur import deblur
+from aolink.restoration import deblur
 from aolink.rig import Rig
 from aolink.viewing import motion, scene
 from aolink.viewing.blueprint import Contents, blueprint

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
@@ -15,6 +14,7 @@ from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
 from aolink.exposure import Exposure
 from aolink.optics.sensor import SpotSensor
+from aolink.recording import topics
 from aolink.rig import Rig
 from aolink.viewing import camera, devices, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
@@ -23,12 +23,10 @@ from aolink.viewing.rrd_file import new_rrd
 from aolink.viewing.timebase import Timebase
 
 if TYPE_CHECKING:
-    from aolink.recording.reader import Recording
+    from aolink.recording.reader import RecordedMessage, Recording
 
 APPLICATION = "aolink"
 """Rerun keeps a user's own layouts by this name."""
-_ESTIMATION = "/estimation/"
-"""Prefix of the topics of what estimators had time for."""
 
 
 def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -102,11 +100,11 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
             if shown
         ],
         restored_spots=any(each.spots is not None for each in restored),
-        commands=bool(found & {"/mirror/command", "/mirror/applied"}),
-        clock="/clock" in found,
-        link="/link" in found,
-        latency="/latency" in found,
-        log="/log" in found,
+        commands=bool(found & {topics.COMMAND, topics.APPLIED}),
+        clock=topics.CLOCK in found,
+        link=topics.LINK in found,
+        latency=topics.LATENCY in found,
+        log=topics.LOG in found,
     )
 
 
@@ -147,22 +145,15 @@ def send_camera(
 
 def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> set[str]:
     """Send what does not come from exposures and estimates; the topics that had messages."""
-    names = ("/mirror/command", "/mirror/applied", "/camera/exposure", "/latency", "/link", "/clock", "/log")
-    records = sorted(recording.messages(*names), key=lambda r: r.topic)
-    by_topic: dict[str, list[Any]] = {topic: list(group) for topic, group in groupby(records, key=lambda r: r.topic)}
-    for topic, log in (
-        ("/mirror/command", devices.log_commands),
-        ("/mirror/applied", devices.log_applied),
-        ("/camera/exposure", devices.log_drops),
-        ("/latency", devices.log_latency),
-    ):
-        log(stream, timebase, [r.message for r in by_topic.get(topic, [])])
-    for topic in [each for each in recording.counts if each.startswith(_ESTIMATION)]:
-        accounts = [r.message for r in recording.messages(topic)]
-        devices.log_estimation(stream, timebase, topic.removeprefix(_ESTIMATION), accounts)
-    devices.log_link(stream, timebase, by_topic.get("/link", []))
-    devices.log_clock(stream, timebase, by_topic.get("/clock", []))
-    devices.log_log(stream, timebase, by_topic.get("/log", []))
+    by_topic: dict[str, list[RecordedMessage]] = {
+        topic: [] for topic in recording.counts if topics.named(topic).name in devices.LOGS
+    }
+    for record in recording.messages(*by_topic) if by_topic else ():
+        by_topic[record.topic].append(record)
+    for name, log in devices.LOGS.items():
+        for topic, records in by_topic.items():
+            if topics.named(topic).name == name:
+                log(stream, timebase, records)
     return set(by_topic)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
 from aolink.optics.scene import SceneSensor
-from aolink.recording.reader import RestoredPictures
+from aolink.restoration import RestoredPictures
 from aolink.viewing.palette import MISSING
 from aolink.viewing.timebase import Timebase
 
@@ -52,10 +52,10 @@ def log_restored(
     Gives whether there was a scene.
     """
     starts = {e.frame_id: e.first_step for e in exposures}
-    known = [each for each in restored if each.info.frame_id in starts]
-    scenes = [(each.info.frame_id, _grey(each.scene)) for each in known if each.scene is not None]
+    known = [each for each in restored if each.frame_id in starts]
+    scenes = [(each.frame_id, _grey(each.scene)) for each in known if each.scene is not None]
     spots = [
-        (each.info.frame_id, _grey(each.spots / max(float(each.spots.max()), 1e-6)))
+        (each.frame_id, _grey(each.spots / max(float(each.spots.max()), 1e-6)))
         for each in known
         if each.spots is not None
     ]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from aolink.estimation import Estimate, run
-from aolink.recording.deblur import scene_psf
 from aolink.restoration import motion_psf
+from aolink.restoration.deblur import scene_psf
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from aolink.calibration import Calibration, Frames, Kind, Measured, calibrate, calibrated_text
 from aolink.calibration.measure import pixel_statistics
-from aolink.errors import CalibrationError, RigError
+from aolink.errors import CalibrationError
 from aolink.jobs.demo import simulated_rig
 from aolink.optics.sensor import Kernel
 from aolink.recording.reader import Recording
@@ -383,10 +383,13 @@ def test_the_calibration_is_in_the_rig_and_what_was_not_measured_again_stays() -
     assert again.endswith("\n\n# the end\n")
 
 
-def test_a_calibration_that_is_no_table_of_its_own_is_left_alone() -> None:
-    text = f"calibration = {{ dark_frames = 3 }}\n{LIVELY.toml}"
-    with pytest.raises(RigError, match="take it out by hand"):
-        calibrated_text(text, parse_rig(text), found(), [])
+def test_a_calibration_in_one_line_stays_in_one_line() -> None:
+    text = f"calibration = {{ dark_frames = 3 }}  # mine\n{LIVELY.toml}"
+    new = calibrated_text(text, parse_rig(text), found(), ["dark dark.mcap sha256:00"])
+    first, rest = new.split("\n", 1)
+    assert first.startswith("calibration = { dark_frames = 100")
+    assert first.endswith("}  # mine")
+    assert rest == calibrated_text(LIVELY.toml, LIVELY, found(), []).split("\n[calibration]")[0]
 
 
 # The command line, over real pseudo terminals.

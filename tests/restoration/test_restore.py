@@ -278,7 +278,6 @@ def test_an_even_picture_stays_as_it_is(method: str) -> None:
         (np.zeros((5, 5)), np.ones(2), {"noise_sd": 0.0}, "above zero, or method='inverse'"),
         (np.zeros((5, 5)), np.ones(2), {"mask": np.ones((5, 4), bool)}, r"mask has shape \(5, 4\)"),
         (np.zeros((5, 5)), np.ones(2), {"mask": np.zeros((5, 5), bool)}, "at least one"),
-        (np.zeros((5, 5)), np.ones(2), {"method": "tv", "boundary": 0.0}, "boundary belongs to the methods on lines"),
         (np.zeros((5, 5)), Psf(values=np.ones((4, 2)) / 2, origin=(0,)), {}, "PSFs for 4 pixels"),
     ],
 )

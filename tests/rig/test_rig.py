@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 from collections.abc import Callable
@@ -13,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.errors import RigError
-from aolink.rig import CalibrationTable, builtin_rigs, load_rig, parse_rig
+from aolink.rig import CalibrationTable, Faults, builtin_rigs, load_rig, parse_rig, tables
+from aolink.rig.toml_table import KEYS, Table
 
 TEXT = load_rig("section-vi").toml
 A = "[[1.0000, 0.0010], [-0.0197, 0.9704]]"
@@ -328,3 +330,20 @@ def test_numbers_and_nesting_beyond_what_can_be_read(value: str) -> None:
     for key in ("sigma = 0.05", "process_noise = 0.1 "):
         with pytest.raises(RigError):
             parse_rig(changed(key, f"{key.split()[0]} = {value} "))
+
+
+def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None:
+    asked = set(Faults.__dataclass_fields__)  # asked for in a loop
+    readers = {name for name in vars(Table) if not name.startswith("_")} - {"key", "missing", "finish"}
+    for path in Path(tables.__file__).parent.glob("*.py"):
+        for call in ast.walk(ast.parse(path.read_text())):
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr in readers:
+                asked |= {each.value for each in call.args[:1] if isinstance(each, ast.Constant)}
+    assert asked == KEYS
+
+
+def test_the_rooms_page_names_every_key() -> None:
+    page = (Path(tables.__file__).parent / "README.md").read_text()
+    top = {"drive", "lenslets", "mirror", "plant", "scene", "sensor", "simulation", "timing"}
+    named = set(re.findall(r"\b[A-Za-z_0-9]+\b", "".join(re.findall(r"`[^`]+`", page))))
+    assert named | top >= KEYS

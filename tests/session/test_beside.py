@@ -27,7 +27,7 @@ from aolink.jobs.demo import simulated_rig
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import first_difference, recorded_estimates, reestimate
+from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig, parse_rig
 from aolink.session import Report, record
 from aolink.session.estimating import BesideTheLoop, Outcome
@@ -76,7 +76,7 @@ def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> Non
         accounts = [each.message for each in recording.messages(topics.estimation_topic(name))]
         assert counted.estimated + counted.skipped == len(accounts) == EXPOSURES
         assert sorted(each.frame_id for each in accounts) == list(range(1, EXPOSURES + 1))
-        estimated = [each.frame_id for each in recorded_estimates(recording, name)]
+        estimated = [each.frame_id for each in recording.iter_estimates(name)]
         assert [each.frame_id for each in accounts if not each.skipped] == estimated
         assert len(estimated) == counted.estimated == len(counted.took_ms) > 0
         assert all((each.took_ns > 0) != each.skipped for each in accounts)
@@ -194,7 +194,7 @@ def test_the_recording_goes_on_without_an_estimator_that_was_killed(rig_file: Pa
     recording = Recording(path)
     assert recording.complete
     again = reestimate(recording, ["o3"], as_recorded=True)["o3"]
-    assert first_difference(list(recorded_estimates(recording, "o3")), again) is None
+    assert first_difference(list(recording.iter_estimates("o3")), again) is None
 
 
 def children(parent: int, what: str) -> list[int]:
@@ -265,7 +265,7 @@ def test_ctrl_c_waits_for_what_is_under_way_and_records_the_rest_as_skipped(rig_
     recording = Recording(path)
     assert recording.complete
     exposures = {each.frame_id for each in recording.exposures()}
-    estimated = {each.frame_id for each in recorded_estimates(recording, SLOW)}
+    estimated = {each.frame_id for each in recording.iter_estimates(SLOW)}
     assert estimated | recording.skipped(SLOW) == exposures
     assert not estimated & recording.skipped(SLOW)
     assert f"{SLOW}: {len(estimated)} of {len(exposures)} exposures".encode() in output

@@ -21,7 +21,6 @@ from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import (
     first_difference,
-    recorded_estimates,
     reestimate,
     reestimated,
     scored_and_compared,
@@ -70,7 +69,7 @@ def test_scored_and_compared_one_by_one_is_as_all_at_once(recorded: Session) -> 
     assert differences == dict.fromkeys(ESTIMATORS)
     for name in ESTIMATORS:
         listed = recording.estimates(name)
-        assert first_difference(list(recorded_estimates(recording, name)), listed) is None
+        assert first_difference(list(recording.iter_estimates(name)), listed) is None
         assert scores[name] == score(list(recording.exposures()), listed)
     some = itertools.islice(reestimated(recording, ESTIMATORS), 3)
     _, differences = scored_and_compared(recording, some, ESTIMATORS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,7 @@ from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.plain import plain_data
 from aolink.recording import schemas_pb2 as schemas
-from aolink.recording.reader import RestoredPictures
+from aolink.restoration import RestoredPictures
 from aolink.rig import Rig, load_rig
 from aolink.wire import messages_pb2 as wire
 
@@ -100,7 +101,7 @@ class StandIn:
 
     @property
     def counts(self) -> dict[str, int]:
-        return {"/estimation/o3": self.n} if self.without_time else {}
+        return Counter(each.topic for each in self.messages())
 
     def skipped(self, name: str) -> frozenset[int]:
         return frozenset(self.without_time if name == "o3" else ())

@@ -12,7 +12,7 @@ import pytest
 from aolink.estimation import run
 from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure
-from aolink.recording.deblur import deblur
+from aolink.restoration import deblur
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
 from aolink.viewing import save_rrd

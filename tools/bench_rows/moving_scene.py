@@ -7,8 +7,8 @@ import numpy as np
 import aolink
 from aolink.estimation import ESTIMATOR_NAMES
 from aolink.optics.scene import framed
-from aolink.recording.deblur import blurred_psnr, psnr, scene_psf
 from aolink.restoration import Psf, motion_psf, restore
+from aolink.restoration.deblur import blurred_psnr, psnr, scene_psf
 from aolink.rig.scene_table import read_scene_picture
 from bench_rows.row import Effort, Row
 

@@ -83,7 +83,7 @@ def restored(
     """By rows, or as one line of 1024 pixels, which is what the fifth-order model is of."""
     lines = image.reshape(1, -1) if raster else image
     done = restore(
-        lines, psf(), method=method, noise_sd=math.sqrt(noise_variance), scanner=scanner, boundary=-1.0  # type: ignore[arg-type]
+        lines, psf(), method=method, noise_sd=math.sqrt(noise_variance), scanner=scanner, boundary=-1.0
     )  # fmt: skip
     return np.asarray(done.image).reshape(image.shape)
 

@@ -1,0 +1,137 @@
+"""What an exposure's sensors saw, without its blur: restored with the path that the exposure's estimate gives.
+
+Neither the truth nor the true scene is read for it; the latter tells afterwards how good it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RestorationError
+from aolink.estimation import Estimate
+from aolink.estimation.motion import coefficient_roots, motion
+from aolink.exposure import Exposure, step_shares
+from aolink.optics.camera import is_saturated, to_density
+from aolink.optics.scene import SceneSensor, scene_motion
+from aolink.optics.sensor import Kernel, SpotSensor
+from aolink.restoration.method import Restored
+from aolink.restoration.psf import Psf, motion_psf_by_root
+from aolink.restoration.restore import restore
+from aolink.rig import Rig
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RestoredPictures:
+    """An exposure's pictures without their blur."""
+
+    frame_id: int
+    estimator: str
+    """Whose path they were restored with."""
+    method: str
+    scene_noise_sd: float
+    """Standard deviation of the scene's noise, as found; NaN where there is no scene."""
+    path_noise_sd: float
+    """What the path's uncertainty adds to it."""
+    reason: str
+    """Why pictures are missing; empty where none is."""
+    scene: NDArray[np.float32] | None
+    """Intensity, (rows, columns)."""
+    spots: NDArray[np.float32] | None
+    """Share of a spot's light, (rows, columns) of the camera's frame."""
+
+
+def estimated_psfs(
+    exposure: Exposure, estimate: Estimate, mixes: Iterable[FloatArray], kernel: Kernel, pixel_scale: float
+) -> Iterator[Psf]:
+    """The PSF, with its uncertainty, of each of some sums of outputs: see `motion`."""
+    roots, offset = coefficient_roots(estimate), exposure.start_offset
+    shares = step_shares(exposure.n_steps, offset)
+    for mix in mixes:
+        path, root = motion(estimate, mix, roots, after=offset > 0)
+        yield motion_psf_by_root(path, root, kernel, pixel_scale, shares)
+
+
+def scene_psf(rig: Rig, exposure: Exposure, estimate: Estimate) -> Psf:
+    """The PSF of a rig's picture sensor by an estimate, with its uncertainty."""
+    assert rig.scene is not None
+    mix = scene_motion(rig.n_outputs)
+    return next(estimated_psfs(exposure, estimate, [mix], rig.scene.kernel, rig.scene.pixel_scale))
+
+
+def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: str = "tv") -> RestoredPictures:
+    """Restore what an exposure's sensors saw, with the path of its estimate; intensities are cut at 0 and 1."""
+    scene = spots = None
+    noise, added, reasons = math.nan, math.nan, list[str]()
+    if rig.scene is not None:
+        try:
+            done = _restored_scene(rig, exposure, estimate, method)
+            scene, noise, added = _unit(done.image), done.noise_sd, done.psf_noise_sd
+        except RestorationError as error:
+            reasons.append(f"scene: {error}")
+    try:
+        spots = _unit(_restored_spots(rig, exposure, estimate, method))
+    except RestorationError as error:
+        reasons.append(f"spot: {error}")
+    return RestoredPictures(
+        frame_id=exposure.frame_id, estimator=estimate.estimator, method=method, scene_noise_sd=noise,
+        path_noise_sd=added, reason="; ".join(reasons), scene=scene, spots=spots,
+    )  # fmt: skip
+
+
+def _restored_scene(rig: Rig, exposure: Exposure, estimate: Estimate, method: str) -> Restored:
+    assert rig.scene is not None
+    if exposure.scene is None:
+        raise RestorationError("the picture never came")
+    counts = exposure.scene.pixels
+    good = exposure.scene.mask & ~rig.scene.is_saturated(counts)
+    return restore(rig.scene.to_intensity(counts), scene_psf(rig, exposure, estimate), method=method, mask=good)
+
+
+def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: str) -> FloatArray:
+    sensor = rig.sensor
+    share = to_density(sensor, exposure.pixels) * sensor.pixel_size
+    good = exposure.mask & ~is_saturated(sensor, exposure.pixels)
+    mixes = np.eye(rig.n_outputs).reshape(-1, 2 if isinstance(sensor, SpotSensor) else 1, rig.n_outputs)
+    psfs = estimated_psfs(exposure, estimate, mixes, sensor.kernel, sensor.pixel_width)
+    if not isinstance(sensor, SpotSensor):
+        return np.asarray(restore(share, next(psfs), method=method, mask=good).image)
+    out, (height, width) = np.zeros_like(share), sensor.window
+    for psf, place in zip(psfs, sensor.lit, strict=False):
+        row, column = divmod(int(place), sensor.grid[1])
+        window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+        out[window] = restore(share[window], psf, method=method, mask=good[window]).image
+    return out
+
+
+def _unit(image: FloatArray) -> NDArray[np.float32]:
+    return np.clip(image, 0.0, 1.0).astype(np.float32)
+
+
+def psnr(picture: FloatArray, scene: FloatArray, mask: NDArray[np.bool_] | None = None) -> float:
+    """Peak signal-to-noise ratio, dB, for a peak of one."""
+    error = (picture - scene)[... if mask is None else mask]
+    return float(-10 * np.log10(np.mean(error**2))) if error.size else math.nan
+
+
+def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: NDArray[np.intp], scene: FloatArray) -> float:
+    """`psnr` of a scene as it came, against the true one moved as it is in the mean: no blur is mistaken for a shift.
+
+    Parameters
+    ----------
+    shift_px:
+        Mean displacement along x, or x and y, whole pixels.
+    """
+    assert exposure.scene is not None
+    x, y = int(shift_px[0]), int(shift_px[1]) if len(shift_px) > 1 else 0
+    rows, columns = sensor.shape
+    kept = np.zeros(sensor.shape, dtype=bool)
+    kept[max(y, 0) : rows + min(y, 0), max(x, 0) : columns + min(x, 0)] = True
+    moved = np.roll(scene, (y, x), axis=(0, 1))
+    return psnr(sensor.to_intensity(exposure.scene.pixels), moved, kept & exposure.scene.mask)

@@ -1,0 +1,96 @@
+"""The methods on the plane: Gauss-Markov, total variation, plug and play."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.restoration import spectrum
+from aolink.restoration.markov import Solver, make_solver, plane_solver
+from aolink.restoration.method import Blurred, Restored
+from aolink.restoration.plug_and_play import Denoiser, non_local_means, plug_and_play
+from aolink.restoration.tv import total_variation
+from aolink.restoration.uncertainty import plane_variance
+
+# Noise below this share of the scene's differences (variances) is taken for as much where conjugate gradients solve:
+# their steps grow with one over its root, and the picture is no sharper for it.
+_SMALLEST_RATIO = 3e-4
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Weights:
+    """How much a picture is believed, and how rough its scene is."""
+
+    noise: float
+    """Variance of the picture's noise."""
+    unexplained: float
+    """Variance that the PSF's uncertainty adds to it."""
+    total: float
+    """Variance that the methods reckon with."""
+    difference: float
+    """lambda, one over the variance of the scene's differences."""
+
+    @classmethod
+    def of(cls, picture: Blurred) -> _Weights:
+        psf, noise = picture.psf, picture.noise_variance
+        difference = spectrum.difference_weight(picture.power_spectrum, noise)
+        modes = psf.modes.mean(axis=1) if psf.varies else psf.modes
+        unexplained = plane_variance(modes, difference)
+        total = noise + unexplained
+        if not psf.on_line or picture.seen is not None:
+            total = max(total, _SMALLEST_RATIO / difference)
+        return cls(noise=noise, unexplained=unexplained, total=total, difference=difference)
+
+    def restored(self, scene: NDArray[Any], solver: Solver) -> Restored:
+        return Restored(
+            image=scene[(slice(None), *solver.frame)], noise_sd=math.sqrt(self.noise),
+            psf_noise_sd=math.sqrt(self.unexplained), difference_weight=self.difference,
+        )  # fmt: skip
+
+
+def gauss_markov(picture: Blurred) -> Restored:
+    """Differences of the scene are Gaussian and white."""
+    weights = _Weights.of(picture)
+    solver = make_solver(picture.psf, _shape(picture), weights.difference * weights.total, picture.seen)
+    whole = picture.whole
+    return weights.restored(solver.solve(solver.project(whole), solver.guess(whole)), solver)
+
+
+def tv(picture: Blurred) -> Restored:
+    """Differences of the scene are Laplacian."""
+    weights = _Weights.of(picture)
+    return weights.restored(*_with_edges(picture, weights))
+
+
+def pnp(picture: Blurred, *, denoise: Denoiser = non_local_means) -> Restored:
+    """The scene is what a denoiser leaves as it is."""
+    weights = _Weights.of(picture)
+    start, solver = _with_edges(picture, weights)
+    scene = plug_and_play(
+        lambda kappa: plane_solver(picture.psf, _shape(picture), kappa, picture.seen, white=True),
+        picture.whole, weights.total, start, denoise,
+    )  # fmt: skip
+    return weights.restored(scene, solver)
+
+
+def why_not_pnp(picture: Blurred) -> str | None:
+    return "pnp needs one PSF for the whole picture: use tv" if picture.psf.varies else None
+
+
+def _with_edges(picture: Blurred, weights: _Weights) -> tuple[NDArray[np.float64], Solver]:
+    # Total variation does not need the last digits; half of them take half of the time.
+    level = picture.whole.mean()
+    scene, solver = total_variation(
+        lambda kappa: make_solver(picture.psf, _shape(picture), kappa, picture.seen, single=True),
+        picture.whole - level, weights.total, weights.difference,
+    )  # fmt: skip
+    return scene.astype(np.float64) + level, solver
+
+
+def _shape(picture: Blurred) -> tuple[int, int]:
+    _, rows, columns = picture.planes.shape
+    return rows, columns

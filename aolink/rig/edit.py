@@ -1,0 +1,95 @@
+"""New values in the text of a rig file; every other character, comments and layout, stays."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import InlineTable, Item, Key, Table
+
+from aolink.errors import RigError
+from aolink.rig.toml_table import did_you_mean
+
+
+def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False) -> str:
+    """Another value for a key such as ``plant.process_noise``.
+
+    Parameters
+    ----------
+    value:
+        Anything that TOML has, or a `tomlkit.value`, which keeps its digits.
+    may_be_new:
+        Whether the key may be missing. The new one stands behind the last value of its table.
+
+    Raises
+    ------
+    RigError
+        The text is not TOML, or has no such key.
+    """
+    *path, name = key.split(".")
+
+    def edit(document: tomlkit.TOMLDocument) -> None:
+        table: Any = document
+        for part in path:
+            table = _entry(table, part, key)
+        new = may_be_new and isinstance(table, Mapping) and name not in table
+        if new and (last := _last_value(table)) is not None:
+            # tomlkit would put it behind comments that belong to the next table.
+            end = "" if last.trivia.trail.endswith("\n") else "\n"
+            last.trivia.trail += f"{end}{last.trivia.indent}{name} = {tomlkit.item(value).as_string()}\n"
+            return
+        if not new:
+            _entry(table, name, key)
+        table[name] = value
+
+    return _edited(text, edit)
+
+
+def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) -> str:
+    """These values in a table at the top of the file; where there is none yet, in a new one at its end."""
+
+    def edit(document: tomlkit.TOMLDocument) -> None:
+        if name not in document:
+            table = tomlkit.table()
+            table.comment(comment)
+            document[name] = table
+        for key, value in values.items():
+            document[name][key] = value
+
+    return _edited(text, edit)
+
+
+def _edited(text: str, edit: Callable[[tomlkit.TOMLDocument], None]) -> str:
+    # What is new has the line ends that the file has.
+    crlf = "\r\n" in text and text.count("\r\n") == text.count("\n")
+    try:
+        document = tomlkit.parse(text.replace("\r\n", "\n") if crlf else text)
+        edit(document)
+        new = tomlkit.dumps(document)
+        tomllib.loads(new)
+    except (TOMLKitError, ValueError) as error:
+        raise RigError(f"not valid TOML: {error}") from None
+    return new.replace("\n", "\r\n") if crlf else new
+
+
+def _entry(table: Any, name: str, key: str) -> Any:
+    known = list(table) if isinstance(table, Mapping) else []
+    if name not in known:
+        why = did_you_mean([name], known) or f"known there: {', '.join(known) or 'none'}"
+        raise RigError(f"{key}: the rig file has no such key: {why}")
+    return table[name]
+
+
+def _last_value(table: Any) -> Item | None:
+    """The last value that stands on a line of its own below a table's header."""
+    if not isinstance(table, Table):
+        return None
+    lines: list[tuple[Key, Item]] = [
+        (key, item)
+        for key, item in table.value.body
+        if key is not None and (isinstance(item, InlineTable) or not isinstance(item, Mapping))
+    ]
+    return lines[-1][1] if lines and not lines[-1][0].is_dotted() else None

@@ -1,0 +1,71 @@
+"""The table of topics says of each message what the rest of the house relies on."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import aolink
+from aolink.recording import topics
+from aolink.recording.topics import TOPICS, Topic
+from aolink.viewing import devices
+
+HOUSE = Path(aolink.__file__).parent
+
+
+@pytest.mark.parametrize("row", TOPICS, ids=lambda row: row.name)
+def test_a_message_has_the_fields_by_which_it_belongs(row: Topic) -> None:
+    fields = set(row.message.DESCRIPTOR.fields_by_name)
+    if row.after:
+        assert topics.named(row.after).belongs_to == row.belongs_to == "exposure"
+    elif row.belongs_to != "time":
+        assert fields >= ({"frame_id"} if row.belongs_to == "exposure" else {"first_step", "n_steps"})
+
+
+def test_what_the_devices_page_shows_has_a_function_there() -> None:
+    assert {row.name for row in TOPICS if row.shown_by == "devices"} == set(devices.LOGS)
+
+
+def test_an_estimators_topic_is_found_by_its_prefix() -> None:
+    assert topics.named(topics.estimate_topic("o1")).name == topics.ESTIMATE
+    assert topics.named(topics.estimation_topic("o1")).name == topics.ESTIMATION
+    assert topics.named("/somebody/elses").name == ""
+
+
+def test_a_message_of_another_kind_belongs_to_its_time_alone() -> None:
+    other = topics.named(topics.LOG).message()
+    assert topics.find(topics.LATENCY, other).belongs_to == "time"
+    assert topics.find(topics.LATENCY, None).belongs_to == "time"
+
+
+def test_topics_are_written_in_the_table_alone() -> None:
+    """Every other module of aolink names them by the table."""
+    for path in HOUSE.rglob("*.py"):
+        if path.name.endswith("_pb2.py") or path == HOUSE / "recording" / "topics.py":
+            continue
+        found = list(ast.walk(ast.parse(path.read_text())))
+        parts = {
+            part for each in found if isinstance(each, ast.JoinedStr) for part in each.values
+        }  # of entities' paths
+        texts = {each.value for each in found if isinstance(each, ast.Constant) and each not in parts}
+        assert not texts & {row.name for row in TOPICS}, path
+
+
+def test_the_rooms_page_has_the_table() -> None:
+    def cell(text: str) -> str:
+        return f"`{text}`" if text else ""
+
+    page = (HOUSE / "recording" / "README.md").read_text()
+    found = [re.sub(r" +", " ", line) for line in page.splitlines() if line.startswith("| `")]
+    assert found == [
+        re.sub(
+            r" +",
+            " ",
+            f"| {cell(row.name)} | `{row.message.DESCRIPTOR.name}` | {row.belongs_to} | {cell(row.after)}"
+            f" | {'yes' if row.repeatable else ''} | {row.shown_by} |",
+        )
+        for row in TOPICS
+    ]
