@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import io
-import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from aolink.devices.gate import Gate
-from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig, check_kind, identify
+from aolink.devices.interfaces import Camera
+from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, DeviceError, PortError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
@@ -29,11 +27,8 @@ from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside, most_waiting
-from aolink.wire import messages_pb2 as wire
-from aolink.wire.hub import Hub
-from aolink.wire.port import SerialPort
 
-__all__ = ["EstimatorReport", "Opened", "Report", "open_devices", "record"]
+__all__ = ["EstimatorReport", "Report", "record"]
 
 Watch = Callable[[Exposure, Sequence[Estimate]], None]
 """Told each exposure with the estimates that have come since the one before."""
@@ -44,58 +39,9 @@ _ASIDE_S = 2.0
 """Real time: how long the session's end waits for who watches."""
 
 
-class Opened(NamedTuple):
-    """Both devices of a rig, identified."""
-
-    hub: Hub
-    camera: NativeCamera
-    mirror: NativeMirror
-    warnings: list[str]
-    """What is doubtful about them, in words."""
-
-
-@contextlib.contextmanager
-def open_devices(
-    rig: Rig, camera_port: str, mirror_port: str, stop: Callable[[], bool] = lambda: False
-) -> Iterator[Opened]:
-    """Open both ports, identify what is behind them, and check it against the rig file.
-
-    Raises
-    ------
-    PortError
-        A port cannot be opened.
-    DeviceError
-        No device answers, it is another one, speaks another protocol, or is not what the rig file says.
-    """
-    hub = Hub(stop)
-    try:
-        camera_link = hub.connect("camera", SerialPort(camera_port, stop=stop))
-        mirror_link = hub.connect("mirror", SerialPort(mirror_port, stop=stop))
-        asked_ns = hub.now_ns()
-        camera_identity = identify(hub, camera_link, secrets.randbits(48))
-        check_kind(camera_link, camera_identity, wire.Identity.CAMERA)
-        mirror_identity = identify(hub, mirror_link, secrets.randbits(48))
-        check_kind(mirror_link, mirror_identity, wire.Identity.MIRROR)
-        warnings = check_against_rig(rig, camera_identity, mirror_identity)
-        gate = Gate(rig, hub, (camera_identity, mirror_identity), asked_ns)
-        hub.budget_bytes += gate.exposure_bytes * (2 + rig.mirror.queue_steps // rig.timing.frame_period_steps)
-        if camera_identity.virtual_time:
-            hub.go_virtual(gate.check_virtual_time)
-        for link in hub.links:
-            link.reset_counts()
-        yield Opened(
-            hub,
-            NativeCamera(hub, camera_link, camera_identity, gate),
-            NativeMirror(hub, mirror_link, mirror_identity, gate),
-            warnings,
-        )
-    finally:
-        hub.close()
-
-
-def _true_scene(rig: Rig, camera: NativeCamera) -> dict[str, bytes]:
+def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
     """The scene at rest as an attachment, where the camera was made from this rig file: a simulated one shows it."""
-    if rig.scene is None or not rig.scene.picture or camera.identity.rig_digest != rig.digest:
+    if rig.scene is None or not rig.scene.picture or camera.rig_digest != rig.digest:
         return {}
     data = io.BytesIO()
     np.save(data, rig.scene.to_counts(framed(rig.scene, read_scene_picture(rig.scene, rig.folder))))
@@ -177,18 +123,18 @@ def record(
         rig = replace(rig, drive=rest)
     report = report or Report()
     with (
-        open_devices(rig, camera_port, mirror_port, stop) as (hub, camera, mirror, warnings),
+        open_devices(rig, camera_port, mirror_port, stop) as (clock, camera, mirror, warnings),
         contextlib.ExitStack() as aside,
     ):
-        start_ns = hub.now_ns()
+        start_ns = clock.now_ns()
         facts = {
             "session": f"{start_ns:x}",
             "aolink_version": version("aolink"),
             "rig": rig.name,
             "rig_digest": rig.digest,
-            "camera": f"{camera.identity.model} {camera.identity.serial_number} ({camera.identity.firmware})",
-            "mirror": f"{mirror.identity.model} {mirror.identity.serial_number} ({mirror.identity.firmware})",
-            "virtual_time": str(hub.virtual),
+            "camera": camera.description,
+            "mirror": mirror.description,
+            "virtual_time": str(clock.virtual),
             "estimators": " ".join(estimators),
             "note": note,
         }
@@ -196,22 +142,22 @@ def record(
             facts[topics.CALIBRATION] = calibration
         attachments = _true_scene(rig, camera)
         writer = RecordingWriter(
-            path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, attachments=attachments,
+            path, rig, facts, start_ns, overwrite=overwrite, deterministic=clock.virtual, attachments=attachments,
             options=options,
         )  # fmt: skip
         report.warnings += warnings
         show, beside = _shown(rig, watch), None
-        if not hub.virtual:
+        if not clock.virtual:
             progress = aside.enter_context(_told_aside(progress, report))
             show = aside.enter_context(_shown_aside(show, rig, report)) if show else None
             beside = aside.enter_context(BesideTheLoop(rig, estimators))
-            hub.beside = beside.processes
-        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, show, beside, report)
+            clock.beside = beside.processes
+        loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, show, beside, report)
         try:
             loop.run(exposures, stop, progress)
         except BaseException as error:
             report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
-            hub.hurry()
+            clock.hurry()
             try:
                 loop.make_safe()
             except AolinkError as unsafe:

@@ -28,12 +28,13 @@ from typer.testing import CliRunner
 from aolink.cli import app
 from aolink.devices.interfaces import CommandAnswered
 from aolink.devices.native import NativeCamera
+from aolink.devices.opening import open_devices
 from aolink.errors import DeviceError, PortError, RecordingError
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
-from aolink.session import open_devices, record
+from aolink.session import record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet, schema_hash
 from aolink.wire.port import SerialPort, wait_readable

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from aolink.devices.opening import open_devices
 from aolink.estimation import Driver
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
-from aolink.session import open_devices
 from aolink.session.loop import SessionLoop, lead_steps
 from aolink.wire import messages_pb2 as pb
 

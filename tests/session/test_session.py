@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import aolink
+from aolink.devices.opening import open_devices
 from aolink.estimation import Driver, run, score
 from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
@@ -28,7 +29,7 @@ from aolink.recording.reestimate import (
     write_reestimated,
 )
 from aolink.rig import load_rig, parse_rig
-from aolink.session import Report, open_devices, record
+from aolink.session import Report, record
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
 
 
