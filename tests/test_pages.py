@@ -13,6 +13,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from PIL import Image
 from aolink.cli.common import app
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
-from aolink.rig import load_rig
+from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 
 ROOT = Path(__file__).parents[1]
@@ -97,6 +98,7 @@ NO_CODE = {
 """How indented blocks begin that are no commands, and what holds them."""
 SHELL = [block for block in BLOCKS if not block.language and not block.text.startswith(tuple(NO_CODE))]
 PYTHON = [block for block in BLOCKS if block.language == "python"]
+TOML = [block for block in BLOCKS if block.language == "toml"]
 
 
 def commands(block: CodeBlock) -> Iterator[str]:
@@ -185,8 +187,19 @@ def test_a_block_of_python_works(block: CodeBlock, laboratory: Path, tmp_path: P
         assert len(list(Recording(made))) > 0
 
 
+@pytest.mark.parametrize("block", TOML, ids=str)
+def test_a_block_of_toml_is_part_of_a_rig_file_or_of_the_example_package(block: CodeBlock, laboratory: Path) -> None:
+    tables = tomllib.loads(block.text)
+    if "project" in tables:
+        example = tomllib.loads((ROOT / "tests" / "example_package" / "pyproject.toml").read_text())["project"]
+        for group, points in tables["project"]["entry-points"].items():
+            assert example["entry-points"][group] == points
+    else:
+        parse_rig(f"{(laboratory / 'my.toml').read_text()}\n{block.text}")
+
+
 def test_every_block_is_of_a_kind_that_is_tried() -> None:
-    assert {block.language for block in BLOCKS} == {"", "python"}
+    assert {block.language for block in BLOCKS} == {"", "python", "toml"}
     assert SHELL
     assert PYTHON
     for start in NO_CODE:

@@ -151,8 +151,9 @@ def devices(
     ports: Annotated[list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to ask who is there.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the serial ports of this machine, or identify what is behind the given ones."""
+    """List the serial ports and the drivers of this machine, or identify what is behind the given ports."""
     from aolink.devices.discovery import Found, identify_port, list_ports
+    from aolink.devices.drivers import driver_names
 
     if not ports:
         listed = list_ports()
@@ -162,6 +163,9 @@ def devices(
             stdout.print(f"{name}  {escape(text)}")
         if not listed and not as_json:
             stdout.print("no serial ports on this machine; `aolink rig section-vi` makes a simulated pair")
+        if not as_json:
+            stdout.print(f"camera drivers: {', '.join(driver_names('camera'))}")
+            stdout.print(f"mirror drivers: {', '.join(driver_names('mirror'))}")
         return
     found: list[Found] = []
     failed: AolinkError | None = None
@@ -185,12 +189,16 @@ def devices(
     " --estimator o3 --exposures 100 -o session.mcap"
 )
 def record(
-    camera: Annotated[
-        str, typer.Option(metavar="PORT", help="Port of the camera: a device path or socket://host:port.")
-    ],
-    mirror: Annotated[str, typer.Option(metavar="PORT", help="Port of the mirror driver.")],
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What the devices are: a rig file or the name of one.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PORT",
+            help="Port of the camera: a device path or socket://host:port. Else as [devices] in the rig file says.",
+        ),
+    ] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror driver, likewise.")] = None,
     estimator: EstimatorOption = None,
     exposures: Annotated[int | None, typer.Option(min=1, max=MOST_EXPOSURES, help="How many exposures.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="How long, in seconds of device time.")] = None,

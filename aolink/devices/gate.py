@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.errors import DeviceError
-from aolink.rig import Rig
+from aolink.rig import MirrorDriver, Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
@@ -53,6 +53,13 @@ def lie(device: str, field: str, found: object, expected: str) -> DeviceError:
 def printable(text: str) -> str:
     """A device's own words, as they may go into a log or onto a terminal."""
     return "".join(each if each.isprintable() else " " for each in text[:_LONGEST_TEXT])
+
+
+def converter_margin(mirror: MirrorDriver) -> NDArray[np.float64]:
+    """How far what a mirror held may be from what it was sent, (n_inputs,): a step of its converter."""
+    low, high = mirror.voltage.input_range if mirror.voltage else (mirror.input_min, mirror.input_max)
+    converter = (np.asarray(high) - low) / ((1 << mirror.dac_bits) - 1) if mirror.dac_bits else 0.0
+    return converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
 
 
 def check_command(
@@ -95,9 +102,7 @@ class Gate:
         self._last_block = 0
         self._sent_end = self._first_step
         mirror = rig.mirror
-        low, high = mirror.voltage.input_range if mirror.voltage else (mirror.input_min, mirror.input_max)
-        converter = (np.asarray(high) - low) / ((1 << mirror.dac_bits) - 1) if mirror.dac_bits else 0.0
-        margin = converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
+        margin = converter_margin(mirror)
         self._input_min, self._input_max = mirror.input_min - margin, mirror.input_max + margin
         planes = [(rig.sensor.shape, rig.sensor.bit_depth)]
         if rig.scene is not None:

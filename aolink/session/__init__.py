@@ -58,8 +58,8 @@ def _saved(report: Report, paths: Sequence[Path]) -> str:
 
 def record(
     rig: Rig,
-    camera_port: str,
-    mirror_port: str,
+    camera_port: str | None,
+    mirror_port: str | None,
     path: str | Path,
     *,
     estimators: Sequence[str] = (),
@@ -85,7 +85,8 @@ def record(
     rig:
         What the devices are; checked against what they say of themselves.
     camera_port, mirror_port:
-        Anything that pyserial opens: a device path, or an address such as socket://host:port.
+        Anything that pyserial opens: a device path, or an address such as socket://host:port. Where None, the rig
+        file's table ``[devices]`` says what drives the device.
     path:
         The recording; must not exist unless ``overwrite``.
     estimators:
