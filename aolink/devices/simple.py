@@ -156,10 +156,12 @@ class AdaptedCamera(_Adapted):
         return True
 
     def stop(self) -> None:
-        self._events += self.poll()
-        self._running = False
-        with calling(self.name, "when it was told to stop"):
-            self._driver.stop()
+        try:
+            self._events += self.poll()
+        finally:
+            self._running = False
+            with calling(self.name, "when it was told to stop"):
+                self._driver.stop()
 
     def flush(self) -> list[Frame]:
         return []

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from aolink import estimate as estimate_exposures
+from aolink.errors import DeviceError
 from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
+from aolink.session import Report, record
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 ROOT = Path(__file__).parents[2]
@@ -98,6 +100,47 @@ def test_a_camera_of_another_package_beside_a_native_mirror(
         refused = aolink("record", "--camera", camera, *arguments, "--overwrite", env=installed)
         assert refused.returncode == 4
         assert "a native camera counts fast steps together with its own mirror" in refused.stderr
+
+
+FAILING = """
+from aolink_example.devices import Camera as Example
+
+calls = []
+
+
+class Camera(Example):
+    def frames(self):
+        yield from super().frames()
+        if len(calls) > 100:
+            raise OSError("the camera was pulled out")
+        calls.append("frames")
+
+    def stop(self):
+        calls.append("stop")
+
+    def close(self):
+        calls.append("close")
+"""
+
+
+def test_a_driver_that_fails_ends_the_session_in_good_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mirror is parked, the camera stopped, both are closed, and the recording is whole."""
+    (tmp_path / "failing.py").write_text(FAILING)
+    points = "[aolink.cameras]\nfailing = failing:Camera\n[aolink.mirrors]\nexample = aolink_example.devices:Mirror\n"
+    info = tmp_path / "failing-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: failing\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(points)
+    monkeypatch.syspath_prepend(EXAMPLE)
+    monkeypatch.syspath_prepend(tmp_path)
+    rig = load_rig(rig_file(tmp_path, 'driver = "failing"'))
+    what = r"the driver of the camera failed when it was asked for its frames: OSError\('the camera was pulled out'\)"
+    with pytest.raises(DeviceError, match=what):
+        record(rig, None, None, tmp_path / "a.mcap", report=(report := Report()))
+    assert sys.modules["failing"].calls[-2:] == ["stop", "close"]
+    assert Recording(tmp_path / "a.mcap").complete
+    ended = report.steps_applied + report.steps_superseded + report.steps_late + report.steps_not_reported
+    assert ended == report.steps_commanded > 0
 
 
 @pytest.mark.parametrize(
