@@ -324,8 +324,10 @@ def replay(
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     get_ready(recording.rig, names)
     if to_rig:
-        if not (camera and mirror and output):
-            raise typer.BadParameter("--to-rig needs --camera PORT, --mirror PORT and -o FILE")
+        if not (output and _are_driven(recording.rig, camera, mirror)):
+            raise typer.BadParameter(
+                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
+            )
         _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
         return
     if camera or mirror or output:
@@ -360,11 +362,16 @@ def replay(
     check_measured(file, scores)
 
 
+def _are_driven(rig: Rig, camera: str | None, mirror: str | None) -> bool:
+    """Whether a port or the rig file says what drives each of the devices."""
+    return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
+
+
 def _replay_to_rig(
     recording: Recording,
     names: list[str],
-    camera: str,
-    mirror: str,
+    camera: str | None,
+    mirror: str | None,
     output: Path,
     *,
     overwrite: bool,
@@ -413,7 +420,7 @@ def calibrate(
 ) -> None:
     """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
 
-    From recordings of dark, flat and still light; or with --camera and --mirror, asking for each in turn.
+    From recordings of dark, flat and still light; or from the devices, asking for each in turn.
     """
     from shutil import rmtree
     from tempfile import mkdtemp
@@ -423,12 +430,12 @@ def calibrate(
     from aolink.rig import load_rig
 
     loaded = load_rig(rig)
-    if bool(files) == bool(camera) or bool(camera) != bool(mirror):
-        raise typer.BadParameter("give recordings, or --camera and --mirror")
+    if (files and (camera or mirror)) or not (files or _are_driven(loaded, camera, mirror)):
+        raise typer.BadParameter("give recordings, or --camera and --mirror, or [devices] in the rig file")
     check_target(output, overwrite=overwrite, sources=files or [])
     folder = keep or Path(mkdtemp(prefix="aolink-"))
     try:
-        if camera and mirror:
+        if not files:
             files = calibrate.record_frames(
                 loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),

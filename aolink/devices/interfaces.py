@@ -74,7 +74,7 @@ class Camera(Device, Protocol):
     """Takes frames, each integrated over a run of fast steps."""
 
     rig_digest: str
-    """Of the rig file that a simulated one was made from; empty otherwise."""
+    """Digest of the rig file that a simulated camera was made from; empty for others."""
 
     def start(self, first_step: int, exposures: int) -> bool:
         """Take ``exposures`` frames (0: until stopped), the first from ``first_step``; False if that has gone by.

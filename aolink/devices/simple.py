@@ -143,7 +143,7 @@ class AdaptedCamera(_Adapted):
         self._step_ns = rig.timing.fast_step_ns
         self._running = False
         self._last: tuple[int, int] | None = None
-        """Of the frame before: its id, and its start on the camera's clock."""
+        """The id of the frame before, and its start on the camera's clock."""
 
     def start(self, first_step: int, exposures: int) -> bool:
         now_ns = self._now_ns()

@@ -90,8 +90,8 @@ def read_frames(path: Path, rig: Rig) -> Frames:
 
 def record_frames(
     rig: Rig,
-    camera: str,
-    mirror: str,
+    camera: str | None,
+    mirror: str | None,
     folder: Path,
     *,
     frames: int,

@@ -31,12 +31,12 @@ from aolink.session.waiting import Aside, most_waiting
 __all__ = ["EstimatorReport", "Report", "record"]
 
 Watch = Callable[[Exposure, Sequence[Estimate]], None]
-"""Told each exposure with the estimates that have come since the one before."""
+"""Called with each exposure and the estimates that have come since the exposure before it."""
 
 _PROGRESS_S = 0.1
-"""Real time: how often the progress is told."""
+"""In real time: how often the progress is reported."""
 _ASIDE_S = 2.0
-"""Real time: how long the session's end waits for who watches."""
+"""In real time: how long the end of a session waits for the function that watches it."""
 
 
 def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
@@ -100,21 +100,21 @@ def record(
         What to command, instead of the rig's drive. It is called by the loop: the mirror gets its next commands when it
         returns.
     watch:
-        Told each exposure with its estimates. An estimate that is not there when the next exposure is comes with that
-        one or a later one. In real time it is called on a thread of its own and may take its time: exposures that
-        come meanwhile are left out and counted, and what it raises becomes a warning.
+        Called with each exposure and its estimates. An estimate that is not there when the next exposure comes is given
+        with that one or a later one. In real time it is called on a thread of its own and may take its time:
+        exposures that come meanwhile are left out and counted, and what it raises becomes a warning.
     options:
         How the recording is cut into chunks and files.
     stop, progress:
-        Asked, and told the number of exposures so far, at least ten times a second; the latter in real time on a
-        thread of its own.
+        Called at least ten times a second: ``stop()`` says whether the session is to end, ``progress(exposures)`` is
+        given the number of exposures so far. In real time the latter is called on a thread of its own.
     report:
         What is filled in while the session goes on, and given back in the end; a new one if None.
 
     Raises
     ------
     AolinkError
-        Of the kind that says what went wrong. The mirror is parked if it can be reached, and the
+        Its class says what kind of thing went wrong. The mirror is parked if it can be reached, and the
         recording is closed with what there is.
     """
     estimators = list(dict.fromkeys(estimators))

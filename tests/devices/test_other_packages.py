@@ -70,6 +70,9 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     for exposure, estimate in zip(exposures, estimate_exposures(tmp_path / "a.mcap", "o1"), strict=True):
         assert exposure.truth is not None
         assert np.abs(estimate.path - exposure.truth.path).max() < 0.02  # its frames have no noise
+    again = aolink("replay", "a.mcap", "--to-rig", "-o", "b.mcap", env=installed)  # the recording has the rig file
+    assert again.returncode == 0, again.stderr
+    assert "b.mcap: 6 exposures, complete" in again.stdout
     info = aolink("info", "a.mcap")
     assert (info.returncode, "example mirror" in info.stdout) == (0, True)
 
