@@ -55,7 +55,7 @@ class FrameReassembly:
     def __init__(self, shape: tuple[int, int], fast_step_ns: int) -> None:
         self._shape, self._fast_step_ns = shape, fast_step_ns
         self._first: pb.FrameChunk | None = None
-        """Of the frame that is in progress; it stands for what all of its chunks say."""
+        """First chunk of the frame that is in progress; it stands for what all of its chunks say."""
         self._data = np.zeros(0, np.uint8)
         self._arrived = np.zeros(0, bool)
         self._largest = 0
@@ -281,7 +281,7 @@ def _after(end: int, blocks: _Blocks) -> _Blocks:
 
 
 _MOST_LEAD_STEPS = 100_000
-"""A longer gap between exposures is not followed input by input; the estimators are told by its missing inputs."""
+"""A longer gap between exposures is not followed input by input; the inputs that are missing show it."""
 
 _MOST_BLOCKS = 100_000
 """Runs of steps that wait for their frame; more than one for each step is not to be expected."""

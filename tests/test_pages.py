@@ -188,13 +188,16 @@ def test_a_block_of_python_works(block: CodeBlock, laboratory: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("block", TOML, ids=str)
-def test_a_block_of_toml_is_a_rig_or_stands_in_the_example_package(block: CodeBlock) -> None:
-    if "[project.entry-points" not in block.text:
-        parse_rig(block.text)
-        return
-    package = tomllib.loads((ROOT / "tests" / "example_package" / "pyproject.toml").read_text())
-    for group, named in tomllib.loads(block.text)["project"]["entry-points"].items():
-        assert named.items() <= package["project"]["entry-points"][group].items()
+def test_a_block_of_toml_is_of_a_rig_file_or_of_the_example_package(block: CodeBlock, laboratory: Path) -> None:
+    """A rig file that is whole stands alone; tables of one are added to the laboratory's."""
+    tables = tomllib.loads(block.text)
+    if "project" in tables:
+        example = tomllib.loads((ROOT / "tests" / "example_package" / "pyproject.toml").read_text())["project"]
+        for group, points in tables["project"]["entry-points"].items():
+            assert points.items() <= example["entry-points"][group].items()
+    else:
+        before = "" if "plant" in tables else (laboratory / "my.toml").read_text()
+        parse_rig(f"{before}\n{block.text}")
 
 
 def test_every_block_is_of_a_kind_that_is_tried() -> None:

@@ -151,8 +151,9 @@ def devices(
     ports: Annotated[list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to ask who is there.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the serial ports of this machine, or identify what is behind the given ones."""
+    """List the serial ports and the drivers of this machine, or identify what is behind the given ports."""
     from aolink.devices.discovery import Found, identify_port, list_ports
+    from aolink.devices.drivers import driver_names
 
     if not ports:
         listed = list_ports()
@@ -162,6 +163,9 @@ def devices(
             stdout.print(f"{name}  {escape(text)}")
         if not listed and not as_json:
             stdout.print("no serial ports on this machine; `aolink rig section-vi` makes a simulated pair")
+        if not as_json:
+            stdout.print(f"camera drivers: {', '.join(driver_names('camera'))}")
+            stdout.print(f"mirror drivers: {', '.join(driver_names('mirror'))}")
         return
     found: list[Found] = []
     failed: AolinkError | None = None
@@ -185,12 +189,16 @@ def devices(
     " --estimator o3 --exposures 100 -o session.mcap"
 )
 def record(
-    camera: Annotated[
-        str, typer.Option(metavar="PORT", help="Port of the camera: a device path or socket://host:port.")
-    ],
-    mirror: Annotated[str, typer.Option(metavar="PORT", help="Port of the mirror driver.")],
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What the devices are: a rig file or the name of one.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PORT",
+            help="Port of the camera: a device path or socket://host:port. Else as [devices] in the rig file says.",
+        ),
+    ] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror driver, likewise.")] = None,
     estimator: EstimatorOption = None,
     exposures: Annotated[int | None, typer.Option(min=1, max=MOST_EXPOSURES, help="How many exposures.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="How long, in seconds of device time.")] = None,
@@ -316,8 +324,10 @@ def replay(
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
     get_ready(recording.rig, names)
     if to_rig:
-        if not (camera and mirror and output):
-            raise typer.BadParameter("--to-rig needs --camera PORT, --mirror PORT and -o FILE")
+        if not (output and _are_driven(recording.rig, camera, mirror)):
+            raise typer.BadParameter(
+                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
+            )
         _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
         return
     if camera or mirror or output:
@@ -352,11 +362,16 @@ def replay(
     check_measured(file, scores)
 
 
+def _are_driven(rig: Rig, camera: str | None, mirror: str | None) -> bool:
+    """Whether a port or the rig file says what drives each of the devices."""
+    return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
+
+
 def _replay_to_rig(
     recording: Recording,
     names: list[str],
-    camera: str,
-    mirror: str,
+    camera: str | None,
+    mirror: str | None,
     output: Path,
     *,
     overwrite: bool,
@@ -406,7 +421,7 @@ def calibrate(
 ) -> None:
     """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
 
-    From recordings of dark, flat and still light; or with --camera and --mirror, asking for each in turn.
+    From recordings of dark, flat and still light; or from the devices, asking for each in turn.
     """
     from shutil import rmtree
     from tempfile import mkdtemp
@@ -416,12 +431,12 @@ def calibrate(
     from aolink.rig import load_rig
 
     loaded = load_rig(rig)
-    if bool(files) == bool(camera) or bool(camera) != bool(mirror):
-        raise typer.BadParameter("give recordings, or --camera and --mirror")
+    if (files and (camera or mirror)) or not (files or _are_driven(loaded, camera, mirror)):
+        raise typer.BadParameter("give recordings, or --camera and --mirror, or [devices] in the rig file")
     check_target(output, overwrite=overwrite, sources=files or [])
     folder = keep or Path(mkdtemp(prefix="aolink-"))
     try:
-        if camera and mirror:
+        if not files:
             files = calibrate.record_frames(
                 loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from serial.tools import list_ports as serial_ports
 
-from aolink.devices.native import identify
+from aolink.devices.identity import identify
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.port import SerialPort

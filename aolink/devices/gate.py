@@ -14,10 +14,11 @@ from collections.abc import Iterable
 
 import numpy as np
 from google.protobuf.message import Message
+from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.errors import DeviceError
-from aolink.rig import Rig
+from aolink.rig import MirrorDriver, Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
@@ -32,7 +33,6 @@ _SLACK_S = 1.0
 """How far a device may be ahead of what its crystal explains."""
 _DELAY_S = 0.01
 """On virtual time, how long a packet may take beyond four times the rig file's latency."""
-_LONGEST_NAME = 200
 _LONGEST_TEXT = 1000
 _REMEMBERED_BLOCKS = 65_536
 _KINDS: dict[str, tuple[type[Message], ...]] = {
@@ -50,29 +50,31 @@ def lie(device: str, field: str, found: object, expected: str) -> DeviceError:
     )
 
 
-def check_identity(link: Link, identity: pb.Identity) -> None:
-    """Refuse an Identity whose numbers or names cannot be. Raises DeviceError naming the field."""
-    if identity.kind not in (pb.Identity.CAMERA, pb.Identity.MIRROR):
-        raise lie(link.name, "Identity.kind", identity.kind, "1 (camera) or 2 (mirror)")
-    for name in ("model", "serial_number", "firmware", "rig_digest"):
-        text = getattr(identity, name)
-        if len(text) > _LONGEST_NAME or not text.isprintable():
-            raise lie(
-                link.name,
-                f"Identity.{name}",
-                repr(text[:40]),
-                f"at most {_LONGEST_NAME} characters that can be printed",
-            )
-    if not 0 < identity.fast_step_ns <= 10**10:
-        raise lie(link.name, "Identity.fast_step_ns", identity.fast_step_ns, "1 to 10^10")
-    if identity.next_step > MOST_STEP:
-        raise lie(link.name, "Identity.next_step", identity.next_step, "at most 2^53")
-    _check_times(link.name, identity, ("step_zero_ns",))
-
-
 def printable(text: str) -> str:
     """A device's own words, as they may go into a log or onto a terminal."""
     return "".join(each if each.isprintable() else " " for each in text[:_LONGEST_TEXT])
+
+
+def converter_margin(mirror: MirrorDriver) -> NDArray[np.float64]:
+    """How far what a mirror held may be from what it was sent, (n_inputs,): a step of its converter."""
+    low, high = mirror.voltage.input_range if mirror.voltage else (mirror.input_min, mirror.input_max)
+    converter = (np.asarray(high) - low) / ((1 << mirror.dac_bits) - 1) if mirror.dac_bits else 0.0
+    return converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
+
+
+def check_command(
+    first_step: int, u: NDArray[np.float64], input_min: NDArray[np.float64], input_max: NDArray[np.float64]
+) -> None:
+    """Refuse inputs of the wrong shape or beyond the limits before they are sent. Raises DeviceError."""
+    if u.ndim != 2 or u.shape[1] != len(input_min):
+        raise DeviceError(f"a command of shape {u.shape} for a mirror of {len(input_min)} inputs: give (steps, inputs)")
+    inside = (u >= input_min) & (u <= input_max)
+    if not inside.all():  # NaN fails as well
+        step, channel = np.argwhere(~inside)[0]
+        raise DeviceError(
+            f"input {channel} at fast step {first_step + step} is {u[step, channel]:g}, beyond the mirror's limits"
+            f" {input_min[channel]:g} .. {input_max[channel]:g}: it was not sent"
+        )
 
 
 class Gate:
@@ -100,9 +102,7 @@ class Gate:
         self._last_block = 0
         self._sent_end = self._first_step
         mirror = rig.mirror
-        low, high = mirror.voltage.input_range if mirror.voltage else (mirror.input_min, mirror.input_max)
-        converter = (np.asarray(high) - low) / ((1 << mirror.dac_bits) - 1) if mirror.dac_bits else 0.0
-        margin = converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
+        margin = converter_margin(mirror)
         self._input_min, self._input_max = mirror.input_min - margin, mirror.input_max + margin
         planes = [(rig.sensor.shape, rig.sensor.bit_depth)]
         if rig.scene is not None:
@@ -142,7 +142,7 @@ class Gate:
         elif isinstance(message, pb.TruthChunk):
             self._check_truth_chunk(device, message)
         elif isinstance(message, pb.ClockReply):
-            _check_times(device, message, ("device_receive_ns", "device_send_ns"))
+            check_times(device, message, ("device_receive_ns", "device_send_ns"))
         elif isinstance(message, pb.Ack):
             latest = max(self._sent_end, self._end(receive_ns))
             if message.step > latest:
@@ -240,7 +240,7 @@ class Gate:
             raise lie(device, "FrameChunk.last_step", chunk.last_step, what)
         if chunk.exposure_offset_ns >= self._step_ns:
             raise lie(device, "FrameChunk.exposure_offset_ns", chunk.exposure_offset_ns, f"below {self._step_ns}")
-        _check_times(device, chunk, ("exposure_start_ns", "exposure_end_ns"))
+        check_times(device, chunk, ("exposure_start_ns", "exposure_end_ns"))
         if self._frame_id >= 0:
             self._check_order(device, chunk.frame_id, first)
         elif chunk.frame_id > MOST_STEP:
@@ -302,7 +302,7 @@ class Gate:
                 u[step, channel],
                 limits,
             )
-        _check_times(device, applied, ("device_ns",))
+        check_times(device, applied, ("device_ns",))
         return True
 
     def _check_command_ack(self, device: str, ack: pb.CommandAck, receive_ns: int) -> None:
@@ -329,7 +329,7 @@ class Gate:
             raise lie(device, "TruthChunk.data", f"{len(chunk.data)} bytes", what)
 
 
-def _check_times(device: str, message: Message, names: Iterable[str]) -> None:
+def check_times(device: str, message: Message, names: Iterable[str]) -> None:
     for name in names:
         if abs(time_ns := getattr(message, name)) > MOST_TIME_NS:
             field = f"{type(message).__name__}.{name}"

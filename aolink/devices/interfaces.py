@@ -1,21 +1,21 @@
-"""What a session asks of a camera and of a mirror, whatever protocol they speak.
+"""What a session asks of a camera, of a mirror and of the time, whoever made them and whatever they speak.
 
-Devices never wait: the session hands them what came over their line (`handle`) and they say what it
-means, as events.
+Devices never wait: a session takes what has come since it last asked as events, and says itself when it asks again.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame
+from aolink.devices.clock import ClockExchange, ClockRegression, ClockStep
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.clock import ClockExchange, ClockRegression, ClockStep, StepClock
-from aolink.wire.link import Link, Received
+from aolink.wire.port import Served
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,13 @@ class ClockSampled:
     step: ClockStep | None = None
     """The step of the device's clock that is certain with this answer."""
 
+    @classmethod
+    def add(cls, clock: ClockRegression, exchange: ClockExchange, *, usable: bool = True) -> ClockSampled:
+        """Give an exchange to a regression, unless it is not ``usable``."""
+        before = clock.step
+        accepted = usable and clock.add(exchange)
+        return cls(exchange, accepted, clock.step if clock.step is not before else None)
+
 
 @dataclass(frozen=True, slots=True)
 class CommandAnswered:
@@ -37,27 +44,37 @@ class CommandAnswered:
 
 
 Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswered
-"""What a device may report."""
+"""What a device may report. Texts in it can be printed."""
 
 
 class Device(Protocol):
     """What camera and mirror have in common."""
 
-    link: Link
-    identity: pb.Identity
+    name: str
+    """``camera`` or ``mirror``."""
+    description: str
+    """What it is, for the recording: model, serial number, firmware."""
     clock: ClockRegression
-    steps: StepClock
-    """The same clock beside the device's count of fast steps: for times of what carries both."""
-
-    def handle(self, received: Received) -> list[Event]:
-        """What a message from the device means."""
 
     def query_clock(self, now_ns: int) -> None:
-        """Ask the device for its time."""
+        """Ask the device for its time; the answer is an event."""
+
+    def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:
+        """Host time of a stamp that came by ``now_ns``, and its standard deviation, ns.
+
+        ``since_zero_ns`` is how long after the beginning of fast step 0 it was made, by the count of fast steps: where
+        the device counts them, a clock that was set shows by it.
+        """
+
+    def statistics(self) -> dict[str, Any]:
+        """Counts since the session began, by the names of ``LinkStatistics``; none for a device without a line."""
 
 
 class Camera(Device, Protocol):
     """Takes frames, each integrated over a run of fast steps."""
+
+    rig_digest: str
+    """Digest of the rig file that a simulated camera was made from; empty for others."""
 
     def start(self, first_step: int, exposures: int) -> bool:
         """Take ``exposures`` frames (0: until stopped), the first from ``first_step``; False if that has gone by.
@@ -70,16 +87,16 @@ class Camera(Device, Protocol):
 
     @property
     def chunks_refused(self) -> int:
-        """Chunks that made no sense."""
+        """Pieces of frames that made no sense."""
 
     def flush(self) -> list[Frame]:
         """The frames that are still incomplete, as they are."""
 
 
 class Mirror(Device, Protocol):
-    """Applies inputs at fast steps.
+    """Applies inputs at fast steps, which it counts.
 
-    Its `handle` gives what the mirror held as `Applied`, each fast step exactly once from the first command on: as a
+    Its events say what the mirror held as `Applied`, each fast step exactly once from the first command on: as a
     report, or as ``NOT_REPORTED`` where none is to be had. ``AWAITED`` comes before either where it is asked for again.
     """
 
@@ -87,20 +104,20 @@ class Mirror(Device, Protocol):
     def in_flight(self) -> int:
         """Blocks sent and not yet answered."""
 
-    @property
-    def reports_asked(self) -> int:
-        """How often missing reports were asked for again."""
-
-    retransmits: int
-    """Blocks sent again."""
-    queue_end_step: int
-    """First fast step that nothing is queued for on the device, as last heard."""
-    round_trip_s: float
-    """Of commands, smoothed; NaN before the first."""
     latched: bool
     """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
     outage_s: float
     """For how long the mirror had taken no command when it said that it is latched, s; 0 at the start of a session."""
+
+    @property
+    def last_sent_ns(self) -> int:
+        """Host time at which it was sent something last: its watchdog runs from then."""
+
+    def since_zero_ns(self, host_ns: int) -> int:
+        """How long after the beginning of its fast step 0 a host time is, on its own clock, ns."""
+
+    def start_step(self, now_ns: int) -> int:
+        """The fast step that it is in, or on virtual time waits at. Raises DeviceError where it cannot be there."""
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         """Send inputs (n_steps, n_inputs) for the fast steps from ``first_step``; gives the block as sent.
@@ -118,10 +135,7 @@ class Mirror(Device, Protocol):
         """
 
     def await_reports(self, end_step: int, now_ns: int) -> list[Event]:
-        """Ask for all reports before ``end_step`` that have not come, as `handle` does where it sees a gap."""
-
-    def check_step(self, step: int, now_ns: int) -> None:
-        """Refuse a fast step that the mirror cannot be in at a host time. Raises DeviceError."""
+        """Wait for all reports before ``end_step`` that have not come, up to the time-outs that follow."""
 
     def park(self) -> int:
         """Put the mirror into its safe state and empty its queue; gives the first fast step that this holds for.
@@ -131,3 +145,45 @@ class Mirror(Device, Protocol):
 
     def rearm(self) -> int:
         """End the latch of the watchdog; gives the first fast step that had not gone by. Otherwise as `park`."""
+
+
+class Happened(NamedTuple):
+    """What a device said at one time."""
+
+    device: Device
+    events: Sequence[Event]
+    receive_ns: int
+    """Host clock."""
+
+
+class Time(Protocol):
+    """The time that a session goes by: the host's clock, or, on virtual time, what a simulated rig hands down."""
+
+    virtual: bool
+    beside: Sequence[Served]
+    """Whom `events` serves as well while it waits in real time."""
+
+    def now_ns(self) -> int:
+        """Host time, ns since 1970."""
+
+    def events(self, timeout_s: float) -> Iterator[Happened]:
+        """What the devices say, in order; in real time, waited for up to ``timeout_s``.
+
+        A device looks at what came next only when what came before has been taken. Raises PortError and DeviceError.
+        """
+
+    def elapse_until(self, host_ns: int) -> None:
+        """On virtual time, let a time-out pass in which nothing can come."""
+
+    def hurry(self) -> None:
+        """Wait from now on as if a stop had been asked for: the session ends with an error."""
+
+
+class Opened(NamedTuple):
+    """Both devices of a rig, identified, and the time that they keep."""
+
+    time: Time
+    camera: Camera
+    mirror: Mirror
+    warnings: list[str]
+    """What is doubtful about them, in words."""

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import count
+from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
-from aolink.devices.gate import Gate, check_identity, lie, printable
+from aolink.devices.clock import ClockExchange, ClockRegression, StepClock
+from aolink.devices.gate import Gate, check_command, lie, printable
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
-from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.clock import ClockExchange, ClockRegression, StepClock
 from aolink.wire.hub import ANSWER_S, TRIES, Hub
 from aolink.wire.link import Link, Received
-from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
 
 _FIRST_TIMEOUT_S = 0.1
 _MIN_TIMEOUT_S = 0.01
@@ -44,12 +43,20 @@ class _NativeDevice:
 
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
         self.link, self.identity = link, identity
+        self.name = link.name
+        self.description = f"{identity.model} {identity.serial_number} ({identity.firmware})"
         self._gate = gate
         self.clock = ClockRegression()
         self.steps = StepClock(self.clock, identity.step_zero_ns, identity.fast_step_ns)
         self._hub = hub
         self._query_ids = count(1)
         self._queries: dict[int, int] = {}
+
+    def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:
+        return self.steps.host_ns(device_ns, since_zero_ns, now_ns)
+
+    def statistics(self) -> dict[str, Any]:
+        return asdict(self.link.counts)
 
     def query_clock(self, now_ns: int) -> None:
         query_id = next(self._query_ids)
@@ -63,9 +70,12 @@ class _NativeDevice:
         if sent_ns is None or sent_ns != reply.host_send_ns:
             return []
         exchange = ClockExchange(sent_ns, reply.device_receive_ns, reply.device_send_ns, receive_ns)
-        before = self.clock.step
-        accepted = usable and self.clock.add(exchange)
-        return [ClockSampled(exchange, accepted, self.clock.step if self.clock.step is not before else None)]
+        return [ClockSampled.add(self.clock, exchange, usable=usable)]
+
+    @staticmethod
+    def _say(event: pb.Event) -> list[Event]:
+        event.text = printable(event.text)
+        return [event]
 
     def _request(
         self,
@@ -92,6 +102,7 @@ class NativeCamera(_NativeDevice):
 
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
         super().__init__(hub, link, identity, gate)
+        self.rig_digest = identity.rig_digest
         geometry = identity.camera
         shapes = [(geometry.height, geometry.width)]
         if geometry.scene_width:
@@ -134,7 +145,7 @@ class NativeCamera(_NativeDevice):
             return [truth]
         if isinstance(message, pb.ClockReply):
             return self._sample_clock(message, received.receive_ns)
-        return [message] if isinstance(message, pb.Event) else []
+        return self._say(message) if isinstance(message, pb.Event) else []
 
 
 @dataclass(slots=True)
@@ -185,9 +196,28 @@ class NativeMirror(_NativeDevice):
         self.round_trip_s = math.nan
         self._deviation_s = math.nan
 
+    def statistics(self) -> dict[str, Any]:
+        return super().statistics() | {
+            "retransmits": self.retransmits,
+            "reports_asked": self._reports.asked,
+            "commands_in_flight": self.in_flight,
+            "round_trip_s": self.round_trip_s,
+            "queue_end_step": self.queue_end_step,
+        }
+
     @property
-    def reports_asked(self) -> int:
-        return self._reports.asked
+    def last_sent_ns(self) -> int:
+        return self.link.last_sent_ns
+
+    def since_zero_ns(self, host_ns: int) -> int:
+        return self.clock.device_ns(host_ns)[0] - self.steps.step_zero_ns
+
+    def start_step(self, now_ns: int) -> int:
+        if self._hub.virtual:
+            return self.identity.next_step
+        step = self.since_zero_ns(now_ns) // self.identity.fast_step_ns
+        self._gate.check_step(self.name, step, now_ns)
+        return step
 
     @property
     def in_flight(self) -> int:
@@ -195,17 +225,7 @@ class NativeMirror(_NativeDevice):
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         limits = self.identity.mirror
-        if u.ndim != 2 or u.shape[1] != limits.n_inputs:
-            raise DeviceError(
-                f"a command of shape {u.shape} for a mirror of {limits.n_inputs} inputs: give (steps, inputs)"
-            )
-        inside = (u >= np.array(limits.input_min)) & (u <= np.array(limits.input_max))
-        if not inside.all():  # NaN fails as well
-            step, channel = np.argwhere(~inside)[0]
-            raise DeviceError(
-                f"input {channel} at fast step {first_step + step} is {u[step, channel]:g}, beyond the mirror's limits"
-                f" {limits.input_min[channel]:g} .. {limits.input_max[channel]:g}: it was not sent"
-            )
+        check_command(first_step, u, np.array(limits.input_min), np.array(limits.input_max))
         block = pb.CommandBlock(
             block_id=next(self._block_ids),
             first_step=first_step,
@@ -278,9 +298,6 @@ class NativeMirror(_NativeDevice):
         """How long to wait for an answer, s: the tries together take the watchdog's time. Then it parks by itself."""
         return min(ANSWER_S, max(self._watchdog_s / TRIES, self._timeout_ns() / 1e9))
 
-    def check_step(self, step: int, now_ns: int) -> None:
-        self._gate.check_step(self.link.name, step, now_ns)
-
     def handle(self, received: Received) -> list[Event]:
         message = received.message
         if not self._gate.passes(self.link, message, received.receive_ns):
@@ -293,7 +310,7 @@ class NativeMirror(_NativeDevice):
             # While something is sent again the line is busy in one direction: such a sample is worth nothing.
             clean = all(len(flight.tries) == 1 for flight in self._flights.values())
             return self._sample_clock(message, received.receive_ns, usable=clean)
-        return [message] if isinstance(message, pb.Event) else []
+        return self._say(message) if isinstance(message, pb.Event) else []
 
     def _take_ack(self, ack: pb.CommandAck, receive_ns: int) -> list[Event]:
         flight = self._flights.get(ack.block_id)
@@ -312,6 +329,7 @@ class NativeMirror(_NativeDevice):
             self.outage_s = 0.0 if self._answered_ns is None else (receive_ns - self._answered_ns) / 1e9
         else:
             self._answered_ns = max(self._answered_ns or 0, flight.last_ns if sent_ns is None else sent_ns)
+        ack.text = printable(ack.text)
         return [CommandAnswered(ack, flight.block)]
 
     def _measure(self, round_trip_s: float) -> None:
@@ -332,96 +350,3 @@ def _reason(ack: pb.Ack | pb.CommandAck) -> str:
     """Why a device refused something."""
     known = pb.Code.Name(ack.code) if ack.code in pb.Code.values() else f"code {ack.code}"
     return printable(ack.text) or known
-
-
-def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
-    """Ask the device on a line who it is.
-
-    Raises
-    ------
-    DeviceError
-        It does not answer, or speaks another version of the protocol.
-    """
-    identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
-    if identity is None and link.foreign_version is not None:
-        found = link.foreign_version
-    elif identity is None:
-        heard = link.counts.bytes_received
-        what = f"{heard} bytes came that are not aolink packets" if heard else "nothing came"
-        raise DeviceError(
-            f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on,"
-            " does another host have it?"
-        )
-    else:
-        found = identity.protocol_version
-    if identity is None or found != PROTOCOL_VERSION:
-        raise DeviceError(
-            f"the device on the {link.name} port speaks protocol version {found},"
-            f" this aolink speaks {PROTOCOL_VERSION}: update the {'device' if found < PROTOCOL_VERSION else 'host'}"
-        )
-    if identity.schema_hash != schema_hash():
-        raise DeviceError(
-            f"the device on the {link.name} port was built with another messages.proto"
-            f" ({identity.schema_hash.hex()}, here {schema_hash().hex()}): update the older of the two"
-        )
-    check_identity(link, identity)
-    return identity
-
-
-def check_kind(link: Link, identity: pb.Identity, kind: pb.Identity.Kind) -> None:
-    """Refuse a device of another kind. Raises DeviceError."""
-    if identity.kind != kind:
-        found = pb.Identity.Kind.Name(identity.kind).lower()
-        wanted = pb.Identity.Kind.Name(kind).lower()
-        raise DeviceError(
-            f"the device on the {link.name} port is a {found} ({identity.model}), expected a {wanted}:"
-            " are the two ports swapped?"
-        )
-
-
-def check_against_rig(rig: Rig, camera: pb.Identity, mirror: pb.Identity) -> list[str]:
-    """Refuse devices that are not what the rig file says; gives what else is doubtful, in words.
-
-    Raises DeviceError naming the first difference.
-    """
-    if camera.virtual_time != mirror.virtual_time or (
-        camera.virtual_time and camera.serial_number != mirror.serial_number
-    ):
-        raise DeviceError(
-            f"camera {camera.serial_number} and mirror {mirror.serial_number} do not belong to the same rig:"
-            " a rig on virtual time needs both of its ports"
-        )
-    limits, scene = mirror.mirror, rig.scene
-    pairs = [
-        ("timing.fast_step_s (camera, ns)", camera.fast_step_ns, rig.timing.fast_step_ns),
-        ("timing.fast_step_s (mirror, ns)", mirror.fast_step_ns, rig.timing.fast_step_ns),
-        ("sensor shape (rows, columns)", (camera.camera.height, camera.camera.width), rig.sensor.shape),
-        ("sensor.bit_depth", camera.camera.bit_depth, rig.sensor.bit_depth),
-        (
-            "scene.pixels (rows, columns)",
-            (camera.camera.scene_height, camera.camera.scene_width),
-            scene.shape if scene else (0, 0),
-        ),
-        ("scene.bit_depth", camera.camera.scene_bit_depth, scene.bit_depth if scene else 0),
-        ("timing.exposure_steps", camera.camera.exposure_steps, rig.timing.exposure_steps),
-        ("timing.frame_period_steps", camera.camera.frame_period_steps, rig.timing.frame_period_steps),
-        ("number of inputs", limits.n_inputs, rig.n_inputs),
-        ("mirror.input_min", list(limits.input_min), rig.mirror.input_min.tolist()),
-        ("mirror.input_max", list(limits.input_max), rig.mirror.input_max.tolist()),
-        ("mirror.park", list(limits.park), rig.mirror.park.tolist()),
-        ("mirror.dac_bits", limits.dac_bits, rig.mirror.dac_bits),
-        ("mirror.queue_steps", limits.queue_steps, rig.mirror.queue_steps),
-        ("mirror.watchdog_s", limits.watchdog_s, rig.mirror.watchdog_s),
-    ]
-    for name, found, expected in pairs:
-        if found != expected:
-            raise DeviceError(
-                f"the rig file {rig.name} does not match the device: {name} is {expected} in the file,"
-                f" {found} on the device; give the rig file of this device (--rig)"
-            )
-    return [
-        f"the {line} was made from another rig file than {rig.name}: sizes agree, other numbers (noise, kernel, plant)"
-        " may not, and estimates may be wrong by it"
-        for line, identity in (("camera", camera), ("mirror", mirror))
-        if identity.rig_digest and identity.rig_digest != rig.digest
-    ][:1]

@@ -13,12 +13,13 @@ import numpy as np
 
 from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
 from aolink.calibration.measure import LEAST_FRAMES, line_sensor
+from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, CalibrationError, RigError
 from aolink.files import check_target
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
-from aolink.session import open_devices, record
+from aolink.session import record
 
 _ASKED = (
     ("dark", "dark", "cover the camera"),
@@ -89,8 +90,8 @@ def read_frames(path: Path, rig: Rig) -> Frames:
 
 def record_frames(
     rig: Rig,
-    camera: str,
-    mirror: str,
+    camera: str | None,
+    mirror: str | None,
     folder: Path,
     *,
     frames: int,

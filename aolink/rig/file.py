@@ -16,6 +16,7 @@ from pathlib import Path
 from aolink.errors import RigError
 from aolink.optics.scene import SceneSensor
 from aolink.optics.sensor import BaseSensor
+from aolink.rig.device_tables import DeviceTable, read_devices
 from aolink.rig.disturbance import Disturbance, read_disturbance
 from aolink.rig.optical_plant import Optics, read_optics
 from aolink.rig.parts import Drive, MirrorDriver, Plant, Simulation, Timing
@@ -26,7 +27,7 @@ from aolink.rig.toml_table import Table
 
 _TABLES = (
     "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
-    "lenslets", "disturbance", "scene", "calibration",
+    "lenslets", "disturbance", "scene", "calibration", "devices",
 )  # fmt: skip
 """What a rig file may hold at its top."""
 
@@ -50,6 +51,8 @@ class Rig:
     disturbance: Disturbance | None
     scene: SceneSensor | None
     """The picture sensor that shares the exposure, where the rig has one."""
+    devices: dict[str, DeviceTable]
+    """What drives the camera and the mirror, by these names, where the file says it."""
     folder: Path
     """Of the file; where a file is named in it, its path is relative to this."""
     toml: str
@@ -134,8 +137,9 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     scene = read_scene(root.table("scene")) if root.has("scene") else None
     simulation = read_simulation(root.table("simulation", optional=True))
     calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
+    devices = read_devices(root.table("devices", optional=True))
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
         mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,
-        optics=optics, disturbance=disturbance, scene=scene, folder=folder or Path(), toml=text,
+        optics=optics, disturbance=disturbance, scene=scene, devices=devices, folder=folder or Path(), toml=text,
     )  # fmt: skip

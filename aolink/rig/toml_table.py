@@ -17,9 +17,9 @@ FloatArray = NDArray[np.float64]
 
 _KEYS = """
 A actuators amplitude axes B B_w bias_v bit_depth bit_error_rate bit_flip_rate black_level black_level_sd
-block_steps C calibration clock_drift_ppm clock_offset_s command_loss_rate correlation_s counts_per_density
-counts_per_density_sd counts_per_intensity coupling dac_bits damping dark_frames disturbance drift_s drive
-duplicate_rate exposure_offset exposure_steps fast_step_s faults field flat_frames focal_length_m footprint_m
+block_steps C calibration camera clock_drift_ppm clock_offset_s command_loss_rate correlation_s counts_per_density
+counts_per_density_sd counts_per_intensity coupling dac_bits damping dark_frames devices disturbance drift_s drive
+driver duplicate_rate exposure_offset exposure_steps fast_step_s faults field flat_frames focal_length_m footprint_m
 frame_period_steps frequency_hz gain gamma grid initial_covariance initial_mean input_max input_min kernel
 kernel_sigma_sd kind latency_s layers least_light lenslets light max_v mirror name noise_density noise_density_sd
 noise_sd obstruction offset outer_scale_m packet_loss_rate pad_radius_m park period_s photoelectrons
@@ -175,6 +175,12 @@ class Table:
         if not np.isfinite(array).all():
             raise RigError(f"{self.key(name)} holds a number that is not finite")
         return array
+
+    def others(self) -> dict[str, Any]:
+        """The keys that nobody has asked for, for somebody who checks them elsewhere."""
+        others = {name: value for name, value in self._values.items() if name not in self._asked}
+        self._asked.update(others)
+        return others
 
     def finish(self, *optional: str) -> None:
         """Raise RigError if the table has a key that nobody asked for, and that is not one of ``optional`` either."""

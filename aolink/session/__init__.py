@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import io
-import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from aolink.devices.gate import Gate
-from aolink.devices.native import NativeCamera, NativeMirror, check_against_rig, check_kind, identify
+from aolink.devices.interfaces import Camera
+from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, DeviceError, PortError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
@@ -29,73 +27,21 @@ from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside, most_waiting
-from aolink.wire import messages_pb2 as wire
-from aolink.wire.hub import Hub
-from aolink.wire.port import SerialPort
 
-__all__ = ["EstimatorReport", "Opened", "Report", "open_devices", "record"]
+__all__ = ["EstimatorReport", "Report", "record"]
 
 Watch = Callable[[Exposure, Sequence[Estimate]], None]
-"""Told each exposure with the estimates that have come since the one before."""
+"""Called with each exposure and the estimates that have come since the exposure before it."""
 
 _PROGRESS_S = 0.1
-"""Real time: how often the progress is told."""
+"""In real time: how often the progress is reported."""
 _ASIDE_S = 2.0
-"""Real time: how long the session's end waits for who watches."""
+"""In real time: how long the end of a session waits for the function that watches it."""
 
 
-class Opened(NamedTuple):
-    """Both devices of a rig, identified."""
-
-    hub: Hub
-    camera: NativeCamera
-    mirror: NativeMirror
-    warnings: list[str]
-    """What is doubtful about them, in words."""
-
-
-@contextlib.contextmanager
-def open_devices(
-    rig: Rig, camera_port: str, mirror_port: str, stop: Callable[[], bool] = lambda: False
-) -> Iterator[Opened]:
-    """Open both ports, identify what is behind them, and check it against the rig file.
-
-    Raises
-    ------
-    PortError
-        A port cannot be opened.
-    DeviceError
-        No device answers, it is another one, speaks another protocol, or is not what the rig file says.
-    """
-    hub = Hub(stop)
-    try:
-        camera_link = hub.connect("camera", SerialPort(camera_port, stop=stop))
-        mirror_link = hub.connect("mirror", SerialPort(mirror_port, stop=stop))
-        asked_ns = hub.now_ns()
-        camera_identity = identify(hub, camera_link, secrets.randbits(48))
-        check_kind(camera_link, camera_identity, wire.Identity.CAMERA)
-        mirror_identity = identify(hub, mirror_link, secrets.randbits(48))
-        check_kind(mirror_link, mirror_identity, wire.Identity.MIRROR)
-        warnings = check_against_rig(rig, camera_identity, mirror_identity)
-        gate = Gate(rig, hub, (camera_identity, mirror_identity), asked_ns)
-        hub.budget_bytes += gate.exposure_bytes * (2 + rig.mirror.queue_steps // rig.timing.frame_period_steps)
-        if camera_identity.virtual_time:
-            hub.go_virtual(gate.check_virtual_time)
-        for link in hub.links:
-            link.reset_counts()
-        yield Opened(
-            hub,
-            NativeCamera(hub, camera_link, camera_identity, gate),
-            NativeMirror(hub, mirror_link, mirror_identity, gate),
-            warnings,
-        )
-    finally:
-        hub.close()
-
-
-def _true_scene(rig: Rig, camera: NativeCamera) -> dict[str, bytes]:
+def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
     """The scene at rest as an attachment, where the camera was made from this rig file: a simulated one shows it."""
-    if rig.scene is None or not rig.scene.picture or camera.identity.rig_digest != rig.digest:
+    if rig.scene is None or not rig.scene.picture or camera.rig_digest != rig.digest:
         return {}
     data = io.BytesIO()
     np.save(data, rig.scene.to_counts(framed(rig.scene, read_scene_picture(rig.scene, rig.folder))))
@@ -112,8 +58,8 @@ def _saved(report: Report, paths: Sequence[Path]) -> str:
 
 def record(
     rig: Rig,
-    camera_port: str,
-    mirror_port: str,
+    camera_port: str | None,
+    mirror_port: str | None,
     path: str | Path,
     *,
     estimators: Sequence[str] = (),
@@ -139,7 +85,8 @@ def record(
     rig:
         What the devices are; checked against what they say of themselves.
     camera_port, mirror_port:
-        Anything that pyserial opens: a device path, or an address such as socket://host:port.
+        Anything that pyserial opens: a device path, or an address such as socket://host:port. Where None, the rig
+        file's table ``[devices]`` says what drives the device.
     path:
         The recording; must not exist unless ``overwrite``.
     estimators:
@@ -153,21 +100,21 @@ def record(
         What to command, instead of the rig's drive. It is called by the loop: the mirror gets its next commands when it
         returns.
     watch:
-        Told each exposure with its estimates. An estimate that is not there when the next exposure is comes with that
-        one or a later one. In real time it is called on a thread of its own and may take its time: exposures that
-        come meanwhile are left out and counted, and what it raises becomes a warning.
+        Called with each exposure and its estimates. An estimate that is not there when the next exposure comes is given
+        with that one or a later one. In real time it is called on a thread of its own and may take its time:
+        exposures that come meanwhile are left out and counted, and what it raises becomes a warning.
     options:
         How the recording is cut into chunks and files.
     stop, progress:
-        Asked, and told the number of exposures so far, at least ten times a second; the latter in real time on a
-        thread of its own.
+        Called at least ten times a second: ``stop()`` says whether the session is to end, ``progress(exposures)`` is
+        given the number of exposures so far. In real time the latter is called on a thread of its own.
     report:
         What is filled in while the session goes on, and given back in the end; a new one if None.
 
     Raises
     ------
     AolinkError
-        Of the kind that says what went wrong. The mirror is parked if it can be reached, and the
+        Its class says what kind of thing went wrong. The mirror is parked if it can be reached, and the
         recording is closed with what there is.
     """
     estimators = list(dict.fromkeys(estimators))
@@ -177,18 +124,18 @@ def record(
         rig = replace(rig, drive=rest)
     report = report or Report()
     with (
-        open_devices(rig, camera_port, mirror_port, stop) as (hub, camera, mirror, warnings),
+        open_devices(rig, camera_port, mirror_port, stop) as (clock, camera, mirror, warnings),
         contextlib.ExitStack() as aside,
     ):
-        start_ns = hub.now_ns()
+        start_ns = clock.now_ns()
         facts = {
             "session": f"{start_ns:x}",
             "aolink_version": version("aolink"),
             "rig": rig.name,
             "rig_digest": rig.digest,
-            "camera": f"{camera.identity.model} {camera.identity.serial_number} ({camera.identity.firmware})",
-            "mirror": f"{mirror.identity.model} {mirror.identity.serial_number} ({mirror.identity.firmware})",
-            "virtual_time": str(hub.virtual),
+            "camera": camera.description,
+            "mirror": mirror.description,
+            "virtual_time": str(clock.virtual),
             "estimators": " ".join(estimators),
             "note": note,
         }
@@ -196,22 +143,22 @@ def record(
             facts[topics.CALIBRATION] = calibration
         attachments = _true_scene(rig, camera)
         writer = RecordingWriter(
-            path, rig, facts, start_ns, overwrite=overwrite, deterministic=hub.virtual, attachments=attachments,
+            path, rig, facts, start_ns, overwrite=overwrite, deterministic=clock.virtual, attachments=attachments,
             options=options,
         )  # fmt: skip
         report.warnings += warnings
         show, beside = _shown(rig, watch), None
-        if not hub.virtual:
+        if not clock.virtual:
             progress = aside.enter_context(_told_aside(progress, report))
             show = aside.enter_context(_shown_aside(show, rig, report)) if show else None
             beside = aside.enter_context(BesideTheLoop(rig, estimators))
-            hub.beside = beside.processes
-        loop = SessionLoop(rig, hub, camera, mirror, writer, driver, inputs, show, beside, report)
+            clock.beside = beside.processes
+        loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, show, beside, report)
         try:
             loop.run(exposures, stop, progress)
         except BaseException as error:
             report.ended = f"error: {error}" if isinstance(error, AolinkError) else f"error: {error!r}"
-            hub.hurry()
+            clock.hurry()
             try:
                 loop.make_safe()
             except AolinkError as unsafe:

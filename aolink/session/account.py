@@ -11,7 +11,7 @@ from aolink.session.report import Report
 from aolink.wire import messages_pb2 as wire
 
 _OPEN, _PASSED, _UNKNOWN, _ENDED = range(4)
-"""Of a commanded step: not reported yet; reported without the command; nobody knows what it held; counted."""
+"""What is known of a commanded step: not reported yet; reported without the command; held input unknown; counted."""
 REFUSALS = (wire.OUT_OF_RANGE, wire.WRONG_SHAPE, wire.NOT_SUPPORTED, wire.LATCHED)
 """Answers to a block that is not taken at all."""
 

@@ -1,6 +1,6 @@
 """The live loop: joins devices, recorder and estimators.
 
-One thread waits on both ports; what comes is recorded, made into exposures and handed to the estimators, which in
+One thread waits for both devices; what comes is recorded, made into exposures and handed to the estimators, which in
 real time run beside the loop. Commands go out in blocks ahead of time, so the loop's own jitter does not reach the
 mirror. The same loop runs in real time and on virtual time; on virtual time it sends whenever the rig waits.
 """
@@ -8,7 +8,7 @@ mirror. The same loop runs in real time and on virtual time; on virtual time it 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,8 +17,8 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.assembly import Assembler, Frame
-from aolink.devices.gate import printable
-from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Event, Mirror
+from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
+from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Event, Mirror, Time
 from aolink.errors import DeviceError
 from aolink.estimation import Driver
 from aolink.exposure import Exposure, Picture
@@ -30,9 +30,6 @@ from aolink.session.account import REFUSALS, Account
 from aolink.session.estimating import Estimating, InTheLoop, Outcome
 from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
-from aolink.wire.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
-from aolink.wire.hub import Hub
-from aolink.wire.link import Link
 
 LEAD_BLOCKS = 3
 """Command blocks that are queued on the device ahead of time; of a queue of more than eight, all but five."""
@@ -40,13 +37,13 @@ _ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
 """Real time: from the first command to its first step."""
 _START_TRIES = 5
-_LINK_PERIOD_S = 1.0
+_STATISTICS_PERIOD_S = 1.0
 _ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """Real time: how long a frame may take after its exposure's end before it counts as lost."""
 _KEEP_ALIVES = 3
-"""Packets on the mirror's line in the time of its watchdog, at least."""
+"""What a mirror is sent in the time of its watchdog, at least."""
 _OUTAGE_WATCHDOGS = 2.0
 """A mirror that was out of reach for more than so many times its watchdog is not told to go on."""
 ESTIMATES_S = 5.0
@@ -76,7 +73,7 @@ class SessionLoop:
     def __init__(
         self,
         rig: Rig,
-        hub: Hub,
+        time: Time,
         camera: Camera,
         mirror: Mirror,
         writer: RecordingWriter,
@@ -87,8 +84,8 @@ class SessionLoop:
         report: Report | None = None,
     ) -> None:
         self.report = report or Report()
-        self.report.virtual_time = hub.virtual
-        self._rig, self._hub, self._camera, self._mirror = rig, hub, camera, mirror
+        self.report.virtual_time = time.virtual
+        self._rig, self._time, self._camera, self._mirror = rig, time, camera, mirror
         self._writer, self._estimating = writer, beside or InTheLoop(driver)
         if beside is not None:
             self.report.estimation |= {name: EstimatorReport() for name in beside.names}
@@ -108,7 +105,7 @@ class SessionLoop:
         self._newest_frame = 0
         self._asked: Camera | Mirror = camera
         """Whose clock is asked next."""
-        self._last_query_ns = self._next_link_ns = 0
+        self._last_query_ns = self._next_statistics_ns = 0
         self._last_frame_ns = 0
         self._end_step: int | None = None
         """First fast step after the session; None if it goes on until it is stopped."""
@@ -125,7 +122,7 @@ class SessionLoop:
             self.report.ended = "interrupted"
             self.make_safe()
             return
-        timing, hub = self._rig.timing, self._hub
+        timing, time = self._rig.timing, self._time
         if self._mirror.latched:
             self._rearm("in a session before")
         self._first_step = self._queued_until = self._start_camera(exposures)
@@ -133,7 +130,7 @@ class SessionLoop:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
         self._send_commands(self._first_step)  # queued before the first step is due
         self._receive(0.0)
-        self._last_frame_ns = hub.now_ns()
+        self._last_frame_ns = time.now_ns()
         self._log(Log.INFO, f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
         self.report.ended = "interrupted"
         while not stop():
@@ -165,35 +162,31 @@ class SessionLoop:
     def finish_estimates(self, patience_s: float = ESTIMATES_S) -> None:
         """Wait for the estimates under way, and record the exposures that none comes for as skipped."""
         outcomes = self._estimating.finish(patience_s)
-        self._take_outcomes(outcomes, self._hub.now_ns())
+        self._take_outcomes(outcomes, self._time.now_ns())
         self._note_failures()
         self._show_unseen(ready=True)
 
     def _receive(self, timeout_s: float) -> int:
         """Deal with what comes within ``timeout_s``; gives the number of clock queries that were answered."""
         answers = 0
-        for link, received in self._hub.wait(timeout_s):
-            events = self._device(link).handle(received)
+        for device, events, receive_ns in self._time.events(timeout_s):
             answers += sum(isinstance(event, ClockSampled) for event in events)
-            self._take(link, events, received.receive_ns)
-        self._take_outcomes(self._estimating.outcomes(), self._hub.now_ns())
+            self._take(device, events, receive_ns)
+        self._take_outcomes(self._estimating.outcomes(), self._time.now_ns())
         return answers
-
-    def _device(self, link: Link) -> Camera | Mirror:
-        return self._camera if link is self._camera.link else self._mirror
 
     def _warm_up_clocks(self, stop: Callable[[], bool]) -> None:
         for _ in range(2 * WARM_UP_QUERIES):
             if stop():
                 return
-            self._query_next_clock(self._hub.now_ns())
-            deadline_ns = self._hub.now_ns() + _ANSWER_NS
-            while not self._receive(0.05) and not self._hub.virtual and self._hub.now_ns() < deadline_ns:
+            self._query_next_clock(self._time.now_ns())
+            deadline_ns = self._time.now_ns() + _ANSWER_NS
+            while not self._receive(0.05) and not self._time.virtual and self._time.now_ns() < deadline_ns:
                 pass
         for device in (self._camera, self._mirror):
             if not device.clock.ready:
-                raise DeviceError(f"the {device.link.name} does not answer clock queries: is it still connected?")
-        self._next_link_ns = self._hub.now_ns() + round(_LINK_PERIOD_S * 1e9)
+                raise DeviceError(f"the {device.name} does not answer clock queries: is it still connected?")
+        self._next_statistics_ns = self._time.now_ns() + round(_STATISTICS_PERIOD_S * 1e9)
 
     def _query_next_clock(self, now: int) -> None:
         """Camera and mirror in turn, so that the one's query does not wait for the other's."""
@@ -209,12 +202,9 @@ class SessionLoop:
     def _start_camera(self, exposures: int) -> int:
         """Start the camera; gives the first fast step of the session."""
         for _ in range(_START_TRIES):
-            if self._hub.virtual:
-                first_step = self._mirror.identity.next_step
-            else:
-                step = self._device_step()
-                self._mirror.check_step(step, self._hub.now_ns())
-                first_step = step + round(_START_DELAY_S * 1e9) // self._step_ns
+            first_step = self._mirror.start_step(self._time.now_ns())
+            if not self._time.virtual:
+                first_step += round(_START_DELAY_S * 1e9) // self._step_ns
             if self._camera.start(first_step, exposures):
                 return first_step
         raise DeviceError(
@@ -224,32 +214,31 @@ class SessionLoop:
 
     def _device_step(self) -> int:
         """The fast step that the device is in: by its clock, or on virtual time the one that it waits at."""
-        if self._hub.virtual:
+        if self._time.virtual:
             return self._queued_until
-        device_ns, _ = self._mirror.clock.device_ns(self._hub.now_ns())
-        return (device_ns - self._mirror.steps.step_zero_ns) // self._step_ns
+        return self._mirror.since_zero_ns(self._time.now_ns()) // self._step_ns
 
     def _send_due(self) -> float:
         """Send what is due; gives the time until the next thing is, s."""
-        hub = self._hub
+        time = self._time
         if self._mirror.latched:
             self._rearm("in this session")
-        now, timeout_ns = hub.now_ns(), self._mirror.next_timeout_ns()
-        if timeout_ns is not None and hub.virtual:  # the rig has dealt with everything, so this one was lost
-            hub.elapse_until(timeout_ns)
-            now = hub.now_ns()
+        now, timeout_ns = time.now_ns(), self._mirror.next_timeout_ns()
+        if timeout_ns is not None and time.virtual:  # the rig has dealt with everything, so this one was lost
+            time.elapse_until(timeout_ns)
+            now = time.now_ns()
         if timeout_ns is not None and timeout_ns <= now:
-            self._take(self._mirror.link, self._mirror.retransmit(now), now)
+            self._take(self._mirror, self._mirror.retransmit(now), now)
         if now >= self._next_query_ns():
             self._query_next_clock(now)
-        if not hub.virtual and now >= self._keep_alive_ns():
+        if not time.virtual and now >= self._keep_alive_ns():
             self._mirror.query_clock(now)
-        if now >= self._next_link_ns:
-            self._record_links(now)
-            self._next_link_ns = now + round(_LINK_PERIOD_S * 1e9)
-        if not (hub.virtual and self._mirror.in_flight):
+        if now >= self._next_statistics_ns:
+            self._record_statistics(now)
+            self._next_statistics_ns = now + round(_STATISTICS_PERIOD_S * 1e9)
+        if not (time.virtual and self._mirror.in_flight):
             self._send_commands(self._device_step())
-        if hub.virtual:
+        if time.virtual:
             return 0.0
         due = [self._next_query_ns() - now, self._keep_alive_ns() - now]
         if self._end_step is None or self._queued_until < self._end_step:
@@ -261,7 +250,7 @@ class SessionLoop:
 
     def _keep_alive_ns(self) -> int:
         """Host time at which the mirror has to hear something, whether there is a command or not."""
-        return self._mirror.link.last_sent_ns + round(self._rig.mirror.watchdog_s * 1e9 / _KEEP_ALIVES)
+        return self._mirror.last_sent_ns + round(self._rig.mirror.watchdog_s * 1e9 / _KEEP_ALIVES)
 
     def _rearm(self, when: str) -> None:
         """The watchdog has parked the mirror: tell it to go on, unless it was out of reach for too long."""
@@ -284,18 +273,18 @@ class SessionLoop:
             n_steps = block_steps if end_step is None else min(block_steps, end_step - self._queued_until)
             since_start = self._queued_until - self._first_step
             u = self._inputs(since_start, n_steps)
-            now = self._hub.now_ns()
+            now = self._time.now_ns()
             block = self._mirror.send_block(self._queued_until, u, self._newest_frame, now)
             self._account.commanded(block)
             self._assembler.add_command(block)
             self._record(topics.COMMAND, block, now)
-            self._latencies.sent(block, self._hub.now_ns())
+            self._latencies.sent(block, self._time.now_ns())
             self._queued_until += n_steps
 
     def _is_over(self, exposures: int) -> bool:
-        if self._hub.virtual:
+        if self._time.virtual:
             return self._end_step is not None and self._queued_until >= self._end_step and not self._mirror.in_flight
-        now, timing = self._hub.now_ns(), self._rig.timing
+        now, timing = self._time.now_ns(), self._rig.timing
         if self._end_step is not None:
             late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
             if self.report.exposures >= exposures or self._device_step() > late_step:
@@ -313,32 +302,32 @@ class SessionLoop:
         """What is still on its way when the last command has been applied."""
         self._receive(0.0)
         self._collect_reports()
-        now = self._hub.now_ns()
-        self._take(self._camera.link, list(self._camera.flush()), now)
+        now = self._time.now_ns()
+        self._take(self._camera, list(self._camera.flush()), now)
         self._estimate(self._assembler.flush(), now)
         self.finish_estimates()
-        self._latencies.close(self._hub.now_ns())
+        self._latencies.close(self._time.now_ns())
         self.close_account()
         if exposures and self.report.ended == "complete":
             self.report.frames_lost = exposures - self.report.frames_received
             if self._rig.scene:
                 self.report.scenes_lost = exposures - self.report.scenes_received
-        self._record_links(now)
+        self._record_statistics(now)
         self._log(Log.INFO, f"session {self.report.ended}: {self.report.exposures} exposures")
 
     def _collect_reports(self) -> None:
         """Ask for the reports that have not come, now that the mirror is parked."""
-        end, now = self._queued_until, self._hub.now_ns()
+        end, now = self._queued_until, self._time.now_ns()
         end = end if self._parked_from is None else min(end, self._parked_from)
-        self._take(self._mirror.link, self._mirror.await_reports(end, now), now)
+        self._take(self._mirror, self._mirror.await_reports(end, now), now)
         while (due_ns := self._mirror.next_timeout_ns()) is not None:
-            self._hub.elapse_until(due_ns)
-            now = self._hub.now_ns()
+            self._time.elapse_until(due_ns)
+            now = self._time.now_ns()
             if due_ns <= now:
-                self._take(self._mirror.link, self._mirror.retransmit(now), now)
+                self._take(self._mirror, self._mirror.retransmit(now), now)
             self._receive(max(0, due_ns - now) / 1e9)
 
-    def _take(self, link: Link, events: Sequence[Event], receive_ns: int) -> None:
+    def _take(self, device: Device, events: Sequence[Event], receive_ns: int) -> None:
         for event in events:
             if isinstance(event, Frame):
                 if event.first_step >= self._first_step:  # not one of a session before
@@ -349,12 +338,12 @@ class SessionLoop:
             elif isinstance(event, wire.Truth):
                 self._record(topics.TRUTH, event, receive_ns)
             elif isinstance(event, ClockSampled):
-                self._take_clock(link.name, event)
+                self._take_clock(device, event)
             elif isinstance(event, CommandAnswered):
                 self._take_answer(event, receive_ns)
             else:
                 level = {wire.Event.INFO: Log.INFO, wire.Event.WARNING: Log.WARNING}.get(event.level, Log.ERROR)
-                self._log(level, f"{link.name}: {printable(event.text)}")
+                self._log(level, f"{device.name}: {event.text}")
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
         frame = self._record_picture(frame, topics.EXPOSURE, topics.IMAGE, receive_ns)
@@ -363,7 +352,7 @@ class SessionLoop:
         report.frames_incomplete += frame.chunks_lost > 0
         report.frames_lost += frame.frames_lost_before
         self._last_frame_ns = receive_ns
-        if not self._hub.virtual:
+        if not self._time.virtual:
             host_end_ns, _ = self._camera.clock.host_ns(frame.device_end_ns)
             self._latencies.frame(
                 pb.Latency(
@@ -400,10 +389,12 @@ class SessionLoop:
 
     def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
         """Record a picture and what is known about it; gives it with the host's time of its start."""
-        since_zero_ns, clock = frame.first_step * self._step_ns + frame.exposure_offset_ns, self._camera.steps
+        since_zero_ns, camera = frame.first_step * self._step_ns + frame.exposure_offset_ns, self._camera
         length_ns = (frame.last_step + 1 - frame.first_step) * self._step_ns
-        clock.host_ns(frame.device_end_ns, since_zero_ns + length_ns, receive_ns)  # may raise the doubt about the start
-        host_start_ns, sigma_ns = clock.host_ns(frame.device_start_ns, since_zero_ns, receive_ns)
+        camera.host_ns(
+            frame.device_end_ns, since_zero_ns + length_ns, receive_ns
+        )  # may raise the doubt about the start
+        host_start_ns, sigma_ns = camera.host_ns(frame.device_start_ns, since_zero_ns, receive_ns)
         frame = replace(frame, host_start_ns=host_start_ns, clock_sigma_ns=sigma_ns)
         info, image = convert.frame_messages(frame)
         self._record(exposure_topic, info, receive_ns)
@@ -433,7 +424,7 @@ class SessionLoop:
                 self._record(topics.estimation_topic(name), outcome.account(), log_time_ns)
             outcomes_so_far = self._unsettled[frame_id]
             if message is not None and all(each.message is None for each in outcomes_so_far):
-                self._know(frame_id, self._hub.now_ns())
+                self._know(frame_id, self._time.now_ns())
             outcomes_so_far.append(outcome)
             if message is None:
                 self._note_failures()
@@ -452,7 +443,7 @@ class SessionLoop:
         """All estimators are done with an exposure, or have skipped it."""
         outcomes = self._unsettled.pop(frame_id)
         if all(each.message is None for each in outcomes):
-            self._know(frame_id, 0 if outcomes else self._hub.now_ns())
+            self._know(frame_id, 0 if outcomes else self._time.now_ns())
         self._show_unseen()
 
     def _know(self, frame_id: int, estimated_ns: int) -> None:
@@ -467,8 +458,8 @@ class SessionLoop:
         is_report = applied.source not in (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
         if is_report and applied.first_step >= self._first_step:  # not before the clock is known
             since_zero_ns = (applied.first_step + applied.n_steps) * self._step_ns
-            end_ns, _ = self._mirror.steps.host_ns(applied.device_ns, since_zero_ns, receive_ns)
-            if applied.block_id and not self._hub.virtual:
+            end_ns, _ = self._mirror.host_ns(applied.device_ns, since_zero_ns, receive_ns)
+            if applied.block_id and not self._time.virtual:
                 self._latencies.applied(applied.block_id, end_ns - applied.n_steps * self._step_ns, receive_ns)
         report, end = self.report, applied.first_step + applied.n_steps
         end = end if self._end_step is None else min(end, self._end_step)
@@ -484,14 +475,13 @@ class SessionLoop:
         if ack.code in REFUSALS and ack.code != wire.LATCHED:
             raise DeviceError(
                 f"the mirror refused command block {ack.block_id} from fast step {answer.block.first_step}:"
-                f" {printable(ack.text) or wire.Code.Name(ack.code)}"
+                f" {ack.text or wire.Code.Name(ack.code)}"
             )
 
-    def _take_clock(self, device: str, sampled: ClockSampled) -> None:
-        clock = (self._camera if device == "camera" else self._mirror).clock
-        exchange, report = sampled.exchange, self.report
+    def _take_clock(self, device: Device, sampled: ClockSampled) -> None:
+        clock, exchange, report = device.clock, sampled.exchange, self.report
         sample = pb.ClockSample(
-            device=device,
+            device=device.name,
             host_send_ns=exchange.host_send_ns,
             device_receive_ns=exchange.device_receive_ns,
             device_send_ns=exchange.device_send_ns,
@@ -508,39 +498,35 @@ class SessionLoop:
         self._record(topics.CLOCK, sample, exchange.host_receive_ns)
         if sampled.step is not None:
             size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
+            direction = "forward" if size_s > 0 else "back"
             warning = (
-                f"the {device}'s clock was set {'forward' if size_s > 0 else 'back'} by {abs(size_s):.6f} s: host times"
-                f" of what it stamped in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
+                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of what it stamped"
+                f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
             )
             report.warnings.append(warning)
             self._log(Log.WARNING, warning)
 
-    def _record_links(self, now: int) -> None:
+    def _record_statistics(self, now: int) -> None:
         report = self.report
         self._count_tries()
-        counts = [link.counts for link in self._hub.links]
-        report.packets_bad_crc = sum(each.bad_crc for each in counts)
-        report.packets_bad_framing = sum(each.bad_framing for each in counts)
-        report.packets_bad_payload = sum(each.bad_payload for each in counts)
-        report.packets_duplicate = sum(each.duplicates for each in counts)
-        report.packets_missing = sum(each.sequence_gaps for each in counts)
+        counts = {device.name: device.statistics() for device in (self._camera, self._mirror)}
+        report.packets_bad_crc = sum(each.get("bad_crc", 0) for each in counts.values())
+        report.packets_bad_framing = sum(each.get("bad_framing", 0) for each in counts.values())
+        report.packets_bad_payload = sum(each.get("bad_payload", 0) for each in counts.values())
+        report.packets_duplicate = sum(each.get("duplicates", 0) for each in counts.values())
+        report.packets_missing = sum(each.get("sequence_gaps", 0) for each in counts.values())
         report.chunks_refused = self._camera.chunks_refused
-        for link in self._hub.links:
-            statistics = pb.LinkStatistics(device=link.name, **asdict(link.counts))
-            if link is self._mirror.link:
-                statistics.retransmits = self._mirror.retransmits
-                statistics.reports_asked = self._mirror.reports_asked
-                statistics.commands_in_flight = self._mirror.in_flight
-                statistics.round_trip_s = self._mirror.round_trip_s
-                statistics.queue_end_step = self._mirror.queue_end_step
-            self._record(topics.LINK, statistics, now)
+        for name, each in counts.items():
+            if each:
+                self._record(topics.LINK, pb.LinkStatistics(device=name, **each), now)
 
     def _count_tries(self) -> None:
-        self.report.blocks_retransmitted = self._mirror.retransmits
-        self.report.reports_asked = self._mirror.reports_asked
+        counts = self._mirror.statistics()
+        self.report.blocks_retransmitted = counts.get("retransmits", 0)
+        self.report.reports_asked = counts.get("reports_asked", 0)
 
     def _log(self, level: Log.Level.ValueType, text: str) -> None:
-        now = self._hub.now_ns()
+        now = self._time.now_ns()
         entry = Log(level=level, message=text, name="aolink")
         entry.timestamp.FromNanoseconds(now)
         self._record(topics.LOG, entry, now)

@@ -49,7 +49,7 @@ class Report:
     frames_lost: int = 0
     """Never received at all."""
     scenes_received: int = 0
-    """Of the picture sensor, as the three above."""
+    """The same three counts for the picture sensor."""
     scenes_incomplete: int = 0
     scenes_lost: int = 0
     packets_bad_crc: int = 0
@@ -61,7 +61,7 @@ class Report:
     chunks_refused: int = 0
     """Pieces of frames that made no sense."""
     steps_commanded: int = 0
-    """Of every command block; at the end of the session they are the sum of the five that follow."""
+    """Steps of all command blocks; at the end of the session they are the sum of the five counts that follow."""
     steps_applied: int = 0
     steps_superseded: int = 0
     """Queued, and replaced by a later command, or dropped when the mirror parked."""
@@ -71,7 +71,7 @@ class Report:
     steps_not_reported: int = 0
     """Nobody knows what the mirror held: the reports did not come, though they were asked for again."""
     steps_clipped: int = 0
-    """Of the applied ones: changed by the device's own protection."""
+    """Applied steps whose input the device's own protection had changed."""
     steps_parked: int = 0
     """Fast steps of the session in which the mirror held its safe input, whatever became of commands for them."""
     blocks_retransmitted: int = 0

@@ -16,15 +16,14 @@ import numpy as np
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from aolink.exposure import Truth
 from aolink.rig import Rig
 from aolink.simulation.model import CameraFrame, RigModel
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MAX_CHUNK, PROTOCOL_VERSION, schema_hash
+from aolink.wire.truth import truth_message
 
 Line = Literal["camera", "mirror"]
 FIRMWARE = "aolink simulated rig 1"
-_LARGEST_PATH = 65_536  # numbers in a truth's path, beyond which single precision must do
 _REMEMBERED_BLOCKS = 256
 _PACKET_INPUTS = 512  # numbers of an `Applied` that is one packet
 _HISTORY_WATCHDOGS = 4  # an outage of two is survived; what was held during it is asked for when it is over
@@ -369,15 +368,3 @@ def history_steps(rig: Rig) -> int:
     """How many fast steps a simulated mirror remembers what it held in."""
     watchdogs = math.ceil(_HISTORY_WATCHDOGS * rig.mirror.watchdog_s / rig.timing.fast_step_s)
     return max(rig.mirror.queue_steps, min(watchdogs, _HISTORY_INPUTS // rig.n_inputs))
-
-
-def truth_message(frame_id: int, truth: Truth) -> pb.Truth:
-    """The wire's form of a `Truth`."""
-    return pb.Truth(
-        frame_id=frame_id,
-        axes=truth.start_state.shape[0],
-        n_outputs=truth.path.shape[0],
-        start_state=truth.start_state.ravel(),
-        end_state=truth.end_state.ravel(),
-        **{"path" if truth.path.size <= _LARGEST_PATH else "path_single": truth.path.ravel()},
-    )

@@ -11,14 +11,14 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 from google.protobuf.message import Message
 
 from aolink.errors import DeviceError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
-from aolink.wire.port import HasFileno, Transport, is_local, wait_readable
+from aolink.wire.port import Served, Transport, is_local, wait_readable
 
 ANSWER_S = 1.0
 """How long an answer may take before a request is sent again, and how long one is waited for after a stop."""
@@ -36,21 +36,6 @@ _SLICE_S = 0.1
 """Longest sleep: a request to stop is seen that soon."""
 
 AnyMessage = TypeVar("AnyMessage", bound=Message)
-
-
-class Served(HasFileno, Protocol):
-    """Somebody beside the lines whom the hub's wait serves as well."""
-
-    @property
-    def alive(self) -> bool:
-        """Whether there is anything to wait for."""
-
-    @property
-    def has_to_send(self) -> bool:
-        """Whether something is to be sent as soon as it is taken."""
-
-    def serve(self) -> None:
-        """Send and receive what goes without waiting."""
 
 
 class Hub:

@@ -119,6 +119,21 @@ class HasFileno(Protocol):
     def fileno(self) -> int: ...
 
 
+class Served(HasFileno, Protocol):
+    """Somebody beside the lines whom a session's wait serves as well."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether there is anything to wait for."""
+
+    @property
+    def has_to_send(self) -> bool:
+        """Whether something is to be sent as soon as it is taken."""
+
+    def serve(self) -> None:
+        """Send and receive what goes without waiting."""
+
+
 def wait_readable(some: Sequence[HasFileno], timeout_s: float, writable: Sequence[HasFileno] = ()) -> None:
     """Wait until one of ``some`` has something or one of ``writable`` takes something, or for ``timeout_s``."""
     select.select(some, writable, [], max(0.0, timeout_s))

@@ -16,8 +16,8 @@ from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
 from aolink.session import record
-from aolink.simulation.devices import truth_message
 from aolink.simulation.model import simulate
+from aolink.wire.truth import truth_message
 from tests.conftest import Session
 
 NAMES = ("open-loop", "o1", "o3")

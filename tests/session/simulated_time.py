@@ -12,7 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from aolink.devices.gate import Gate
-from aolink.devices.native import NativeCamera, NativeMirror, identify
+from aolink.devices.host import Host
+from aolink.devices.identity import identify
+from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.estimation import Driver
 from aolink.exposure import Exposure
 from aolink.recording import topics
@@ -24,7 +26,6 @@ from aolink.session.report import Report
 from aolink.simulation.devices import Line
 from aolink.simulation.server import RigServer
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.hub import Hub
 from aolink.wire.link import Link, Received
 
 _EPOCH_NS = 1_767_225_600_000_000_000
@@ -90,7 +91,7 @@ class End:
         pass
 
 
-class SimulatedTimeHub(Hub):
+class SimulatedTimeHub(Host):
     """Both ends: the host's hub and the rig's server, on one clock that moves from event to event."""
 
     def __init__(self, rig: Rig, seed: int | None = None, stop: Callable[[], bool] = lambda: False) -> None:
@@ -202,6 +203,7 @@ def run_session(
     gate = Gate(rig, hub, (camera_identity, mirror_identity), asked_ns)
     camera = NativeCamera(hub, camera_link, camera_identity, gate)
     mirror = NativeMirror(hub, mirror_link, mirror_identity, gate)
+    hub.native = [camera, mirror]
     for link in hub.links:
         link.reset_counts()
     with RecordingWriter(path, rig, {}, hub.now_ns(), deterministic=True) as writer:

@@ -33,11 +33,12 @@ from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
-from aolink.session import open_devices, record
+from aolink.session import record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet, schema_hash
 from aolink.wire.port import SerialPort, wait_readable
 from tests.conftest import Session
+from tests.session.native import open_native
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 Start = Callable[..., "subprocess.Popen[str]"]
@@ -301,7 +302,7 @@ def test_the_watchdog_parks_the_mirror_while_commands_are_queued(tmp_path: Path)
     rig = load_rig(tmp_path / "rig.toml")
     with (
         simulated_rig(tmp_path / "rig.toml", "--real-time") as ports,
-        open_devices(rig, *ports) as (hub, _, mirror, _),
+        open_native(rig, *ports) as (hub, _, mirror),
     ):
         for k in range(0, 4000, 50):
             mirror.send_block(mirror.identity.next_step + 100 + k, np.full((50, 1), 0.01), 0, hub.now_ns())
@@ -317,7 +318,7 @@ def test_the_watchdog_parks_the_mirror_while_commands_are_queued(tmp_path: Path)
 
 def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() -> None:
     rig = load_rig("section-vi")
-    with simulated_rig("section-vi") as ports, open_devices(rig, *ports) as (hub, _, mirror, _):
+    with simulated_rig("section-vi") as ports, open_native(rig, *ports) as (hub, _, mirror):
         for value in (0.06, float("nan")):
             u = np.array([[0.0], [value]])
             with pytest.raises(DeviceError, match=r"input 0 at fast step 1 is .*, beyond the mirror's limits"):

@@ -11,9 +11,9 @@ from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import load_rig
-from aolink.session import open_devices
 from aolink.session.loop import SessionLoop, lead_steps
 from aolink.wire import messages_pb2 as pb
+from tests.session.native import open_native
 
 RIG = load_rig("section-vi")
 
@@ -26,7 +26,7 @@ def test_a_long_queue_is_kept_full_and_others_are_three_blocks_ahead() -> None:
 
 def test_on_virtual_time_one_line_waits_for_the_other() -> None:
     """Otherwise the rig might take the camera's query before the mirror's block or after it."""
-    with simulated_rig("section-vi") as ports, open_devices(RIG, *ports) as (hub, camera, mirror, _):
+    with simulated_rig("section-vi") as ports, open_native(RIG, *ports) as (hub, camera, mirror):
         before = hub.now_ns()
         for k in range(3):
             mirror.send_block(50 * k, np.zeros((50, 1)), 0, before)
@@ -41,7 +41,7 @@ def test_on_virtual_time_one_line_waits_for_the_other() -> None:
 
 def test_frames_of_before_the_session_are_not_its_own(tmp_path: Path) -> None:
     """A camera that was running already: its frames come while the clocks are still being compared."""
-    with simulated_rig("section-vi") as ports, open_devices(RIG, *ports) as (hub, camera, mirror, _):
+    with simulated_rig("section-vi") as ports, open_native(RIG, *ports) as (hub, camera, mirror):
         first = mirror.identity.next_step
         camera.start(first, 2)
         mirror.send_block(first, np.zeros((200, 1)), 0, hub.now_ns())

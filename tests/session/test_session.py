@@ -27,8 +27,9 @@ from aolink.recording.reestimate import (
     write_reestimated,
 )
 from aolink.rig import load_rig, parse_rig
-from aolink.session import Report, open_devices, record
+from aolink.session import Report, record
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
+from tests.session.native import open_native
 
 
 def test_everything_is_received_and_recorded(recorded: Session) -> None:
@@ -270,7 +271,7 @@ def test_what_a_killed_host_left_behind_is_not_in_the_next_session(tmp_path: Pat
     for how in ([], ["--real-time"]):
         path = tmp_path / f"{len(how)}.mcap"
         with simulated_rig("section-vi-lively", *how) as ports:
-            with open_devices(rig, *ports) as (hub, camera, mirror, _):
+            with open_native(rig, *ports) as (hub, camera, mirror):
                 first = mirror.identity.next_step + 300
                 camera.start(first, 0)
                 mirror.send_block(first + 50, np.full((50, 1), 0.01), 0, hub.now_ns())

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.wire.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, ClockExchange, ClockRegression, StepClock
+from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, ClockExchange, ClockRegression, StepClock
 
 START = 1_767_225_600_000_000_000
 OFFSET = -7_000_000_000_123

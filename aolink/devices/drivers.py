@@ -1,0 +1,72 @@
+"""Drivers by their names: the native ones, and those that other packages bring through entry points."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Literal
+
+from aolink.errors import AolinkError, DeviceError, RigError
+from aolink.rig import Rig
+from aolink.rig.device_tables import DeviceTable
+
+Kind = Literal["camera", "mirror"]
+NATIVE = "native"
+"""The driver of devices that speak aolink's packets; its only key is ``port``."""
+
+
+def driver_names(kind: Kind) -> list[str]:
+    """The drivers that there are; those of other packages may turn out to be broken when they are loaded."""
+    return [NATIVE, *sorted(_others(kind))]
+
+
+def open_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Any:
+    """Make the driver that a rig file names, with its own keys.
+
+    Raises
+    ------
+    DeviceError
+        There is no driver of this name, it cannot be loaded, or it says what its device cannot do.
+    RigError
+        It does not take the keys that the table has.
+    """
+    make = _load(kind, table.driver)
+    try:
+        inspect.signature(make).bind(rig, **table.options)
+    except TypeError as error:
+        raise RigError(f"devices.{kind}: the driver {table.driver} cannot take these keys: {error}") from None
+    with calling(kind, "when it was opened"):
+        return make(rig, **table.options)
+
+
+@contextmanager
+def calling(kind: str, when: str) -> Iterator[None]:
+    """Whatever a driver raises becomes a DeviceError that says so."""
+    try:
+        yield
+    except AolinkError:
+        raise
+    except Exception as error:
+        raise DeviceError(f"the driver of the {kind} failed {when}: {error!r}") from error
+
+
+def _load(kind: Kind, name: str) -> Callable[..., Any]:
+    there = ", ".join(driver_names(kind))
+    point = _others(kind).get(name)
+    if point is None:
+        raise DeviceError(
+            f"there is no {kind} driver {name}, there is {there}: install the package that brings it, or mend"
+            f" devices.{kind}.driver in the rig file"
+        )
+    try:
+        return point.load()  # type: ignore[no-any-return]
+    except Exception as error:
+        raise DeviceError(
+            f"the {kind} driver {name} ({point.value}) cannot be loaded: {error!r}; there is {there}"
+        ) from error
+
+
+def _others(kind: Kind) -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=f"aolink.{kind}s") if point.name != NATIVE}

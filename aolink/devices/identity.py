@@ -1,0 +1,133 @@
+"""Who is behind a line: devices of the packet protocol say it, and what they say is compared with the rig file."""
+
+from __future__ import annotations
+
+from aolink.devices.gate import MOST_STEP, check_times, lie
+from aolink.errors import DeviceError
+from aolink.rig import Rig
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.hub import Hub
+from aolink.wire.link import Link
+from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
+
+_LONGEST_NAME = 200
+
+
+def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
+    """Ask the device on a line who it is.
+
+    Raises
+    ------
+    DeviceError
+        It does not answer, or speaks another version of the protocol.
+    """
+    identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
+    if identity is None and link.foreign_version is not None:
+        found = link.foreign_version
+    elif identity is None:
+        heard = link.counts.bytes_received
+        what = f"{heard} bytes came that are not aolink packets" if heard else "nothing came"
+        raise DeviceError(
+            f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on,"
+            " does another host have it?"
+        )
+    else:
+        found = identity.protocol_version
+    if identity is None or found != PROTOCOL_VERSION:
+        raise DeviceError(
+            f"the device on the {link.name} port speaks protocol version {found},"
+            f" this aolink speaks {PROTOCOL_VERSION}: update the {'device' if found < PROTOCOL_VERSION else 'host'}"
+        )
+    if identity.schema_hash != schema_hash():
+        raise DeviceError(
+            f"the device on the {link.name} port was built with another messages.proto"
+            f" ({identity.schema_hash.hex()}, here {schema_hash().hex()}): update the older of the two"
+        )
+    check_identity(link, identity)
+    return identity
+
+
+def check_kind(link: Link, identity: pb.Identity, kind: pb.Identity.Kind) -> None:
+    """Refuse a device of another kind. Raises DeviceError."""
+    if identity.kind != kind:
+        found = pb.Identity.Kind.Name(identity.kind).lower()
+        wanted = pb.Identity.Kind.Name(kind).lower()
+        raise DeviceError(
+            f"the device on the {link.name} port is a {found} ({identity.model}), expected a {wanted}:"
+            " are the two ports swapped?"
+        )
+
+
+def check_identity(link: Link, identity: pb.Identity) -> None:
+    """Refuse an Identity whose numbers or names cannot be. Raises DeviceError naming the field."""
+    if identity.kind not in (pb.Identity.CAMERA, pb.Identity.MIRROR):
+        raise lie(link.name, "Identity.kind", identity.kind, "1 (camera) or 2 (mirror)")
+    for name in ("model", "serial_number", "firmware", "rig_digest"):
+        text = getattr(identity, name)
+        if len(text) > _LONGEST_NAME or not text.isprintable():
+            raise lie(
+                link.name,
+                f"Identity.{name}",
+                repr(text[:40]),
+                f"at most {_LONGEST_NAME} characters that can be printed",
+            )
+    if not 0 < identity.fast_step_ns <= 10**10:
+        raise lie(link.name, "Identity.fast_step_ns", identity.fast_step_ns, "1 to 10^10")
+    if identity.next_step > MOST_STEP:
+        raise lie(link.name, "Identity.next_step", identity.next_step, "at most 2^53")
+    check_times(link.name, identity, ("step_zero_ns",))
+
+
+def check_against_rig(rig: Rig, identities: dict[str, pb.Identity]) -> list[str]:
+    """Refuse devices that are not what the rig file says; gives what else is doubtful, in words.
+
+    ``identities`` are those of the camera, of the mirror or of both, by these names. Raises DeviceError naming the
+    first difference.
+    """
+    times = {identity.virtual_time for identity in identities.values()}
+    if times == {False, True} or (times == {True} and len({each.serial_number for each in identities.values()}) > 1):
+        raise DeviceError(
+            f"camera {identities['camera'].serial_number} and mirror {identities['mirror'].serial_number} do not belong"
+            " to the same rig: a rig on virtual time needs both of its ports"
+        )
+    pairs: list[tuple[str, object, object]] = [
+        (f"timing.fast_step_s ({line}, ns)", identity.fast_step_ns, rig.timing.fast_step_ns)
+        for line, identity in identities.items()
+    ]
+    if "camera" in identities:
+        camera, scene = identities["camera"].camera, rig.scene
+        pairs += [
+            ("sensor shape (rows, columns)", (camera.height, camera.width), rig.sensor.shape),
+            ("sensor.bit_depth", camera.bit_depth, rig.sensor.bit_depth),
+            (
+                "scene.pixels (rows, columns)",
+                (camera.scene_height, camera.scene_width),
+                scene.shape if scene else (0, 0),
+            ),
+            ("scene.bit_depth", camera.scene_bit_depth, scene.bit_depth if scene else 0),
+            ("timing.exposure_steps", camera.exposure_steps, rig.timing.exposure_steps),
+            ("timing.frame_period_steps", camera.frame_period_steps, rig.timing.frame_period_steps),
+        ]
+    if "mirror" in identities:
+        limits = identities["mirror"].mirror
+        pairs += [
+            ("number of inputs", limits.n_inputs, rig.n_inputs),
+            ("mirror.input_min", list(limits.input_min), rig.mirror.input_min.tolist()),
+            ("mirror.input_max", list(limits.input_max), rig.mirror.input_max.tolist()),
+            ("mirror.park", list(limits.park), rig.mirror.park.tolist()),
+            ("mirror.dac_bits", limits.dac_bits, rig.mirror.dac_bits),
+            ("mirror.queue_steps", limits.queue_steps, rig.mirror.queue_steps),
+            ("mirror.watchdog_s", limits.watchdog_s, rig.mirror.watchdog_s),
+        ]
+    for name, found, expected in pairs:
+        if found != expected:
+            raise DeviceError(
+                f"the rig file {rig.name} does not match the device: {name} is {expected} in the file,"
+                f" {found} on the device; give the rig file of this device (--rig)"
+            )
+    return [
+        f"the {line} was made from another rig file than {rig.name}: sizes agree, other numbers (noise, kernel, plant)"
+        " may not, and estimates may be wrong by it"
+        for line, identity in identities.items()
+        if identity.rig_digest and identity.rig_digest != rig.digest
+    ][:1]

@@ -1,0 +1,198 @@
+"""A camera and a mirror of another package, which is installed and used as anybody's would be."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink import estimate as estimate_exposures
+from aolink.errors import DeviceError
+from aolink.jobs.demo import simulated_rig
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.rig import load_rig
+from aolink.session import Report, record
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "tests" / "example_package"
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a process in which the example package is installed, and one whose drivers are broken."""
+    folder = tmp_path_factory.mktemp("installed")
+    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*command, "--target", folder, EXAMPLE], check=True)
+    broken = folder / "broken-1.0.dist-info"
+    broken.mkdir()
+    (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (broken / "entry_points.txt").write_text("[aolink.cameras]\nbroken = no_such_module:Camera\n")
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), "COLUMNS": "200"}
+
+
+def rig_file(folder: Path, camera: str = 'driver = "example"', mirror: str = 'driver = "example"') -> Path:
+    tables = [f"[devices.{kind}]\n{keys}\n" for kind, keys in (("camera", camera), ("mirror", mirror)) if keys]
+    path = folder / "mine.toml"
+    path.write_text("\n".join([load_rig("section-vi").toml, *tables]))
+    return path
+
+
+def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[str, str], tmp_path: Path) -> None:
+    rig = rig_file(tmp_path, 'driver = "example"\nclock_offset_s = 3.5')
+    arguments = ("--rig", rig, "--estimator", "o1", "--exposures", "6", "-o", "a.mcap", "--json")
+    done = aolink("record", *arguments, env=installed)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["ended"], report["frames_received"], report["frames_lost"]) == ("complete", 6, 0)
+    assert report["steps_commanded"] == 1200
+    ends = ("applied", "superseded", "late", "refused", "not_reported")
+    assert sum(report[f"steps_{how}"] for how in ends) == 1200
+    assert report["steps_applied"] > 0
+
+    recording = Recording(tmp_path / "a.mcap")
+    assert (recording.metadata["camera"], recording.metadata["mirror"]) == ("example camera", "example mirror")
+    assert recording.counts[topics.TRUTH] == recording.counts[topics.IMAGE] == 6
+    assert topics.LINK not in recording.counts
+    reported = [each.message for each in recording.messages(topics.APPLIED)]
+    steps = [k for m in reported for k in range(m.first_step, m.first_step + m.n_steps)]  # type: ignore[attr-defined]
+    assert steps == list(range(steps[0], steps[0] + len(steps)))  # each once, in order
+    exposures = list(recording.exposures())
+    assert all(exposure.inputs_assumed == 0 for exposure in exposures)
+    assert np.abs(exposures[-1].inputs).max() > 0.001
+    for exposure, estimate in zip(exposures, estimate_exposures(tmp_path / "a.mcap", "o1"), strict=True):
+        assert exposure.truth is not None
+        assert np.abs(estimate.path - exposure.truth.path).max() < 0.02  # its frames have no noise
+    again = aolink("replay", "a.mcap", "--to-rig", "-o", "b.mcap", env=installed)  # the recording has the rig file
+    assert again.returncode == 0, again.stderr
+    assert "b.mcap: 6 exposures, complete" in again.stdout
+    info = aolink("info", "a.mcap")
+    assert (info.returncode, "example mirror" in info.stdout) == (0, True)
+
+
+def test_a_camera_of_another_package_beside_a_native_mirror(
+    aolink: Run, installed: dict[str, str], tmp_path: Path
+) -> None:  # fmt: skip
+    """In real time the mirror's clock and count of fast steps are known; on virtual time no other camera follows."""
+    rig = rig_file(tmp_path, mirror="")
+    arguments = ("--rig", rig, "--exposures", "4", "-o", "a.mcap")
+    with simulated_rig(rig, "--real-time") as (_, mirror):
+        done = aolink("record", "--mirror", mirror, *arguments, "--json", env=installed)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["ended"], report["frames_received"], report["steps_commanded"]) == ("complete", 4, 800)
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.metadata["camera"] == "example camera"
+    assert report["steps_applied"] > 0
+    first_steps = [exposure.first_step for exposure in recording.exposures()]
+    assert np.diff(first_steps).tolist() == [200] * 3
+    with simulated_rig(rig) as (camera, mirror):
+        refused = aolink("record", "--mirror", mirror, *arguments, "--overwrite", env=installed)
+        assert refused.returncode == 4
+        assert (
+            "the mirror runs on virtual time, which only the camera of the same simulated rig follows" in refused.stderr
+        )
+        rig = rig_file(tmp_path, camera="")
+        refused = aolink("record", "--camera", camera, *arguments, "--overwrite", env=installed)
+        assert refused.returncode == 4
+        assert "a native camera counts fast steps together with its own mirror" in refused.stderr
+
+
+FAILING = """
+from aolink_example.devices import Camera as Example
+
+calls = []
+
+
+class Camera(Example):
+    def frames(self):
+        yield from super().frames()
+        if len(calls) > 100:
+            raise OSError("the camera was pulled out")
+        calls.append("frames")
+
+    def stop(self):
+        calls.append("stop")
+
+    def close(self):
+        calls.append("close")
+"""
+
+
+def test_a_driver_that_fails_ends_the_session_in_good_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mirror is parked, the camera stopped, both are closed, and the recording is whole."""
+    (tmp_path / "failing.py").write_text(FAILING)
+    points = "[aolink.cameras]\nfailing = failing:Camera\n[aolink.mirrors]\nexample = aolink_example.devices:Mirror\n"
+    info = tmp_path / "failing-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: failing\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(points)
+    monkeypatch.syspath_prepend(EXAMPLE)
+    monkeypatch.syspath_prepend(tmp_path)
+    rig = load_rig(rig_file(tmp_path, 'driver = "failing"'))
+    what = r"the driver of the camera failed when it was asked for its frames: OSError\('the camera was pulled out'\)"
+    with pytest.raises(DeviceError, match=what):
+        record(rig, None, None, tmp_path / "a.mcap", report=(report := Report()))
+    assert sys.modules["failing"].calls[-2:] == ["stop", "close"]
+    assert Recording(tmp_path / "a.mcap").complete
+    ended = report.steps_applied + report.steps_superseded + report.steps_late + report.steps_not_reported
+    assert ended == report.steps_commanded > 0
+
+
+@pytest.mark.parametrize(
+    ("camera", "code", "what"),
+    [
+        (
+            "",
+            2,
+            "nothing says what drives the camera: give --camera PORT, or [devices.camera] in the rig file with one",
+        ),
+        ('driver = "exmaple"', 4, "there is no camera driver exmaple, there is native, broken, example: install"),
+        ('driver = "broken"', 4, "the camera driver broken (no_such_module:Camera) cannot be loaded: ModuleNotFound"),
+        ('driver = "example"\nclock = 3', 2, "devices.camera: the driver example cannot take these keys: got an unexp"),
+        (
+            'driver = "example"\nclock_offset_s = "x"',
+            4,
+            "the driver of the camera failed when it was opened: TypeError",
+        ),
+        ('driver = "native"\nbaud = 9600', 2, "devices.camera: the driver native takes one key, port, a text"),
+        ("port = 3", 2, "devices.camera.driver is missing"),
+    ],
+)
+def test_a_driver_that_is_not_there_is_one_line(
+    aolink: Run, installed: dict[str, str], tmp_path: Path, camera: str, code: int, what: str
+) -> None:
+    mirror = 'driver = "native"\nport = "/dev/null"' if "native" in camera else 'driver = "example"'
+    done = aolink("record", "--rig", rig_file(tmp_path, camera, mirror), "-o", "a.mcap", env=installed)
+    assert done.returncode == code
+    assert what in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_the_drivers_that_there_are_are_listed(aolink: Run, installed: dict[str, str]) -> None:
+    listed = aolink("devices", env=installed).stdout
+    assert "camera drivers: native, broken, example\nmirror drivers: native, example" in listed
+
+
+def test_native_devices_may_stand_in_the_rig_file(aolink: Run, tmp_path: Path) -> None:
+    with simulated_rig("section-vi") as ports:
+        rig = rig_file(tmp_path, *(f'driver = "native"\nport = "{port}"' for port in ports))
+        done = aolink("record", "--rig", rig, "--exposures", "2", "-o", "a.mcap")
+    assert done.returncode == 0, done.stderr
+    assert len(list(Recording(tmp_path / "a.mcap"))) == 2
+
+
+def test_each_driver_of_the_example_has_at_most_40_lines() -> None:
+    """And the page of the devices shows the mirror as it is."""
+    text = (EXAMPLE / "aolink_example" / "devices.py").read_text()
+    _, mirror, camera = text.split("\nclass ")
+    assert max(len(part.strip().splitlines()) for part in (mirror, camera)) <= 40
+    assert f"class {mirror.rstrip()}\n```" in (ROOT / "aolink" / "devices" / "README.md").read_text()

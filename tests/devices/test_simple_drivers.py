@@ -1,0 +1,234 @@
+"""Simple drivers: frames get their fast steps, and each commanded step ends once, whatever a driver does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from aolink.assembly import Frame
+from aolink.devices.interfaces import CommandAnswered, Event
+from aolink.devices.simple import AdaptedCamera, AdaptedMirror, SimpleFrame
+from aolink.errors import DeviceError
+from aolink.rig import load_rig
+from aolink.session.account import Account
+from aolink.session.report import Report
+from aolink.wire import messages_pb2 as pb
+
+RIG = load_rig("section-vi")
+STEP_NS = RIG.timing.fast_step_ns
+EXPOSURE_NS, PERIOD_NS = RIG.timing.exposure_steps * STEP_NS, RIG.timing.frame_period_steps * STEP_NS
+EPOCH_NS = 1_767_225_600_000_000_000
+CAMERA_ZERO_NS = 777_000_000
+
+
+class Bench:
+    """A mirror and a camera whose clocks are exact, and a host's clock that stands still between two calls."""
+
+    description = "bench"
+
+    def __init__(self) -> None:
+        self.host_ns = EPOCH_NS
+        self.late = 0
+        self.refusal: Exception | None = None
+        self.reports: list[tuple[int, NDArray[np.float64]]] = []
+        self.taken: list[SimpleFrame] = []
+        self.started_ns: int | None = None
+
+    def now_ns(self) -> int:
+        return self.host_ns
+
+    def time_ns(self) -> int:
+        return self.host_ns - EPOCH_NS
+
+    def send(self, first_step: int, u: NDArray[np.float64]) -> int:
+        if self.refusal:
+            raise self.refusal
+        return self.late
+
+    def applied(self) -> Iterable[tuple[int, NDArray[np.float64]]]:
+        reports, self.reports = self.reports, []
+        return reports
+
+    def park(self) -> int:
+        return self.time_ns() // STEP_NS
+
+    def start(self, start_ns: int, exposures: int) -> None:
+        self.started_ns = start_ns
+
+    def frames(self) -> Iterable[SimpleFrame]:
+        taken, self.taken = self.taken, []
+        return taken
+
+    def stop(self) -> None:
+        self.started_ns = None
+
+    def close(self) -> None:
+        pass
+
+
+class CameraBench(Bench):
+    def time_ns(self) -> int:
+        return super().time_ns() + CAMERA_ZERO_NS
+
+
+def mirror_of(bench: Bench) -> AdaptedMirror:
+    mirror = AdaptedMirror(RIG, bench, bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.poll()
+    return mirror
+
+
+def held(n_steps: int, value: float = 0.01) -> NDArray[np.float64]:
+    return RIG.mirror.quantise(np.full((n_steps, 1), value))
+
+
+def ends(mirror: AdaptedMirror) -> list[tuple[int, int, int, int]]:
+    """Block, first step, number of steps and source of each report."""
+    events = mirror.poll()
+    return [(e.block_id, e.first_step, e.n_steps, e.source) for e in events if isinstance(e, pb.Applied)]
+
+
+def test_what_a_mirror_held_is_reported_by_the_block_that_it_was_commanded_with() -> None:
+    mirror = mirror_of(bench := Bench())
+    mirror.send_block(10, np.full((4, 1), 0.01), 0, 0)
+    mirror.send_block(14, np.full((4, 1), 0.02), 0, 0)
+    bench.reports = [(8, held(4)), (12, np.concatenate([held(2), held(3, 0.02)]))]
+    assert ends(mirror) == [(1, 10, 2, pb.Applied.COMMAND), (1, 12, 2, pb.Applied.COMMAND), (2, 14, 3, 0)]
+    bench.reports = [(17, held(3, -0.04))]  # something else, and one step that nothing is queued for
+    assert ends(mirror) == [(2, 17, 1, pb.Applied.CLIPPED), (0, 18, 2, pb.Applied.PARKED)]
+
+
+def test_a_gap_between_reports_is_said_not_to_be_reported() -> None:
+    mirror = mirror_of(bench := Bench())
+    mirror.send_block(0, np.full((8, 1), 0.01), 0, 0)
+    bench.reports = [(0, held(2)), (5, held(3)), (5, held(3))]
+    assert ends(mirror) == [(1, 0, 2, 0), (0, 2, 3, pb.Applied.NOT_REPORTED), (1, 5, 3, 0)]
+    assert mirror.next_timeout_ns() is None
+    assert mirror.await_reports(12, 50) == []
+    assert mirror.next_timeout_ns() == 1_000_000_050
+    (given_up,) = mirror.retransmit(1_000_000_050)
+    assert given_up == pb.Applied(first_step=8, n_steps=4, source=pb.Applied.NOT_REPORTED)
+    assert mirror.next_timeout_ns() is None
+
+
+def test_what_a_driver_raises_refuses_the_command_in_words() -> None:
+    mirror = mirror_of(bench := Bench())
+    bench.refusal = OSError("no such channel")
+    mirror.send_block(0, np.full((8, 1), 0.01), 0, 0)
+    (answered,) = mirror.poll()
+    assert isinstance(answered, CommandAnswered)
+    assert answered.ack.code == pb.NOT_SUPPORTED
+    assert answered.ack.text == "the driver of the mirror failed when it was sent a command: OSError('no such channel')"
+    with pytest.raises(DeviceError, match=r"input 0 at fast step 1 is 0.06, beyond the mirror's limits"):
+        mirror.send_block(0, np.array([[0.0], [0.06]]), 0, 0)
+
+
+@given(
+    st.lists(st.tuples(st.integers(1, 9), st.integers(0, 12), st.booleans()), min_size=1, max_size=6),
+    st.lists(st.integers(0, 9), max_size=8),
+    st.integers(0, 60),
+)
+def test_each_commanded_step_ends_once(
+    blocks: list[tuple[int, int, bool]], gaps: list[int], parked: int
+) -> None:  # fmt: skip
+    """Late and refused commands, gaps between reports, parking in the middle."""
+    mirror = mirror_of(bench := Bench())
+    account, first = Account(report := Report()), 0
+
+    def take(events: Iterable[Event]) -> None:
+        for event in events:
+            if isinstance(event, CommandAnswered):
+                account.answered(event.ack)
+            elif isinstance(event, pb.Applied):
+                account.reported(event)
+
+    for n_steps, late, refused in blocks:
+        bench.late, bench.refusal = late, ValueError() if refused else None
+        account.commanded(mirror.send_block(first, np.full((n_steps, 1), 0.01), 0, 0))
+        first += n_steps
+    step = 0
+    for gap in gaps:
+        bench.reports.append((step + gap, held(3)))
+        step += gap + 3
+        take(mirror.poll())
+    bench.host_ns = EPOCH_NS + parked * STEP_NS
+    step = mirror.park()
+    mirror.await_reports(min(first, step), bench.host_ns)
+    while (due_ns := mirror.next_timeout_ns()) is not None:
+        take(mirror.retransmit(due_ns))
+        take(mirror.poll())
+    take(mirror.poll())
+    account.parked_from(step)
+    account.close()
+    ended = report.steps_applied + report.steps_superseded + report.steps_late + report.steps_refused
+    assert ended + report.steps_not_reported == report.steps_commanded == first
+    assert report.steps_refused == sum(n for n, _, refused in blocks if refused)
+
+
+@pytest.fixture
+def bench() -> CameraBench:
+    return CameraBench()
+
+
+@pytest.fixture
+def camera(bench: CameraBench) -> AdaptedCamera:
+    """Started at fast step 100."""
+    mirror_bench = Bench()
+    camera = AdaptedCamera(RIG, bench, mirror_of(mirror_bench), bench.now_ns)
+    camera.query_clock(bench.host_ns)
+    camera.poll()
+    assert camera.start(100, 0)
+    assert bench.started_ns == CAMERA_ZERO_NS + 100 * STEP_NS
+    bench.host_ns += 10**10
+    return camera
+
+
+def frame(since_zero_ns: int, **changes: object) -> SimpleFrame:
+    """One whose exposure began so long after the mirror's fast step 0."""
+    pixels = np.full(RIG.sensor.shape, 20_000, dtype=np.uint16)
+    return replace(
+        SimpleFrame(pixels=pixels, start_ns=CAMERA_ZERO_NS + since_zero_ns, exposure_ns=EXPOSURE_NS), **changes  # type: ignore[arg-type] # of its fields
+    )  # fmt: skip
+
+
+def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench: CameraBench) -> None:
+    bench.taken = [
+        frame(100 * STEP_NS - 3000),  # as the clocks are compared: no step earlier
+        frame(100 * STEP_NS + PERIOD_NS + STEP_NS // 4),
+        frame(100 * STEP_NS + 4 * PERIOD_NS),
+    ]
+    frames = [event for event in camera.poll() if isinstance(event, Frame)]
+    assert [(f.first_step, f.exposure_offset_ns) for f in frames] == [(100, 0), (300, STEP_NS // 4), (900, 0)]
+    assert [(f.frame_id, f.frames_lost_before) for f in frames] == [(1, 0), (2, 0), (5, 2)]
+    assert all(f.last_step + 1 - f.first_step == RIG.timing.exposure_steps for f in frames)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"pixels": np.zeros((2, 3), np.uint16)}, r"the camera gives \(2, 3\) pixels from 0 to 0, the rig file says"),
+        ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: mend"),
+        ({"start_ns": CAMERA_ZERO_NS + 10**12}, "a frame whose exposure ends in the future"),
+    ],
+)
+def test_a_frame_that_is_not_of_this_rig_is_refused(
+    camera: AdaptedCamera, bench: CameraBench, wrong: dict[str, object], what: str
+) -> None:
+    bench.taken = [frame(100 * STEP_NS, **wrong)]
+    with pytest.raises(DeviceError, match=what):
+        camera.poll()
+
+
+def test_a_step_that_has_gone_by_is_too_late_to_start_at(camera: AdaptedCamera) -> None:
+    assert not camera.start(200, 0)
+
+
+def test_a_second_picture_is_not_to_be_had_of_a_simple_driver(bench: CameraBench) -> None:
+    with pytest.raises(DeviceError, match="no second picture"):
+        AdaptedCamera(load_rig("moving-scene"), bench, mirror_of(Bench()), bench.now_ns)
