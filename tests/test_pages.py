@@ -213,7 +213,7 @@ def test_the_architecture_names_what_there_is() -> None:
         path.stem for path in (ROOT / "aolink").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
     }
     assert named <= there
-    assert there - named == {"__init__", "__main__", "plain", "simulation", "units"}
+    assert there - named == {"__init__", "__main__", "extensions", "plain", "simulation", "units"}
 
 
 def test_commands_in_the_text_have_the_options_that_they_are_given() -> None:
