@@ -6,15 +6,16 @@ is asked for, so that a broken one is in nobody else's way.
 
 from __future__ import annotations
 
-from functools import cache, partial
-from importlib.metadata import EntryPoint, entry_points
+from functools import partial
 
 from aolink.errors import RestorationError
+from aolink.extensions import described, installed, loaded
 from aolink.restoration.lines import inverse, kalman_estimate, why_not_inverse, why_not_lines
 from aolink.restoration.method import Method
 from aolink.restoration.plane import gauss_markov, pnp, tv, why_not_pnp
 
 GROUP = "aolink.restorations"
+_KIND = "restoration method"
 
 
 def _on_lines(name: str, summary: str) -> Method:
@@ -47,7 +48,7 @@ _OWN = {
 
 def method_names() -> tuple[str, ...]:
     """Names of all methods; nothing of other packages is loaded for it."""
-    return (*_OWN, *_installed())
+    return (*_OWN, *(name for name in installed(GROUP) if name not in _OWN))
 
 
 def find_method(name: str) -> Method:
@@ -60,14 +61,13 @@ def find_method(name: str) -> Method:
     """
     if row := _OWN.get(name):
         return row
-    if (point := _installed().get(name)) is None:
+    if (point := installed(GROUP).get(name)) is None:
         raise RestorationError(f"method is {name!r}, expected one of {', '.join(method_names())}")
-    try:
-        row = point.load()
-    except Exception as error:  # whatever another package does wrong
-        raise RestorationError(f"{_where(point)} cannot be loaded: {type(error).__name__}: {error}") from error
+    row = loaded(point, _KIND, RestorationError)
     if not isinstance(row, Method) or row.name != name:
-        raise RestorationError(f"{_where(point)} is {row!r}, expected an aolink.restoration.Method of that name")
+        raise RestorationError(
+            f"{described(point, _KIND)} is {row!r}, expected an aolink.restoration.Method of that name"
+        )
     return row
 
 
@@ -78,13 +78,3 @@ def check_parameters(row: Method, given: dict[str, object]) -> None:
             takers = [each.name for each in _OWN.values() if name in each.parameters]
             what = f"belongs to {', '.join(takers)}" if takers else "is a parameter of no method of aolink"
             raise RestorationError(f"{row.name} takes no {name}, which {what}: leave it out")
-
-
-@cache
-def _installed() -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=GROUP) if point.name not in _OWN}
-
-
-def _where(point: EntryPoint) -> str:
-    package = f" of {point.dist.name}" if point.dist else ""
-    return f"the restoration method {point.name}{package} ({point.value})"

@@ -69,3 +69,9 @@ def test_the_rooms_page_has_the_table() -> None:
         )
         for row in TOPICS
     ]
+
+
+def test_the_page_for_other_software_names_every_topic() -> None:
+    page = (HOUSE.parent / "recordings" / "FORMAT.md").read_text()
+    for row in TOPICS:
+        assert f"`{row.name}" in page or (row.name.startswith(topics.RESTORED) and f"`{topics.RESTORED}" in page)

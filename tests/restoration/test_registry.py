@@ -3,36 +3,31 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import aolink.restoration
 from aolink.errors import RestorationError
 from aolink.restoration import METHODS, find_method, restore
 from tests.restoration.scenes import UNIFORM, blocks, blurred, psnr
 
-ROOT = Path(__file__).parents[2]
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="module")
-def with_packages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """The environment of a program that has the example package installed, and one whose method is missing."""
-    folder = tmp_path_factory.mktemp("packages")
-    subprocess.run(
-        [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index",
-         "--target", folder, ROOT / "tests" / "example_package"],
-        check=True,
-    )  # fmt: skip
-    broken = folder / "broken-1.0.dist-info"
+def with_packages(with_example: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a process with the example package, and a package whose method is missing."""
+    broken = tmp_path_factory.mktemp("broken") / "broken-1.0.dist-info"
     broken.mkdir()
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
     (broken / "entry_points.txt").write_text("[aolink.restorations]\ngone = no_such_module:method\n")
-    return os.environ | {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}", "COLUMNS": "200"}
+    path = os.pathsep.join([str(broken.parent), with_example["PYTHONPATH"]])
+    return with_example | {"PYTHONPATH": path, "COLUMNS": "200"}
 
 
 def test_a_method_of_another_package_restores_a_picture(
@@ -71,8 +66,8 @@ def test_a_method_that_cannot_be_loaded_is_one_line(
     done = aolink(*arguments, env=with_packages)
     assert done.returncode == RestorationError.exit_code
     assert done.stderr == (
-        "aolink: the restoration method gone of broken (no_such_module:method) cannot be loaded: ModuleNotFoundError:"
-        " No module named 'no_such_module'\n"
+        "aolink: the restoration method gone of broken (no_such_module:method) cannot be loaded:"
+        " ModuleNotFoundError(\"No module named 'no_such_module'\")\n"
     )
 
 
@@ -87,3 +82,9 @@ def test_a_method_that_cannot_be_loaded_is_one_line(
 def test_a_parameter_that_a_method_does_not_take(method: str, parameters: dict[str, object], says: str) -> None:
     with pytest.raises(RestorationError, match=says):
         restore(np.ones((9, 9)), np.ones(2), method=method, **parameters)
+
+
+def test_the_rooms_page_names_every_method() -> None:
+    page = (Path(aolink.restoration.__file__).parent / "README.md").read_text()
+    rows = [line.split("|")[1] for line in page.splitlines() if line.startswith("| `")]
+    assert [name for row in rows for name in re.findall(r"`(\w+)`", row)] == list(METHODS)
