@@ -62,6 +62,15 @@ def aolink(tmp_path: Path, command_server: CommandServer) -> Callable[..., subpr
     return run
 
 
+@pytest.fixture(scope="session")
+def with_example(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a process in which tests/example_package is installed."""
+    folder = tmp_path_factory.mktemp("installed")
+    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*command, "--target", folder, Path(__file__).parent / "example_package"], check=True)
+    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(Path(__file__).parents[1])])}
+
+
 @pytest.fixture
 def start_aolink(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
     """Start the command line in the background."""

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from aolink.estimation.batch import Block, blocks
 from aolink.estimation.estimate import Estimate
+from aolink.estimation.estimator import Estimator
 from aolink.estimation.options import Engine
-from aolink.estimation.registry import Estimator, make_estimator
+from aolink.estimation.registry import make_estimator
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 

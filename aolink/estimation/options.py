@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, get_args
 
-from aolink.estimation.frames.moments import Flux
+from aolink.errors import EstimatorError
+from aolink.estimation.frames.frame_data import Flux
 from aolink.estimation.kalman.filter import Noise
 from aolink.estimation.moments.windowed import Basis
 
 Engine = Literal["aolink", "filterpy"]
+
+_HIGHEST_ORDER = 8
 
 
 @dataclass(frozen=True)
@@ -34,3 +37,26 @@ class Options:
     """Of `sampled`."""
     seed: int = 0
     """Of `sampled`: the same one gives the same estimates, bit for bit."""
+
+
+def checked_options(**options: Any) -> Options:
+    """Options by their names. Raises EstimatorError: there is no such option, or it cannot have this value."""
+    known = Options.__dataclass_fields__
+    for key in options:
+        if key not in known:
+            raise EstimatorError(f"estimators have no option {key!r}: use {', '.join(known)}")
+    chosen = Options(**options)
+    choices = {
+        "gain": ("steady-state", "time-varying"),
+        "process_noise": get_args(Noise),
+        "flux": get_args(Flux),
+        "basis": get_args(Basis),
+        "engine": get_args(Engine),
+    }
+    for key, values in choices.items():
+        if getattr(chosen, key) not in values:
+            raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
+    orders = tuple(chosen.orders)
+    if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
+        raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
+    return chosen

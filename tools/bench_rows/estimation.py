@@ -39,7 +39,7 @@ def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
 
 def o3_step(effort: Effort) -> Row:
     """One exposure of 1800 axes, given their moments: correction and prediction."""
-    from aolink.estimation.frames.moments import Measurement
+    from aolink.estimation.frames.frame_data import Measurement
     from aolink.estimation.kalman.filter import BlurFilter
     from aolink.estimation.kalman.observation import PathMoments
     from aolink.estimation.model.exposure_model import exposure_model

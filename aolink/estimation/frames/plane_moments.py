@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.moments import LEAST_FLUX, Flux, Measurement
+from aolink.estimation.frames.frame_data import Flux, Measurement
+from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.numerics import batched
 from aolink.optics.plane import kernel_moments_2d
 

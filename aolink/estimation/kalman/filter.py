@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.estimate import Status
-from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman import two_states
 from aolink.estimation.kalman.observation import MOST_COVARIANCES, Belief, Correction, Observation, PathMoments
 from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis
@@ -64,7 +65,28 @@ def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
     return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
 
 
-class BlurFilter:
+class Filter(ABC):
+    """A filter of one rig: it is given what it needs of exposure after exposure, and says what each came to."""
+
+    @property
+    @abstractmethod
+    def needs(self) -> Needs | None:
+        """What it needs of each frame; None if it does not look at the camera."""
+
+    @abstractmethod
+    def bridge(self, inputs: FloatArray) -> None:
+        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
+
+    @abstractmethod
+    def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
+        """One exposure, with what was needed of its frame, or without."""
+
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
+        """`step` for several exposures at once, where the filter can; None where it cannot."""
+        return None
+
+
+class BlurFilter(Filter):
     """State and prior of all axes, carried from exposure to exposure.
 
     Timing: an exposure's measurement corrects the state at its start; the state at its end is the
@@ -99,8 +121,11 @@ class BlurFilter:
         self._written_out = predict is None and plant.axes == 1 and _is_two_states(plant, observation)
         self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
 
+    @property
+    def needs(self) -> Needs | None:
+        return self.observation.needs if self.observation else None
+
     def bridge(self, inputs: FloatArray) -> None:
-        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
         if len(inputs):
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
@@ -108,7 +133,6 @@ class BlurFilter:
             self._predict_unseen(transition, noise, kick)
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
-        """One exposure, with what the observation takes of it, or without."""
         axes, looks = self.plant.axes, self.observation
         lost = self._missed >= _PATIENCE
         prior = _where(lost, self._unseen, self.belief)

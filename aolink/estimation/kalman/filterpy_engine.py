@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.observation import Belief, Correction, PathMoments, predicted_moments
 from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
 from aolink.estimation.kalman import information, two_states
 from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
 from aolink.numerics import batched, entrywise
@@ -55,6 +55,7 @@ Measured = TypeVar("Measured", contravariant=True)
 class Observation(Protocol[Measured]):
     """A way to look at an exposure."""
 
+    needs: Needs
     models_noise: bool
     """Whether the coefficients go on after the start state, to the process noise inside the exposure."""
     n_measurements: int
@@ -76,14 +77,18 @@ class PathMoments:
         A constant gain (n_states, n_measurements) instead of the optimal one.
     crosses:
         Whether the cross moments of each two outputs follow, y_11 of a lenslet's x and y.
+    flux:
+        As of `Needs`.
     """
 
     models_noise = False
 
     def __init__(
-        self, n_outputs: int, orders: Sequence[int], gain: FloatArray | None = None, *, crosses: bool = False
-    ) -> None:
+        self, n_outputs: int, orders: Sequence[int], gain: FloatArray | None = None, *, crosses: bool = False,
+        flux: Flux = "known",
+    ) -> None:  # fmt: skip
         self.orders, self.gain, self.crosses = tuple(orders), gain, crosses
+        self.needs = Needs(what="moments", orders=self.orders, flux=flux)
         self.n_measurements = n_outputs * len(self.orders) + crosses * math.comb(n_outputs, 2)
 
     def correct(

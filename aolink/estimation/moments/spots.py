@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.moments import Flux
+from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
 from aolink.estimation.kalman.observation import Belief
 from aolink.estimation.model.quadrature import Nodes
 from aolink.estimation.moments.windowed import Basis, Regression, Windowed, expected_response, weighted_sums
@@ -36,32 +35,6 @@ _TERMS = 5
 _HIGHEST = 7
 # A row of pixels of which more are missing is left out; so is, of the rest, a column with any missing.
 _LEAST_OF_A_ROW = 0.5
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SpotWindows:
-    """Densities of the pixels about each spot of each copy of the plant."""
-
-    density: FloatArray
-    """One over slope units squared, zero where the mask is, (axes, spots, rows, columns)."""
-    mask: BoolArray
-    """True where the pixel can be used, (axes, spots, rows, columns)."""
-    light: FloatArray | None = None
-    """Light of each spot, of a whole one, which densities are divided by, (axes, spots); one where None."""
-    usable: BoolArray | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
-
-    def per_light(self, light: FloatArray | None) -> SpotWindows:
-        """The same with densities divided by the light of each spot in the rig's order, (axes * spots,)."""
-        if light is None:
-            return self
-        light = light.reshape(self.density.shape[:2])
-        return SpotWindows(density=self.density / light[..., None, None], mask=self.mask, light=light)
-
-    def part(self, axes: slice) -> SpotWindows:
-        """Of these axes alone."""
-        light = None if self.light is None else self.light[axes]
-        return SpotWindows(density=self.density[axes], mask=self.mask[axes], light=light)
 
 
 class WindowedSpots(Windowed[SpotWindows]):
@@ -91,6 +64,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         self.orders = [*light, *((p, 0) for p in beyond), *((0, p) for p in beyond), *([(1, 1)] if crosses else [])]
         each = len(self.orders)
         lights = [k * each for k in range(spots)]
+        self.needs = Needs(what="windows", least_usable=HALF)
         super().__init__(basis, flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
 
     def look(self, nodes: Nodes, about: Belief, measured: SpotWindows) -> tuple[FloatArray, FloatArray, Regression]:

@@ -30,7 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.estimation.frames.moments import LEAST_FLUX, Flux
+from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
+from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.estimation.kalman.observation import Belief, Correction, corrected
 from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.model.quadrature import Nodes, blocks, nodes_of
@@ -62,25 +63,6 @@ class Seen(Protocol):
 
 
 Light = TypeVar("Light", bound=Seen)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Profile:
-    """Densities of one row of pixels for each axis."""
-
-    density: FloatArray
-    """One over slope units, (axes, pixels)."""
-    mask: NDArray[np.bool_]
-    """True where the pixel can be used, (axes, pixels)."""
-    light: FloatArray | None = None
-    """Light of each spot, of a whole one, which densities are divided by, (axes,); one where None."""
-    usable: NDArray[np.bool_] | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
-
-    def part(self, axes: slice) -> Profile:
-        """Of these axes alone."""
-        light = None if self.light is None else self.light[axes]
-        return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +213,7 @@ class WindowedMoments(Windowed[Profile]):
         self.sensor = sensor
         # A ratio to the light in the window needs the light first.
         self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
+        self.needs = Needs(what="profile", least_usable=HALF)
         super().__init__(basis, flux, lights=[0], light_of=[0] * len(self.orders))
 
     def look(self, nodes: Nodes, about: Belief, measured: Profile) -> tuple[FloatArray, FloatArray, Regression]:

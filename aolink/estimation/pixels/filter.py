@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from aolink.estimation.compiled.modes import drop_repeats
 from aolink.estimation.estimate import Status
-from aolink.estimation.kalman.filter import Posterior, predicted
+from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
+from aolink.estimation.kalman.filter import Filter, Posterior, predicted
 from aolink.estimation.kalman.observation import Belief
 from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis, exposure_model
-from aolink.estimation.moments.spots import SpotWindows
-from aolink.estimation.moments.windowed import Profile
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, single
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.numerics import batched
@@ -80,7 +79,7 @@ class Updates(Protocol):
         """
 
 
-class HypothesisFilter:
+class HypothesisFilter(Filter):
     """A mixture for each axis, carried from exposure to exposure.
 
     Parameters
@@ -121,8 +120,11 @@ class HypothesisFilter:
         updates.update(view.part(one), self.belief.part(one), _part(self._unseen, one), 0)
         view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
 
+    @property
+    def needs(self) -> Needs:
+        return Needs(what="windows" if self.plant.n_outputs > 1 else "profile", least_usable=HALF)
+
     def bridge(self, inputs: FloatArray) -> None:
-        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
         if len(inputs):
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
@@ -140,7 +142,6 @@ class HypothesisFilter:
         )
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
-        """One exposure, with its pixels or without."""
         axes = self.plant.axes
         reduced = self._updates.reduction(model, self.sensor)
         lost = self._missed >= _PATIENCE

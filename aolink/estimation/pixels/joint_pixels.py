@@ -24,13 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
 from aolink.estimation.kalman import information
 from aolink.estimation.kalman.observation import Belief, Correction
 from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
 from aolink.estimation.moments.joint_moments import JointMoments, by_spot
-from aolink.estimation.moments.spots import SpotWindows
 from aolink.estimation.pixels.likelihood import _masses, mehler_series
 from aolink.numerics import single_thread
 from aolink.optics.camera import effective_noise_density, shot_gain
@@ -180,6 +180,7 @@ class JointProfile:
     one number for each output, chi-square together if all is well.
     """
 
+    needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
     models_noise = True
 
     def __init__(self, sensor: SpotSensor, n_outputs: int) -> None:

@@ -21,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.observation import Belief
 from aolink.estimation.model import quadrature
 from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, exposure_model
 from aolink.estimation.model.quadrature import Nodes
-from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
-from aolink.estimation.moments.windowed import Profile, Regression, Windowed, WindowedMoments
+from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import Regression, Windowed, WindowedMoments
 from aolink.numerics import batched
 from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import effective_noise_density, shot_gain

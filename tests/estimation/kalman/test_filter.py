@@ -8,7 +8,7 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 from scipy import linalg, stats
 
 from aolink.estimation.estimate import Status
-from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.observation import (
     Belief,

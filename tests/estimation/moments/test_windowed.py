@@ -8,11 +8,12 @@ from scipy import linalg
 
 from aolink.errors import EstimatorError
 from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.observation import Belief
 from aolink.estimation.model.quadrature import blocks, nodes_of
 from aolink.estimation.moments import windowed
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.optics.camera import pixel_noise_variance, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import load_rig

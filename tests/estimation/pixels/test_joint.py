@@ -26,7 +26,6 @@ from aolink.estimation.moments import windowed
 from aolink.estimation.moments.joint_moments import JointMoments
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import Regression
-from aolink.estimation.options import Options
 from aolink.estimation.pixels import joint_pixels
 from aolink.estimation.pixels.joint_pixels import JointPixels, find_mode
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
@@ -71,7 +70,7 @@ def frame(rig) -> Frame:
     exposures = simulate(rig, 3, seed=4)
     for each in exposures[:2]:
         estimate = estimator.step(each)
-    windows, _ = measure(rig, exposures[2], estimator._observation, estimator.options)
+    windows, _ = measure(rig, exposures[2], estimator.filter.needs)
     model = exposure_model(rig.plant, 200, exposures[2].start_offset)
     return Frame(model, exposures[2], windows, Belief(estimate.end_state, estimate.end_covariance))
 
@@ -180,7 +179,7 @@ def test_o3_is_the_dense_filter_in_every_step(small_membrane, monkeypatch):
     exposures = simulate(rig, 6)
     estimates = run(rig, exposures, ["o3"])["o3"]
     moments = PathMoments(rig.plant.n_outputs, (1, 2))
-    measured = [measure(rig, exposure, moments, Options())[0] for exposure in exposures]
+    measured = [measure(rig, exposure, moments.needs)[0] for exposure in exposures]
     for module in (observation, filters):
         monkeypatch.setattr(module, "MANY_STATES", 10_000)
     model = ExposureModel(rig.plant, 200)

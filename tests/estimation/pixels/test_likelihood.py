@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aolink.estimation import exposure_model, make_estimator
+from aolink.estimation import exposure_model
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.observation import Belief
 from aolink.estimation.moments.spots import WindowedSpots
@@ -43,7 +43,7 @@ def view_of(rig, *, photoelectrons=0.0, seed=1, **how):
     (exposure,) = simulate(rig, 1, seed=seed)
     spots = rig.plant.n_outputs // 2
     looks = WindowedSpots(rig.sensor, spots) if spots else WindowedMoments(rig.sensor)
-    measured, _ = measure(rig, exposure, looks, make_estimator(rig, "moments").options)
+    measured, _ = measure(rig, exposure, looks.needs)
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor, **how)
     return likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced), model

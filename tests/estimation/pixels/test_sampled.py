@@ -7,9 +7,10 @@ import pytest
 from scipy import stats
 
 from aolink.estimation import exposure_model, make_estimator
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.observation import Belief, corrected
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.gaussian_mixture import single
 from aolink.estimation.pixels.sampled import SampledUpdates
@@ -51,7 +52,7 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
 
 
 def seen(rig, exposure):
-    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor), make_estimator(rig, "moments").options)
+    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor).needs)
     updates = SampledUpdates()
     reduced = updates.reduction(MODEL, rig.sensor)
     return likelihood.PixelView(rig.sensor, MODEL, MODEL.response(exposure.inputs), measured, reduced)

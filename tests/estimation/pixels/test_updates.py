@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation import Status, exposure_model, run, score
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.filter import HypothesisFilter
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, single
@@ -33,7 +34,7 @@ def quiet(rig, V):
 def seen(rig=RIG, *, width=1.0, seed=3):
     """One exposure, with a prior of its start state so many times as wide as the plant's own, about the truth."""
     (exposure,) = simulate(rig, 1, seed=seed)
-    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor), make_estimator(rig, "moments").options)
+    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor).needs)
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor)
     view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
@@ -340,7 +341,7 @@ def test_what_commands_left_in_the_state_is_foreseen(name):
 def test_a_lost_mode_is_found_again(name):
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
     rig = load_rig("jitter")
-    how, found = WindowedMoments(rig.sensor), []
+    how, found = WindowedMoments(rig.sensor).needs, []
     for seed in range(1, 7):
         filter_, errors = HypothesisFilter(rig.plant, rig.sensor, UPDATES[name]), []
         for k, exposure in enumerate(simulate(rig, 9, seed=seed)):
@@ -348,7 +349,7 @@ def test_a_lost_mode_is_found_again(name):
                 h = filter_.belief
                 filter_.belief = Hypotheses(h.log_weight, -h.mean, 0.3 * h.covariance)
             model = exposure_model(rig.plant, exposure.n_steps)
-            measured, _ = measure(rig, exposure, how, make_estimator(rig, "moments").options)
+            measured, _ = measure(rig, exposure, how)
             response = model.response(exposure.inputs)
             posterior = filter_.step(model, response, measured)
             path = model.path(posterior.coefficients.mean, response.path)
