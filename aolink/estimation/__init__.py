@@ -10,7 +10,8 @@ from aolink.estimation.frames.moments import measure_moments
 from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.estimation.kalman.filter import BlurFilter, Filter, Posterior
 from aolink.estimation.kalman.observation import PathMoments
-from aolink.estimation.model.exposure_model import ExposureModel, exposure_model, path_from_coefficients
+from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.model.exposure_model import exposure_model, path_from_coefficients
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Engine, Options

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, exposure_model
+from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 

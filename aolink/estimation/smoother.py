@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.model.exposure_model import by_axis
+from aolink.estimation.model.base import by_axis
 from aolink.exposure import Exposure
 from aolink.numerics import batched
 from aolink.plant.lifting import input_response, lift

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RestorationError
 from aolink.estimation import Estimate, Scorer
-from aolink.estimation.motion import coefficient_roots, motion
+from aolink.estimation.estimate import coefficient_roots, motion
 from aolink.exposure import Exposure, step_shares
 from aolink.files import writing
 from aolink.numerics.workers import processes

@@ -221,7 +221,8 @@ def spots_under_turbulence(effort: Effort) -> list[Row]:
 
 def membrane_in_real_time(effort: Effort) -> list[Row]:
     """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and what memory it takes."""
-    from aolink.estimation import ExposureModel, make_estimator
+    from aolink.estimation import make_estimator
+    from aolink.estimation.model.dense import DenseModel
     from aolink.plant.alike import alike_systems
     from aolink.simulation.model import simulate
 
@@ -254,7 +255,7 @@ def membrane_in_real_time(effort: Effort) -> list[Row]:
     tracemalloc.stop()
     systems, steps = alike_systems(rig.plant), rig.timing.exposure_steps
     assert systems is not None
-    coefficients = rig.n_inputs * ExposureModel(systems.one, steps).n_coefficients
+    coefficients = rig.n_inputs * DenseModel(systems.one, steps).n_coefficients
     dense = 8 * rig.n_outputs * steps * coefficients
     figure = "their memory, beside a dense basis"
     rows.append(Row(figure, f"{peak / 1e6:.0f} MB", f"{dense / 1e6:.0f} MB", dense / peak, 5))

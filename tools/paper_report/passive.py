@@ -10,7 +10,7 @@ from scipy import optimize
 
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.observation import predicted_moments
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 
 FloatArray = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman import two_states
 from aolink.estimation.kalman.observation import MOST_COVARIANCES, Belief, Correction, Observation, PathMoments
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis
+from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
 from aolink.numerics import batched, entrywise, single_thread
 from aolink.plant.alike import MANY_STATES
 from aolink.plant.lifting import input_response, lift

@@ -13,7 +13,7 @@ from scipy import linalg
 
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.observation import Belief, Correction, PathMoments, predicted_moments
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 
 FloatArray = NDArray[np.float64]
 

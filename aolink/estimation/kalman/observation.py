@@ -14,7 +14,7 @@ from scipy import linalg
 
 from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
 from aolink.estimation.kalman import information, two_states
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics import batched, entrywise
 from aolink.numerics.entrywise import Entry
 from aolink.plant.alike import MANY_STATES

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics.entrywise import Entry, reciprocal
 
 FloatArray = NDArray[np.float64]

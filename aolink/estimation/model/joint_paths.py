@@ -19,11 +19,11 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.kalman import information
-from aolink.estimation.model.exposure_model import InputResponse, exposure_model
+from aolink.estimation.model.base import InputResponse
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.quadrature import Nodes, Quadrature, Resolution, resolution
-from aolink.numerics import single_thread
+from aolink.numerics import information, single_thread
 from aolink.numerics.covariance import psd_root
 from aolink.optics.sensor import SpotSensor
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.sensor import Sensor

@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
 from aolink.estimation.frames.moments import LEAST_FLUX
-from aolink.estimation.kalman import information
 from aolink.estimation.kalman.observation import Belief, Correction
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, joint_paths
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import _NOT_BELIEVED, _PASSES, Basis, Regression, _memory, _slowest
-from aolink.numerics import batched, single_thread
+from aolink.numerics import batched, information, single_thread
 from aolink.optics.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]

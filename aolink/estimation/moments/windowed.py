@@ -33,7 +33,7 @@ from scipy.special import erf
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
 from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.estimation.kalman.observation import Belief, Correction, corrected
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.quadrature import Nodes, blocks, nodes_of
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density

@@ -19,7 +19,8 @@ from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
 from aolink.estimation.kalman.filter import Filter, Posterior, predicted
 from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis, exposure_model
+from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, single
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.numerics import batched

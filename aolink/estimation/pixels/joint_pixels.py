@@ -25,14 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
-from aolink.estimation.kalman import information
 from aolink.estimation.kalman.observation import Belief, Correction
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
 from aolink.estimation.moments.joint_moments import JointMoments, by_spot
 from aolink.estimation.pixels.likelihood import _masses, mehler_series
-from aolink.numerics import single_thread
+from aolink.numerics import information, single_thread
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.sensor import SpotSensor
 

@@ -24,7 +24,8 @@ from scipy.special import erf
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.observation import Belief
 from aolink.estimation.model import quadrature
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, exposure_model
+from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.model.quadrature import Nodes
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import Regression, Windowed, WindowedMoments

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.exposure_model import ExposureModel
+from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import Update
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction

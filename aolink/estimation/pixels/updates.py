@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.exposure_model import ExposureModel
+from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import Update
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, log_sum, single
 from aolink.estimation.pixels.importance import posterior, proposed

@@ -18,7 +18,7 @@ from aolink.estimation.kalman import information, observation
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.observation import Belief, PathMoments, steady_gain
 from aolink.estimation.model import joint_paths
-from aolink.estimation.model.exposure_model import ExposureModel
+from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths
 from aolink.estimation.model.quadrature import Resolution
@@ -182,7 +182,7 @@ def test_o3_is_the_dense_filter_in_every_step(small_membrane, monkeypatch):
     measured = [measure(rig, exposure, moments.needs)[0] for exposure in exposures]
     for module in (observation, filters):
         monkeypatch.setattr(module, "MANY_STATES", 10_000)
-    model = ExposureModel(rig.plant, 200)
+    model = DenseModel(rig.plant, 200)
     dense = BlurFilter(rig.plant, moments)
     for exposure, found, seen in zip(exposures, estimates, measured, strict=True):
         step = dense.step(model, exposure_model(rig.plant, 200).response(exposure.inputs), seen)
