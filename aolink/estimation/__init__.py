@@ -9,7 +9,7 @@ from aolink.estimation.frames.frame_data import Measurement, Needs, Profile, Spo
 from aolink.estimation.frames.moments import measure_moments
 from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.estimation.kalman.filter import BlurFilter, Filter, Posterior
-from aolink.estimation.kalman.observation import PathMoments
+from aolink.estimation.kalman.path_moments import PathMoments
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.model.exposure_model import exposure_model, path_from_coefficients
 from aolink.estimation.moments.spots import WindowedSpots

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.frame_data import Flux
-from aolink.estimation.kalman.filter import Noise
+from aolink.estimation.kalman.predict import Noise
 from aolink.estimation.moments.windowed import Basis
 
 Engine = Literal["aolink", "filterpy"]

@@ -24,9 +24,11 @@ from aolink.errors import EstimatorError
 from aolink.estimation.estimator import Estimator
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import SpotWindows
-from aolink.estimation.kalman.filter import BlurFilter, Filter, added_noise
+from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
 from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
-from aolink.estimation.kalman.observation import Observation, PathMoments, steady_gain
+from aolink.estimation.kalman.path_moments import Observation, PathMoments
+from aolink.estimation.kalman.predict import added_noise
+from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
 from aolink.estimation.moments.spots import WindowedSpots
@@ -145,12 +147,15 @@ def _paper(*orders: int) -> Callable[[Rig, Options], Filter]:
 
     def build(rig: Rig, options: Options) -> Filter:
         gain = _steady_gain(rig, options) if orders == (1,) and options.gain == "steady-state" else None
-        if options.engine == "aolink":
-            return _blur_filter(rig, options, PathMoments(rig.plant.n_outputs, orders, gain, flux=options.flux))
-        moments = FilterpyMoments(rig.plant.n_outputs, orders, gain, flux=options.flux)
-        return BlurFilter(
-            rig.plant, moments, process_noise=options.process_noise, gate=options.gate, predict=moments.predict
-        )
+        if options.engine == "filterpy":
+            theirs = FilterpyMoments(rig.plant, orders, gain, flux=options.flux)
+            return BlurFilter(
+                rig.plant, theirs, process_noise=options.process_noise, gate=options.gate, predictor=theirs.predict
+            )
+        moments = PathMoments(rig.plant, orders, gain, flux=options.flux)
+        if orders == (1, 2) and TwoStateFilter.suits(rig.plant):
+            return TwoStateFilter(rig.plant, moments, process_noise=options.process_noise, gate=options.gate)
+        return _blur_filter(rig, options, moments)
 
     return build
 

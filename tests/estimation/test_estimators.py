@@ -18,7 +18,7 @@ from aolink.estimation import (
 )
 from aolink.estimation.estimate import COMPARED
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import PathMoments
+from aolink.estimation.kalman.path_moments import PathMoments
 from aolink.plant.lifting import lift
 from aolink.recording.reestimate import first_difference
 from aolink.rig import load_rig
@@ -323,7 +323,7 @@ def test_a_random_walk_is_followed(rig):
 
 
 def test_a_frame_of_the_rig_has_its_moments(rig, exposures):
-    measured, _ = measure(rig, exposures[0], PathMoments(1, (1, 2)).needs)
+    measured, _ = measure(rig, exposures[0], PathMoments(rig.plant, (1, 2)).needs)
     path = exposures[0].truth.path[0]
     errors = measured.value[0] - [path.mean(), np.mean(path**2)]
     assert (np.abs(errors) < 5 * np.sqrt(measured.covariance[0].diagonal())).all()

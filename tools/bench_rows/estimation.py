@@ -41,7 +41,7 @@ def o3_step(effort: Effort) -> Row:
     """One exposure of 1800 axes, given their moments: correction and prediction."""
     from aolink.estimation.frames.frame_data import Measurement
     from aolink.estimation.kalman.filter import BlurFilter
-    from aolink.estimation.kalman.observation import PathMoments
+    from aolink.estimation.kalman.path_moments import PathMoments
     from aolink.estimation.model.exposure_model import exposure_model
 
     axes, sample = 1800, effort.of(100)
@@ -52,7 +52,7 @@ def o3_step(effort: Effort) -> Row:
     R = np.diag([0.0067, 0.004])
     measured = Measurement(value=rng.normal(0, 0.1, (axes, 2)), covariance=np.broadcast_to(R, (axes, 2, 2)))
     response = model.response(np.zeros((200, axes)))
-    ours, turns = BlurFilter(plant, PathMoments(1, (1, 2))), effort.of(100)
+    ours, turns = BlurFilter(plant, PathMoments(plant, (1, 2))), effort.of(100)
     peer = filterpy_loop(model, R, measured.value[:sample])
 
     def steps() -> None:  # as long as the peer's turn, more or less: both find their own code in the caches

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from aolink.estimation.frames.frame_data import Measurement
-from aolink.estimation.kalman.observation import predicted_moments
+from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.model.base import ExposureModel, InputResponse
 
 FloatArray = NDArray[np.float64]

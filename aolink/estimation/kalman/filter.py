@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +14,15 @@ from scipy import special
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman import two_states
-from aolink.estimation.kalman.observation import MOST_COVARIANCES, Belief, Correction, Observation, PathMoments
+from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Belief, Correction
+from aolink.estimation.kalman.path_moments import Observation
+from aolink.estimation.kalman.predict import Noise, Predict, added_noise, predict, predicted_mean
 from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
-from aolink.numerics import batched, entrywise, single_thread
-from aolink.plant.alike import MANY_STATES
+from aolink.numerics import batched
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
 
 FloatArray = NDArray[np.float64]
-Noise = Literal["lifted", "printed"]
-Predict = Callable[[Belief, FloatArray, FloatArray, FloatArray], Belief]
 
 # A measurement that chi-square makes less likely than this is not used. It is wide: the paper's filters leave the
 # process noise inside an exposure out, and have every right to innovations larger than they expect.
@@ -57,12 +55,6 @@ class Posterior:
         """The state at the exposure's first fast step."""
         n = self.end.mean.shape[1]
         return Belief(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
-
-
-def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
-    """What the process noise of one exposure adds to the state's covariance, (n_states, n_states)."""
-    plant = model.plant
-    return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
 
 
 class Filter(ABC):
@@ -100,16 +92,16 @@ class BlurFilter(Filter):
         Covariance that one exposure adds: "lifted", what N fast steps do, or "printed", the paper's B_w W B_w'.
     gate:
         Whether measurements that are too far from their prediction are left out.
-    predict:
-        Another engine's prediction in the place of `predicted`.
+    predictor:
+        Another engine's prediction in the place of `predict`.
     """
 
     def __init__(
         self, plant: Plant, observation: Observation[Any] | None, *, process_noise: Noise = "lifted",
-        gate: bool = True, predict: Predict | None = None,
+        gate: bool = True, predictor: Predict | None = None,
     ) -> None:  # fmt: skip
         self.plant, self.observation = plant, observation
-        self._process_noise, self._predict = process_noise, predict or predicted
+        self._process_noise, self._predict = process_noise, predictor or predict
         prior = Belief(batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes))
         self.belief = prior
         # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
@@ -118,7 +110,6 @@ class BlurFilter(Filter):
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
-        self._written_out = predict is None and plant.axes == 1 and _is_two_states(plant, observation)
         self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
 
     @property
@@ -144,11 +135,11 @@ class BlurFilter(Filter):
             status = np.full(axes, Status.PREDICTED if looks is None else Status.INPUT_INVALID, dtype=np.int64)
             coefficients = prior
         else:
-            done = looks.correct(model, response, prior, measured)
+            done = looks.update(model, response, prior, measured)
             done = _without(done, measured.usable)
             coefficients, status = self._trusted(prior, done, lost, measured.usable)
         if with_noise:
-            self.belief = predicted(coefficients, model.end_rows, model.end_remainder, response.end)
+            self.belief = predict(coefficients, model.end_rows, model.end_remainder, response.end)
         else:
             noise = added_noise(model, self._process_noise)
             self.belief = self._predict(coefficients, model.transition, noise, response.end)
@@ -162,42 +153,13 @@ class BlurFilter(Filter):
             nis=_numbers(done.nis),
         )
 
-    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
-        """`step` for exposures without a gap between them, all at once and to the same bits, as far as they can be
-        believed; None where that is none.
-
-        Parameters
-        ----------
-        responses, measured:
-            One row for each exposure.
-        """
-        if not self._written_out or self._missed[0]:
-            return None
-        noise, belief = added_noise(model, self._process_noise), self.belief
-        state, covariance = belief.mean[0], belief.covariance[0]
-        done = two_states.run(
-            model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
-        )
-        count = len(done.nis)
-        if not count:
-            return None
-        self.belief = Belief(done.end[-1], done.end_covariance[-1])
-        settled = None if self._settled_under is model.transition else _SETTLED
-        before = self._unseen
-        mean, covariance, is_settled = two_states.unseen(
-            model, before.mean[0], before.covariance[0], responses.end[:count], settled
-        )
-        self._unseen = Belief(mean[None], covariance[None])
-        self._settled_under = model.transition if is_settled else None
-        return done
-
     def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
         """Carry on what would be believed without a camera; a covariance that has settled is not computed again."""
         before = self._unseen
         if transition is self._settled_under:
-            self._unseen = Belief(_predicted_mean(before.mean, transition, kick), before.covariance)
+            self._unseen = Belief(predicted_mean(before.mean, transition, kick), before.covariance)
             return
-        self._unseen = after = predicted(before, transition, noise, kick)
+        self._unseen = after = predict(before, transition, noise, kick)
         change = np.abs(after.covariance - before.covariance).max()
         settled = change <= _SETTLED * np.abs(before.covariance).max()
         self._settled_under = transition if settled else None
@@ -226,33 +188,42 @@ class BlurFilter(Filter):
         return _where(refused, prior, after), status
 
 
-def _is_two_states(plant: Plant, observation: Observation[Any] | None) -> bool:
-    """Whether it is what `two_states` has written out."""
-    return (
-        type(observation) is PathMoments
-        and (plant.n_states, plant.n_outputs) == (2, 1)
-        and observation.orders == (1, 2)
-        and observation.gain is None
-    )
+class TwoStateFilter(BlurFilter):
+    """o3 of one axis with two states: a series of exposures is one loop over numbers, to the same bits."""
 
+    @staticmethod
+    def suits(plant: Plant) -> bool:
+        """Whether a plant is of this size."""
+        return (plant.axes, plant.n_states, plant.n_outputs) == (1, 2, 1)
 
-def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
-    """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
-    mean = _predicted_mean(belief.mean, transition, kick)
-    if max(transition.shape) > entrywise.MOST_ROWS:
-        spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence
-        return Belief(mean, batched.symmetric(spread(transition, belief.covariance) + noise))
-    P, Q = entrywise.unpack(belief.covariance), entrywise.unpack(noise)
-    covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
-    return Belief(mean, entrywise.pack(covariance, len(belief.covariance)))
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
+        """`step` for exposures without a gap between them, all at once and to the same bits, as far as they can be
+        believed; None where that is none.
 
-
-def _predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:
-    """x -> A x + d"""
-    if max(transition.shape) > entrywise.MOST_ROWS:
-        return batched.matvec(transition, mean) + kick
-    moved = entrywise.times_vector(entrywise.unpack(transition), entrywise.columns(mean))
-    return entrywise.pack_vector(entrywise.add(moved, entrywise.columns(kick)), len(mean))
+        Parameters
+        ----------
+        responses, measured:
+            One row for each exposure.
+        """
+        if self._missed[0]:
+            return None
+        noise, belief = added_noise(model, self._process_noise), self.belief
+        state, covariance = belief.mean[0], belief.covariance[0]
+        done = two_states.run(
+            model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
+        )
+        count = len(done.nis)
+        if not count:
+            return None
+        self.belief = Belief(done.end[-1], done.end_covariance[-1])
+        settled = None if self._settled_under is model.transition else _SETTLED
+        before = self._unseen
+        mean, covariance, is_settled = two_states.unseen(
+            model, before.mean[0], before.covariance[0], responses.end[:count], settled
+        )
+        self._unseen = Belief(mean[None], covariance[None])
+        self._settled_under = model.transition if is_settled else None
+        return done
 
 
 def _without(done: Correction, usable: NDArray[np.bool_] | None) -> Correction:

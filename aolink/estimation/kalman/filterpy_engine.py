@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.estimation.frames.frame_data import Measurement
-from aolink.estimation.kalman.observation import Belief, Correction, PathMoments, predicted_moments
+from aolink.estimation.kalman.gaussian import Belief, Correction
+from aolink.estimation.kalman.path_moments import PathMoments, predicted_moments
 from aolink.estimation.model.base import ExposureModel, InputResponse
 
 FloatArray = NDArray[np.float64]
 
 
 class FilterpyMoments(PathMoments):
-    """`PathMoments` with every correction and prediction done by filterpy."""
+    """`PathMoments` with every update and prediction done by filterpy."""
 
-    def correct(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
-    ) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement) -> Correction:
         """KalmanFilter for the centroid alone, ExtendedKalmanFilter where the second moment is taken."""
         from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 
@@ -35,7 +34,7 @@ class FilterpyMoments(PathMoments):
         noise = measured.covariance[0]
         ekf.R = linalg.block_diag(*noise) if noise.ndim == 3 else np.array(noise)
         if linear:
-            self._correct_linear(ekf, model, measured.value[0][:, None] - response.mean[0][:, None])
+            self._update_linear(ekf, model, measured.value[0][:, None] - response.mean[0][:, None])
         else:
             ekf.update(
                 measured.value[0][:, None],
@@ -45,7 +44,7 @@ class FilterpyMoments(PathMoments):
         nis = (ekf.y.T @ np.linalg.solve(ekf.S, ekf.y))[0]
         return Correction(Belief(ekf.x.T, ekf.P[None]), ekf.y.T, ekf.S[None], nis)
 
-    def _correct_linear(self, kf: Any, model: ExposureModel, z: FloatArray) -> None:
+    def _update_linear(self, kf: Any, model: ExposureModel, z: FloatArray) -> None:
         H = model.mean_row
         kf.H = H
         if self.gain is None:

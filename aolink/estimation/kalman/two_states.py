@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 Weights = tuple[float, float, float]
 
 
-def corrected(
+def update(
     mean: Sequence[Entry], spread: Sequence[Entry], innovation: Sequence[Entry], slopes: Sequence[Sequence[Entry]],
     noise: Sequence[Entry], *, together: bool,
 ) -> tuple[Entry, ...]:  # fmt: skip
@@ -122,7 +122,7 @@ def run(
         half0, half1 = m00 * x + m01 * v + b0, m10 * x + m11 * v + b1
         z1 = y1 - (f0 * x + f1 * v + mean)
         z2 = y2 - (x * (half0 + b0) + v * (half1 + b1) + square)
-        after: tuple[float, ...] = corrected(  # type: ignore[assignment] # numbers in, numbers out
+        after: tuple[float, ...] = update(  # type: ignore[assignment] # numbers in, numbers out
             (x, v), (p, q, r), (z1, z2), ((f0, f1), (2 * half0, 2 * half1)), (noise, shared, rest),
             together=shared != 0.0,
         )  # fmt: skip

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
 from aolink.estimation.frames.moments import LEAST_FLUX
-from aolink.estimation.kalman.observation import Belief, Correction
+from aolink.estimation.kalman.gaussian import Belief, Correction
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, joint_paths
@@ -52,9 +52,7 @@ class JointMoments:
         self.n_measurements = self._spot.n_measurements * (n_outputs // 2)
 
     @single_thread.by_one_thread
-    def correct(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
-    ) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows) -> Correction:
         """Iterated statistical linearisation, copy by copy of the plant."""
         assert isinstance(model, FactoredModel)
         paths, n = joint_paths(model, self.sensor), model.plant.n_states

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.model.quadrature import Nodes
 from aolink.estimation.moments.windowed import Basis, Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched

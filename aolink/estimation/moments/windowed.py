@@ -32,7 +32,8 @@ from scipy.special import erf
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
 from aolink.estimation.frames.moments import LEAST_FLUX
-from aolink.estimation.kalman.observation import Belief, Correction, corrected
+from aolink.estimation.kalman.gaussian import Belief, Correction
+from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.quadrature import Nodes, blocks, nodes_of
 from aolink.numerics import batched
@@ -102,11 +103,11 @@ class Windowed(ABC, Generic[Light]):
         self._lights, self._light_of = list(lights), np.array(light_of)
         self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
 
-    def correct(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
         """Iterated statistical linearisation, from the prior to the posterior."""
         nodes = nodes_of(model, response, blocks(model.n_steps, self.most_nodes))
         parts = [
-            self._correct(model, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
+            self._update(model, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
         ]
         if len(parts) == 1:
@@ -114,7 +115,7 @@ class Windowed(ABC, Generic[Light]):
         joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
         return Correction(Belief(joined[0], joined[1]), *joined[2:])
 
-    def _correct(self, model: ExposureModel, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
+    def _update(self, model: ExposureModel, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
         about, rho = prior, np.full(len(prior.mean), _slowest(model.transition[None])[0])
         memory = _memory(rho)
         for to_come in reversed(range(_PASSES)):
@@ -124,7 +125,7 @@ class Windowed(ABC, Generic[Light]):
                 y, noise, fit = self._ratios(y, noise, fit)
             innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
             R = noise + memory[:, None, None] * fit.remainder
-            done = corrected(prior, innovation, fit.slope, R)
+            done = joseph_update(prior, innovation, fit.slope, R)
             about = done.posterior
             if to_come:
                 memory = _memory(np.sqrt(rho * _slowest(_closed_loop(model, prior, fit.slope, R))))

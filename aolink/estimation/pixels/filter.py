@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from aolink.estimation.compiled.modes import drop_repeats
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
-from aolink.estimation.kalman.filter import Filter, Posterior, predicted
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.filter import Filter, Posterior
+from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.predict import predict
 from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, single
@@ -134,7 +135,7 @@ class HypothesisFilter(Filter):
 
     def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
         """The next of `_unseen`; that of an unstable plant stays where it is so wide that it says nothing."""
-        now, later = self._unseen, predicted(self._unseen, transition, noise, kick)
+        now, later = self._unseen, predict(self._unseen, transition, noise, kick)
         widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
         grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)
         return Belief(

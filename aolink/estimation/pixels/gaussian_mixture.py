@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.numerics import batched
 
 FloatArray = NDArray[np.float64]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, joined, log_sum, stacked_axes, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.tempering import annealed, fitted

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
-from aolink.estimation.kalman.observation import Belief, Correction
+from aolink.estimation.kalman.gaussian import Belief, Correction
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
@@ -187,9 +187,7 @@ class JointProfile:
         self._moments = JointMoments(sensor, n_outputs)
 
     @single_thread.by_one_thread
-    def correct(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
-    ) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows) -> Correction:
         """The mode of the posterior, copy by copy of the plant."""
         assert isinstance(model, FactoredModel)
         paths, n = joint_paths(model, self.sensor), model.plant.n_states

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.model import quadrature
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.exposure_model import exposure_model

@@ -20,7 +20,8 @@ from scipy import special
 from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.compiled import moments as compiled_moments
 from aolink.estimation.compiled.line import Line
-from aolink.estimation.kalman.observation import Belief, corrected
+from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import cholesky, lower_inverse
@@ -207,7 +208,7 @@ def broad(view: PixelView, prior: Belief) -> Belief:
         innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
         # A window without a pixel that can be used has neither moments nor noise.
         spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
-        about = corrected(prior, innovation, fit.slope, spread).posterior
+        about = joseph_update(prior, innovation, fit.slope, spread).posterior
     return about
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import Update
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, stacked_axes

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import Update
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, log_sum, single

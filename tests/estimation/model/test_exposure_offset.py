@@ -9,7 +9,7 @@ from scipy import linalg
 
 from aolink.errors import RigError
 from aolink.estimation import exposure_model, run, score
-from aolink.estimation.kalman.observation import predicted_moments
+from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.model.quadrature import blocks, nodes_of
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.optics.frame import frame_density

@@ -10,7 +10,7 @@ from scipy import linalg
 from aolink.estimation import Status, exposure_model, make_estimator, run, score
 from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.model.quadrature import blocks, nodes_of
 from aolink.estimation.moments import windowed
 from aolink.estimation.moments.spots import WindowedSpots

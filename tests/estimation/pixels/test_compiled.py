@@ -11,7 +11,7 @@ import pytest
 from aolink.estimation import exposure_model, make_estimator
 from aolink.estimation.compiled import forget_stale, small
 from aolink.estimation.frames.frame_data import Profile
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.pixels import likelihood, modes
 from aolink.estimation.pixels.filter import HypothesisFilter
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, log_determinant, single

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
 
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, joined, log_sum, single
 
 

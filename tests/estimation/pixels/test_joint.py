@@ -13,10 +13,11 @@ from aolink.errors import EstimatorError
 from aolink.estimation import Status, exposure_model, make_estimator, run, score, smooth
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman import filter as filters
-from aolink.estimation.kalman import information, observation
+from aolink.estimation.kalman import path_moments, predict
 from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.observation import Belief, PathMoments, steady_gain
+from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.path_moments import PathMoments
+from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model import joint_paths
 from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
@@ -31,6 +32,7 @@ from aolink.estimation.pixels.joint_pixels import JointPixels, find_mode
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.estimation.pixels.modes import find_modes, whitened
 from aolink.exposure import Exposure
+from aolink.numerics import information
 from aolink.optics.sensor import Kernel
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.model import simulate
@@ -178,10 +180,11 @@ def test_o3_is_the_dense_filter_in_every_step(small_membrane, monkeypatch):
     rig = small_membrane
     exposures = simulate(rig, 6)
     estimates = run(rig, exposures, ["o3"])["o3"]
-    moments = PathMoments(rig.plant.n_outputs, (1, 2))
-    measured = [measure(rig, exposure, moments.needs)[0] for exposure in exposures]
-    for module in (observation, filters):
+    needs = make_estimator(rig, "o3").filter.needs
+    measured = [measure(rig, exposure, needs)[0] for exposure in exposures]
+    for module in (path_moments, predict):
         monkeypatch.setattr(module, "MANY_STATES", 10_000)
+    moments = PathMoments(rig.plant, (1, 2))
     model = DenseModel(rig.plant, 200)
     dense = BlurFilter(rig.plant, moments)
     for exposure, found, seen in zip(exposures, estimates, measured, strict=True):
@@ -215,8 +218,8 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
 
     monkeypatch.setattr(theirs, "regression", lambda *arguments: of_each_spot(theirs, *arguments))
     before = whole_prior(frame, paths.size)
-    expected = theirs.correct(frame.model, frame.response, before, frame.windows)
-    found = JointMoments(rig.sensor, rig.plant.n_outputs, flux=flux).correct(
+    expected = theirs.update(frame.model, frame.response, before, frame.windows)
+    found = JointMoments(rig.sensor, rig.plant.n_outputs, flux=flux).update(
         frame.model, frame.response, before, frame.windows
     )
     joint_paths.joint_paths.cache_clear()

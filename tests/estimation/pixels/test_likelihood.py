@@ -7,7 +7,7 @@ import pytest
 
 from aolink.estimation import exposure_model
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood

@@ -9,7 +9,8 @@ from scipy import stats
 from aolink.estimation import exposure_model, make_estimator
 from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief, corrected
+from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.gaussian_mixture import single
@@ -44,7 +45,7 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
     truth = before.mean[0] + np.linalg.cholesky(before.covariance[0]) @ rng.standard_normal(reduced.size)
     view = LinearView(H, (H @ truth + 0.3 * rng.standard_normal(4))[None], 0.3, reduced)
     t = SampledUpdates(particles=4000).sample(view, single(PRIOR), 0)[0]
-    kalman = corrected(before, view.y - before.mean @ H.T, H[None], 0.09 * np.eye(4)[None]).posterior
+    kalman = joseph_update(before, view.y - before.mean @ H.T, H[None], 0.09 * np.eye(4)[None]).posterior
     sd = np.sqrt(np.diag(kalman.covariance[0]))
     np.testing.assert_allclose((t.mean(axis=0) - kalman.mean[0]) / sd, 0, atol=0.1)
     white = np.linalg.solve(np.linalg.cholesky(kalman.covariance[0]), (t - kalman.mean[0]).T)

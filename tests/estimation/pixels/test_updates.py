@@ -9,7 +9,7 @@ from scipy.linalg import expm, solve_discrete_lyapunov
 from aolink.estimation import Status, exposure_model, run, score
 from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Belief
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.filter import HypothesisFilter

@@ -3,7 +3,7 @@
 import numpy as np
 
 from aolink.estimation import BlurFilter, EstimatorRow, Needs
-from aolink.estimation.kalman.observation import corrected
+from aolink.estimation.kalman.update import joseph_update
 
 THRESHOLD = 0.2  # of the brightest pixel
 CENTROID_SD = 0.1  # slope units
@@ -17,14 +17,14 @@ class Threshold:
     def __init__(self, sensor):
         self.sensor = sensor
 
-    def correct(self, model, response, prior, measured):
+    def update(self, model, response, prior, measured):
         brightest = measured.density.max(axis=1, keepdims=True)
         light = np.where(measured.density > THRESHOLD * brightest, measured.density, 0.0)
         centroid = light @ self.sensor.centres / light.sum(axis=1)
         innovation = centroid[:, None] - prior.mean @ model.mean_row.T - response.mean
         H = np.tile(model.mean_row, (len(innovation), 1, 1))
         R = np.full((len(innovation), 1, 1), CENTROID_SD**2)
-        return corrected(prior, innovation, H, R)
+        return joseph_update(prior, innovation, H, R)
 
 
 def refusal(rig):

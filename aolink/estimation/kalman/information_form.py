@@ -1,4 +1,4 @@
-"""Corrections of a plant with hundreds of states, in information form: posterior = (P^-1 + H' R^-1 H)^-1.
+"""Updates of a plant with hundreds of states, in information form: posterior = (P^-1 + H' R^-1 H)^-1.
 
 The information that frames add is a sum over spots, of which each knows its own noise; nothing is as large as
 measurements times measurements. All products are those of `aolink.numerics.single_thread`.
@@ -19,7 +19,7 @@ _MOST_EXPOSURES = 1000
 _SETTLED = 1e-11
 
 
-def corrected(
+def update(
     mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """One step of a Kalman filter for one axis, y the innovation, with the optimal gain or another one.
