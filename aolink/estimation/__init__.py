@@ -9,7 +9,9 @@ from aolink.estimation.frames.frame_data import Measurement, Needs, Profile, Spo
 from aolink.estimation.frames.moments import measure_moments
 from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.estimation.kalman.filter import BlurFilter, Filter, Posterior
+from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.path_moments import PathMoments
+from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.model.exposure_model import exposure_model, path_from_coefficients
 from aolink.estimation.moments.spots import WindowedSpots
@@ -34,6 +36,7 @@ __all__ = [
     "EstimatorRow",
     "ExposureModel",
     "Filter",
+    "Gaussian",
     "Measurement",
     "Needs",
     "Options",
@@ -44,11 +47,13 @@ __all__ = [
     "Scorer",
     "SpotWindows",
     "Status",
+    "Update",
     "WindowedMoments",
     "WindowedSpots",
     "estimator_row",
     "estimator_rows",
     "exposure_model",
+    "joseph_update",
     "make_estimator",
     "measure_moments",
     "measure_moments_2d",

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.batch import Block
+from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.frames.measure import Measured, Measurements
 from aolink.estimation.kalman.filter import Filter, Posterior
@@ -31,46 +31,46 @@ class Estimator:
 
     def step(self, exposure: Exposure) -> Estimate:
         """The estimate of an exposure, from it and from all that came before."""
-        (estimate,) = self.steps(Block(self.rig, [exposure]))
+        (estimate,) = self.steps(Batch(self.rig, [exposure]))
         return estimate
 
-    def steps(self, block: Block) -> Iterator[Estimate]:
+    def steps(self, batch: Batch) -> Iterator[Estimate]:
         """The estimates of exposures one after the other, to the same bits."""
-        measured = Measurements(self.rig, block.exposures, self.filter.needs)
+        measured = Measurements(self.rig, batch.exposures, self.filter.needs)
         k = 0
-        while k < len(block.exposures):
-            done = self._run(block, measured, k)
+        while k < len(batch.exposures):
+            done = self._run(batch, measured, k)
             if done is None:
-                yield self._stepped(block, k, measured[k])
+                yield self._stepped(batch, k, measured[k])
                 k += 1
                 continue
             count = len(done.nis)
-            last = block.exposures[k + count - 1]
+            last = batch.exposures[k + count - 1]
             self._next_step, self._last_input = last.first_step + last.n_steps, last.inputs[-1]
-            yield from self._believed(block, k, done)
+            yield from self._believed(batch, k, done)
             k += count
 
-    def _run(self, block: Block, measured: Measurements, first: int) -> Run | None:
+    def _run(self, batch: Batch, measured: Measurements, first: int) -> Run | None:
         """What the filter makes of exposures from ``first`` on between which there is no gap, and that have no flaw."""
         row, moments = measured.rows[first], measured.moments
-        if block.model is None or moments is None or row < 0:
+        if batch.model is None or moments is None or row < 0:
             return None
         end, next_step = first, self._next_step
-        for exposure in block.exposures[first:]:
+        for exposure in batch.exposures[first:]:
             follows = next_step in (None, exposure.first_step) and not len(exposure.lead_inputs)
-            if not (follows and block.finite[end] and measured.rows[end] == row + end - first):
+            if not (follows and batch.finite[end] and measured.rows[end] == row + end - first):
                 break
             end, next_step = end + 1, exposure.first_step + exposure.n_steps
         if end == first:
             return None
         axes = self.rig.plant.axes
-        responses = block.responses.of(slice(first * axes, end * axes))
-        return self.filter.run(block.model, responses, measured.some(row, row + end - first))
+        responses = batch.responses.of(slice(first * axes, end * axes))
+        return self.filter.run(batch.model, responses, measured.some(row, row + end - first))
 
-    def _believed(self, block: Block, first: int, done: Run) -> Iterator[Estimate]:
+    def _believed(self, batch: Batch, first: int, done: Run) -> Iterator[Estimate]:
         """Estimates of a run of exposures."""
-        assert block.model is not None
-        exposures = block.exposures[first : first + len(done.nis)]
+        assert batch.model is not None
+        exposures = batch.exposures[first : first + len(done.nis)]
         for exposure, state, covariance, end, end_covariance, innovation, S, nis in zip(
             exposures, done.coefficients, done.covariance, done.end, done.end_covariance, done.innovation,
             done.innovation_covariance, done.nis, strict=True,
@@ -89,18 +89,18 @@ class Estimator:
                 coefficients=state,
                 coefficient_covariance=covariance,
                 inputs=exposure.inputs,
-                model=block.model,
+                model=batch.model,
                 innovation=innovation,
                 innovation_covariance=S,
                 nis=nis,
             )
 
-    def _stepped(self, block: Block, k: int, measured: Measured) -> Estimate:
+    def _stepped(self, batch: Batch, k: int, measured: Measured) -> Estimate:
         """The estimate of exposure k, whatever it is like."""
-        exposure, model = block.exposures[k], block.model_of(k)
+        exposure, model = batch.exposures[k], batch.model_of(k)
         reasons = self._bridge(exposure)
         taken, remark = measured
-        posterior = self.filter.step(model, block.response_to(k), taken)
+        posterior = self.filter.step(model, batch.response_to(k), taken)
         self.several = posterior.several
         reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance

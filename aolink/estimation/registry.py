@@ -229,17 +229,17 @@ def _mixture(rig: Rig, options: Options) -> Filter:
 
 
 def _sampled(rig: Rig, options: Options) -> Filter:
-    from aolink.estimation.pixels.sampled import SampledUpdates
+    from aolink.estimation.pixels.sampled import TemperedUpdater
 
-    return _of_pixels(rig, options, SampledUpdates(options.particles, options.seed))
+    return _of_pixels(rig, options, TemperedUpdater(options.particles, options.seed))
 
 
 def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
     """The filters of the pixels themselves; the code that they compile is loaded when one is wanted."""
-    from aolink.estimation.pixels.filter import HypothesisFilter
+    from aolink.estimation.pixels.filter import MixtureFilter
     from aolink.estimation.pixels.updates import MIXTURE
 
-    pixels = HypothesisFilter(rig.plant, rig.sensor, updates, gate=options.gate)
+    pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
     # What profile compiles when a blur has several readings, mixture does at once.
     pixels.warm_up(MIXTURE)
     updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)

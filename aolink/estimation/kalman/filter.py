@@ -14,7 +14,7 @@ from scipy import special
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman import two_states
-from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Belief, Correction
+from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.estimation.kalman.path_moments import Observation
 from aolink.estimation.kalman.predict import Noise, Predict, added_noise, predict, predicted_mean
 from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
@@ -36,9 +36,9 @@ _SETTLED = 1e-13
 class Posterior:
     """What one exposure came to."""
 
-    coefficients: Belief
+    coefficients: Gaussian
     """Of the exposure basis; the start state comes first."""
-    end: Belief
+    end: Gaussian
     status: NDArray[np.int64]
     """`Status` of each axis, (axes,)."""
     innovation: FloatArray
@@ -51,10 +51,10 @@ class Posterior:
     """Whether the blur was seen to have more than one reading, (axes,); None where nobody looked for it."""
 
     @property
-    def start(self) -> Belief:
+    def start(self) -> Gaussian:
         """The state at the exposure's first fast step."""
         n = self.end.mean.shape[1]
-        return Belief(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
+        return Gaussian(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
 
 
 class Filter(ABC):
@@ -102,10 +102,12 @@ class BlurFilter(Filter):
     ) -> None:  # fmt: skip
         self.plant, self.observation = plant, observation
         self._process_noise, self._predict = process_noise, predictor or predict
-        prior = Belief(batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes))
+        prior = Gaussian(
+            batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes)
+        )
         self.belief = prior
         # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
-        self._unseen = Belief(prior.mean, prior.covariance[:1])
+        self._unseen = Gaussian(prior.mean, prior.covariance[:1])
         # The transition that no longer changes it.
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
@@ -131,7 +133,7 @@ class BlurFilter(Filter):
         if with_noise:
             prior = _with_noise(prior, model.n_coefficients)
         if measured is None or looks is None:
-            done = Correction(prior, np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes))
+            done = Update(prior, np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes))
             status = np.full(axes, Status.PREDICTED if looks is None else Status.INPUT_INVALID, dtype=np.int64)
             coefficients = prior
         else:
@@ -157,7 +159,7 @@ class BlurFilter(Filter):
         """Carry on what would be believed without a camera; a covariance that has settled is not computed again."""
         before = self._unseen
         if transition is self._settled_under:
-            self._unseen = Belief(predicted_mean(before.mean, transition, kick), before.covariance)
+            self._unseen = Gaussian(predicted_mean(before.mean, transition, kick), before.covariance)
             return
         self._unseen = after = predict(before, transition, noise, kick)
         change = np.abs(after.covariance - before.covariance).max()
@@ -165,8 +167,8 @@ class BlurFilter(Filter):
         self._settled_under = transition if settled else None
 
     def _trusted(
-        self, prior: Belief, done: Correction, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
-    ) -> tuple[Belief, NDArray[np.int64]]:
+        self, prior: Gaussian, done: Update, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
+    ) -> tuple[Gaussian, NDArray[np.int64]]:
         """The correction where there is one that can be believed, the prior elsewhere; and the status of each axis."""
         after, missed = done.posterior, self._missed
         used = done.nis <= self._gate
@@ -215,25 +217,25 @@ class TwoStateFilter(BlurFilter):
         count = len(done.nis)
         if not count:
             return None
-        self.belief = Belief(done.end[-1], done.end_covariance[-1])
+        self.belief = Gaussian(done.end[-1], done.end_covariance[-1])
         settled = None if self._settled_under is model.transition else _SETTLED
         before = self._unseen
         mean, covariance, is_settled = two_states.unseen(
             model, before.mean[0], before.covariance[0], responses.end[:count], settled
         )
-        self._unseen = Belief(mean[None], covariance[None])
+        self._unseen = Gaussian(mean[None], covariance[None])
         self._settled_under = model.transition if is_settled else None
         return done
 
 
-def _without(done: Correction, usable: NDArray[np.bool_] | None) -> Correction:
+def _without(done: Update, usable: NDArray[np.bool_] | None) -> Update:
     """Innovations, their covariance and NIS of zero for axes of which nothing was measured."""
     if usable is None:
         return done
     innovation = np.where(usable[:, None], done.innovation, 0.0)
     covariance = done.innovation_covariance
     covariance = np.where(usable.reshape(-1, *[1] * (covariance.ndim - 1)), covariance, 0.0)
-    return Correction(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
+    return Update(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
 
 
 def _kept(covariance: FloatArray) -> FloatArray:
@@ -243,12 +245,12 @@ def _kept(covariance: FloatArray) -> FloatArray:
     return covariance
 
 
-def _with_noise(state: Belief, count: int) -> Belief:
+def _with_noise(state: Gaussian, count: int) -> Gaussian:
     """The start state and the noise coefficients, which nothing is known of before the exposure: N(0, I)."""
     axes, n = state.mean.shape
     mean, covariance = np.zeros((axes, count)), np.tile(np.eye(count), (axes, 1, 1))
     mean[:, :n], covariance[:, :n, :n] = state.mean, state.covariance
-    return Belief(mean, covariance)
+    return Gaussian(mean, covariance)
 
 
 def _numbers(values: FloatArray) -> FloatArray:
@@ -260,7 +262,7 @@ def _has_finite_sum(values: FloatArray) -> bool:
     return math.isfinite(np.add.reduce(values, axis=None))
 
 
-def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
+def _where(chosen: NDArray[np.bool_], first: Gaussian, second: Gaussian) -> Gaussian:
     """Axis by axis, the first belief where chosen."""
     which = np.flatnonzero(chosen)
     if not len(which):
@@ -268,4 +270,4 @@ def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
     mean, covariance = second.mean.copy("K"), second.covariance.copy("K")
     mean[which] = first.mean[which]
     covariance[which] = first.covariance[which] if len(first.covariance) > 1 else first.covariance[0]
-    return Belief(mean, covariance)
+    return Gaussian(mean, covariance)

@@ -15,7 +15,7 @@ MOST_COVARIANCES = 32
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
+class Gaussian:
     """A Gaussian for each axis."""
 
     mean: FloatArray
@@ -25,10 +25,10 @@ class Belief:
 
 
 @dataclass(frozen=True, eq=False)
-class Correction:
+class Update:
     """What a measurement made of a belief."""
 
-    posterior: Belief
+    posterior: Gaussian
     innovation: FloatArray
     """(axes, n_measurements)"""
     innovation_covariance: FloatArray

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
-from aolink.estimation.kalman.gaussian import Belief, Correction
+from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import (
     blocked_update,
     information_update,
@@ -26,7 +26,7 @@ from aolink.plant.alike import MANY_STATES
 from aolink.rig import Plant
 
 FloatArray = NDArray[np.float64]
-Form = Callable[[ExposureModel, InputResponse, "Belief", Measurement], "Correction"]
+Form = Callable[[ExposureModel, InputResponse, Gaussian, Measurement], Update]
 
 
 Data = TypeVar("Data", contravariant=True)
@@ -40,7 +40,7 @@ class Observation(Protocol[Data]):
     """Whether the coefficients go on after the start state, to the process noise inside the exposure."""
     n_measurements: int
 
-    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Data) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
         """The exposure's coefficients with what was measured."""
 
 
@@ -82,38 +82,36 @@ class PathMoments:
             return self._two_states
         return self._small
 
-    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
         """One step of the (extended) Kalman filter."""
         return self._form(model, response, prior, measured)
 
-    def _many(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement) -> Correction:
+    def _many(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
         expected, slope = many_moments(model, response, prior.mean, self.orders)
         return information_update(prior, measured.value - expected, slope, measured.covariance, self.gain)
 
-    def _blocked(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
-    ) -> Correction:
+    def _blocked(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
         expected, slope = many_moments(model, response, prior.mean, self.orders)
         return blocked_update(prior, measured.value - expected, slope, measured.covariance, self.gain)
 
     def _in_matrices(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
-    ) -> Correction:
+        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
+    ) -> Update:
         h, H = predicted_moments(model, response, prior.mean, self.orders, crosses=self.crosses)
         return joseph_update(prior, measured.value - h, H, self._noise(measured), self.gain)
 
-    def _small(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement) -> Correction:
+    def _small(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
         innovation, H = self._entries(model, response, prior, measured)
         return small_update(prior, innovation, H, self._noise(measured), self.gain)
 
     def _two_states(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
-    ) -> Correction:
+        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
+    ) -> Update:
         innovation, H = self._entries(model, response, prior, measured)
         return two_state_update(prior, innovation, H, self._noise(measured))
 
     def _entries(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
+        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
     ) -> tuple[list[Entry], entrywise.Matrix]:
         h, H = _moment_entries(model, response, prior.mean, self.orders, crosses=self.crosses)
         return [y - expected for y, expected in zip(entrywise.columns(measured.value), h, strict=True)], H

@@ -8,14 +8,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
 from aolink.numerics import batched, entrywise, single_thread
 from aolink.plant.alike import MANY_STATES
 
 FloatArray = NDArray[np.float64]
 Noise = Literal["lifted", "printed"]
-Predict = Callable[[Belief, FloatArray, FloatArray, FloatArray], Belief]
+Predict = Callable[[Gaussian, FloatArray, FloatArray, FloatArray], Gaussian]
 
 
 def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
@@ -24,15 +24,15 @@ def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
     return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
 
 
-def predict(belief: Belief, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
+def predict(belief: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
     """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
     mean = predicted_mean(belief.mean, transition, kick)
     if max(transition.shape) > entrywise.MOST_ROWS:
         spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence
-        return Belief(mean, batched.symmetric(spread(transition, belief.covariance) + noise))
+        return Gaussian(mean, batched.symmetric(spread(transition, belief.covariance) + noise))
     P, Q = entrywise.unpack(belief.covariance), entrywise.unpack(noise)
     covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
-    return Belief(mean, entrywise.pack(covariance, len(belief.covariance)))
+    return Gaussian(mean, entrywise.pack(covariance, len(belief.covariance)))
 
 
 def predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:

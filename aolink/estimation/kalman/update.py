@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.kalman import information_form, two_states
-from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Belief, Correction
+from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.numerics import batched, entrywise
 from aolink.numerics.entrywise import Entry
 
@@ -17,8 +17,8 @@ FloatArray = NDArray[np.float64]
 
 
 def joseph_update(
-    prior: Belief, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
-) -> Correction:
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
+) -> Update:
     """The update of a Kalman filter in Joseph form.
 
     Mishra & Wen (18) to (20), with the innovation y - h(x). ``gain`` (n_states, n_measurements) stands in
@@ -33,12 +33,12 @@ def joseph_update(
     keep = np.eye(prior.mean.shape[1]) - batched.matmul(K, H)
     covariance = batched.symmetric(batched.congruence(keep, prior.covariance) + batched.congruence(K, R))
     nis = batched.dot(innovation, batched.matvec(S_inverse, innovation))
-    return Correction(Belief(mean, covariance), innovation, S, nis)
+    return Update(Gaussian(mean, covariance), innovation, S, nis)
 
 
 def blocked_update(
-    prior: Belief, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
-) -> Correction:
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
+) -> Update:
     """`joseph_update` for few states and many measurements, whose noise is shared within blocks only.
 
     With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing
@@ -77,12 +77,12 @@ def blocked_update(
         for k in range(blocks):
             some = slice(k * size, (k + 1) * size)
             S[:, some, some] += R[:, k]
-    return Correction(Belief(prior.mean + moved, covariance), innovation, S, nis)
+    return Update(Gaussian(prior.mean + moved, covariance), innovation, S, nis)
 
 
 def information_update(
-    prior: Belief, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
-) -> Correction:
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
+) -> Update:
     """`blocked_update` for many states, in information form; of the innovation covariance there is the diagonal."""
     axes = len(innovation)
     gains = [None] * axes if gain is None else np.broadcast_to(gain, (axes, *gain.shape[-2:]))
@@ -90,12 +90,12 @@ def information_update(
     mean, covariance, S, nis = (
         np.stack(each) for each in zip(*(information_form.update(*one) for one in every), strict=True)
     )
-    return Correction(Belief(mean, covariance), innovation, S, nis)
+    return Update(Gaussian(mean, covariance), innovation, S, nis)
 
 
 def small_update(
-    prior: Belief, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray, gain: FloatArray | None
-) -> Correction:
+    prior: Gaussian, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray, gain: FloatArray | None
+) -> Update:
     """`joseph_update` for one or two states and measurements, entry by entry."""
     axes, P, noise = len(prior.mean), entrywise.unpack(prior.covariance), entrywise.unpack(R)
     HP = entrywise.times_transposed(H, P)
@@ -107,13 +107,13 @@ def small_update(
     from_noise = entrywise.symmetric_times_transposed(entrywise.times_transposed(K, noise), K)
     covariance = entrywise.congruence(keep, P, from_noise)
     nis = entrywise.dot(innovation, entrywise.times_vector(S_inverse, innovation))
-    after = Belief(entrywise.pack_vector(mean, axes), entrywise.pack(covariance, axes))
-    return Correction(
+    after = Gaussian(entrywise.pack_vector(mean, axes), entrywise.pack(covariance, axes))
+    return Update(
         after, entrywise.pack_vector(innovation, axes), entrywise.pack(S, axes), entrywise.pack_one(nis, axes)
     )
 
 
-def two_state_update(prior: Belief, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray) -> Correction:
+def two_state_update(prior: Gaussian, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray) -> Update:
     """`joseph_update` for two states and two measurements, with the optimal gain."""
     axes = len(prior.mean)
     (p, q), (_, r) = entrywise.unpack(prior.covariance)
@@ -121,6 +121,6 @@ def two_state_update(prior: Belief, innovation: list[Entry], H: entrywise.Matrix
     x, v, p, q, r, s, both, t, nis = two_states.update(
         entrywise.columns(prior.mean), (p, q, r), innovation, H, (first, shared, rest), together=bool(np.any(shared))
     )
-    after = Belief(entrywise.pack_vector([x, v], axes), entrywise.pack([[p, q], [q, r]], axes))
+    after = Gaussian(entrywise.pack_vector([x, v], axes), entrywise.pack([[p, q], [q, r]], axes))
     S = entrywise.pack([[s, both], [both, t]], axes)
-    return Correction(after, entrywise.pack_vector(innovation, axes), S, entrywise.pack_one(nis, axes))
+    return Update(after, entrywise.pack_vector(innovation, axes), S, entrywise.pack_one(nis, axes))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from aolink.estimation.model.base import InputResponse
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.model.factored import FactoredModel
-from aolink.estimation.model.quadrature import Nodes, Quadrature, Resolution, resolution
+from aolink.estimation.model.quadrature import QuadraturePaths, QuadratureRule, Resolution, resolution
 from aolink.numerics import information, single_thread
 from aolink.numerics.covariance import psd_root
 from aolink.optics.sensor import SpotSensor
@@ -93,7 +93,7 @@ class JointPaths:
         z[:, :n] = z[:, :n] @ psd_root(self.model.plant.initial_covariance).T
         return np.concatenate([self.shares(each) @ self._functions.T for each in z])
 
-    def _at(self, q: Quadrature) -> tuple[FloatArray, FloatArray]:
+    def _at(self, q: QuadratureRule) -> tuple[FloatArray, FloatArray]:
         """Courses and weights of nodes."""
         functions, weights, moved = np.ascontiguousarray(q.at(self._functions.T).T), q.weights, self.model.moved
         if not moved:
@@ -164,12 +164,12 @@ class JointPaths:
         compiled_loops().taken(np.ascontiguousarray(matrix), self.order, out)
         return out
 
-    def of_one_spot(self) -> Nodes:
+    def of_one_spot(self) -> QuadraturePaths:
         """The shares of a spot as coefficients of a basis of its own; each spot is an axis."""
         nodes, m = self.functions.shape
         basis = np.zeros((2, nodes, 2, m))
         basis[0, :, 0] = basis[1, :, 1] = self.functions
-        return Nodes(
+        return QuadraturePaths(
             basis=basis.reshape(2, nodes, 2 * m), weights=self.weights,
             inputs=self.inputs.reshape(self.spots, 2, nodes), widening=self.model.unmodelled_rest,
         )  # fmt: skip

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
 from aolink.estimation.frames.moments import LEAST_FLUX
-from aolink.estimation.kalman.gaussian import Belief, Correction
+from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, joint_paths
@@ -52,23 +52,23 @@ class JointMoments:
         self.n_measurements = self._spot.n_measurements * (n_outputs // 2)
 
     @single_thread.by_one_thread
-    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
         """Iterated statistical linearisation, copy by copy of the plant."""
         assert isinstance(model, FactoredModel)
         paths, n = joint_paths(model, self.sensor), model.plant.n_states
         mean, covariance, rest = prior.mean.copy(), prior.covariance.copy(), []
         for axis in range(len(mean)):
             some = slice(0, paths.size)
-            before = Belief(mean[axis, some], covariance[axis, :n, :n])
+            before = Gaussian(mean[axis, some], covariance[axis, :n, :n])
             windows = by_spot(measured, axis)
             t, P, *told = self.corrected(model, paths.foreseen(mean[axis, some], response, axis), before, windows)
             mean[axis, some], covariance[axis, some, some] = t, P
             rest.append(told)
         new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))
-        return Correction(Belief(mean, covariance), new, S, nis)
+        return Update(Gaussian(mean, covariance), new, S, nis)
 
     def corrected(
-        self, model: FactoredModel, paths: JointPaths, prior: Belief, windows: SpotWindows
+        self, model: FactoredModel, paths: JointPaths, prior: Gaussian, windows: SpotWindows
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Of one copy, with a prior of the coefficients' mean and of the state's covariance.
 
@@ -84,7 +84,7 @@ class JointMoments:
         t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
         spread = first = paths.spread_of_spots(wide)
         for to_come in reversed(range(_PASSES)):
-            y, noise, fit = self._spot.look(nodes, Belief(paths.shares_of_spots(t), spread), windows)
+            y, noise, fit = self._spot.look(nodes, Gaussian(paths.shares_of_spots(t), spread), windows)
             noise = noise + _NO_NOISE * np.eye(noise.shape[-1])
             light = None
             if self._spot.flux == "measured":

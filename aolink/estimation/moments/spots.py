@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
-from aolink.estimation.kalman.gaussian import Belief
-from aolink.estimation.model.quadrature import Nodes
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.quadrature import QuadraturePaths
 from aolink.estimation.moments.windowed import Basis, Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
 from aolink.optics.sensor import SpotSensor
@@ -67,7 +67,9 @@ class WindowedSpots(Windowed[SpotWindows]):
         self.needs = Needs(what="windows", least_usable=HALF)
         super().__init__(basis, flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
 
-    def look(self, nodes: Nodes, about: Belief, measured: SpotWindows) -> tuple[FloatArray, FloatArray, Regression]:
+    def look(
+        self, nodes: QuadraturePaths, about: Gaussian, measured: SpotWindows
+    ) -> tuple[FloatArray, FloatArray, Regression]:
         """The weighted sums, their noise, and their regression on the coefficients."""
         axes, (_, count, size) = len(about.mean), nodes.basis.shape
         rows = nodes.basis.reshape(self.spots, 2, count, size).swapaxes(1, 2).reshape(-1, size)

@@ -32,10 +32,10 @@ from scipy.special import erf
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
 from aolink.estimation.frames.moments import LEAST_FLUX
-from aolink.estimation.kalman.gaussian import Belief, Correction
+from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.estimation.model.quadrature import Nodes, blocks, nodes_of
+from aolink.estimation.model.quadrature import QuadraturePaths, blocks, quadrature_paths
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import BaseSensor, Sensor
@@ -103,19 +103,19 @@ class Windowed(ABC, Generic[Light]):
         self._lights, self._light_of = list(lights), np.array(light_of)
         self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
 
-    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Light) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = nodes_of(model, response, blocks(model.n_steps, self.most_nodes))
+        nodes = quadrature_paths(model, response, blocks(model.n_steps, self.most_nodes))
         parts = [
-            self._update(model, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
+            self._update(model, nodes.part(s), Gaussian(prior.mean[s], prior.covariance[s]), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
         ]
         if len(parts) == 1:
             return parts[0]
         joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
-        return Correction(Belief(joined[0], joined[1]), *joined[2:])
+        return Update(Gaussian(joined[0], joined[1]), *joined[2:])
 
-    def _update(self, model: ExposureModel, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
+    def _update(self, model: ExposureModel, nodes: QuadraturePaths, prior: Gaussian, measured: Light) -> Update:
         about, rho = prior, np.full(len(prior.mean), _slowest(model.transition[None])[0])
         memory = _memory(rho)
         for to_come in reversed(range(_PASSES)):
@@ -135,10 +135,12 @@ class Windowed(ABC, Generic[Light]):
         nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
         if self.flux == "measured":
             nis = np.where(light < LEAST_FLUX, _NOT_BELIEVED, nis)
-        return Correction(about, innovation, S, nis)
+        return Update(about, innovation, S, nis)
 
     @abstractmethod
-    def look(self, nodes: Nodes, about: Belief, measured: Light) -> tuple[FloatArray, FloatArray, Regression]:
+    def look(
+        self, nodes: QuadraturePaths, about: Gaussian, measured: Light
+    ) -> tuple[FloatArray, FloatArray, Regression]:
         """The sums (axes, sums), their noise (axes, sums, sums), and their regression on the coefficients."""
 
     def window(
@@ -217,7 +219,9 @@ class WindowedMoments(Windowed[Profile]):
         self.needs = Needs(what="profile", least_usable=HALF)
         super().__init__(basis, flux, lights=[0], light_of=[0] * len(self.orders))
 
-    def look(self, nodes: Nodes, about: Belief, measured: Profile) -> tuple[FloatArray, FloatArray, Regression]:
+    def look(
+        self, nodes: QuadraturePaths, about: Gaussian, measured: Profile
+    ) -> tuple[FloatArray, FloatArray, Regression]:
         """The weighted sums, their noise, and their regression on the coefficients."""
         basis = nodes.basis[0]
         mean = batched.matvec(basis, about.mean) + nodes.inputs[:, 0]
@@ -329,7 +333,7 @@ def expected_response(
     return [batched.matmul(d, steps) for d in derivatives[: highest + 1]]
 
 
-def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
+def _arrays(correction: Update) -> tuple[FloatArray, ...]:
     after = correction.posterior
     rest = correction.innovation, correction.innovation_covariance, correction.nis
     return (after.mean, after.covariance, *rest)
@@ -347,7 +351,7 @@ def _memory(rho: FloatArray) -> FloatArray:
     return np.asarray(np.minimum(_MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
 
 
-def _closed_loop(model: ExposureModel, prior: Belief, H: FloatArray, R: FloatArray) -> FloatArray:
+def _closed_loop(model: ExposureModel, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:
     """How an error of the start state goes on to the next exposure's, A (I - K H), (axes, n_states, n_states)."""
     n = len(model.transition)
     PH = batched.matmul(prior.covariance, batched.transpose(H))

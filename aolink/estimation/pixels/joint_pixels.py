@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
-from aolink.estimation.kalman.gaussian import Belief, Correction
+from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
@@ -187,7 +187,7 @@ class JointProfile:
         self._moments = JointMoments(sensor, n_outputs)
 
     @single_thread.by_one_thread
-    def update(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
         """The mode of the posterior, copy by copy of the plant."""
         assert isinstance(model, FactoredModel)
         paths, n = joint_paths(model, self.sensor), model.plant.n_states
@@ -202,12 +202,12 @@ class JointProfile:
                 mode = find_mode(view, before, paths.prior_information(P), before)
                 t, after, at = mode.t, information.covariance(mode.precision), mode.at
             else:
-                t, after, *_ = self._moments.corrected(model, view.paths, Belief(before, P), by_spot(measured, axis))
+                t, after, *_ = self._moments.corrected(model, view.paths, Gaussian(before, P), by_spot(measured, axis))
                 at = view.at(t)
             mean[axis, : paths.size], covariance[axis, : paths.size, : paths.size] = t, after
             found.append(innovation(view.paths, before, P, t, at))
         new, S, nis = (np.stack(each) for each in zip(*found, strict=True))
-        return Correction(Belief(mean, covariance), new, S, nis)
+        return Update(Gaussian(mean, covariance), new, S, nis)
 
 
 def innovation(

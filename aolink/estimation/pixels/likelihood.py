@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
-from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.exposure_model import exposure_model
-from aolink.estimation.model.quadrature import Nodes
+from aolink.estimation.model.quadrature import QuadraturePaths
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import Regression, Windowed, WindowedMoments
 from aolink.numerics import batched
@@ -73,24 +73,24 @@ class Reduction:
         """n"""
         return int(self.expand.shape[1])
 
-    def prior(self, state: Belief) -> Belief:
+    def prior(self, state: Gaussian) -> Gaussian:
         """Of t, from that of the start state; leading axes as they come."""
         *lead, states = state.mean.shape
         mean, covariance = np.zeros((*lead, self.size)), np.zeros((*lead, self.size, self.size))
         mean[..., :states] = state.mean
         covariance[...] = np.eye(self.size)
         covariance[..., :states, :states] = state.covariance
-        return Belief(mean, covariance)
+        return Gaussian(mean, covariance)
 
-    def end(self, t: Belief) -> Belief:
+    def end(self, t: Gaussian) -> Gaussian:
         """Of the state at the exposure's end, without what inputs do; leading axes as they come."""
         spread = batched.congruence(self.end_rows, t.covariance) + self.end_remainder
-        return Belief(batched.matvec(self.end_rows, t.mean), batched.symmetric(spread))
+        return Gaussian(batched.matvec(self.end_rows, t.mean), batched.symmetric(spread))
 
-    def coefficients(self, t: Belief) -> Belief:
+    def coefficients(self, t: Gaussian) -> Gaussian:
         """Of z, from that of t, one for each axis."""
         spread = batched.congruence(self.expand, t.covariance) + self.left_out
-        return Belief(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
+        return Gaussian(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
 
 
 def reduction(
@@ -148,7 +148,7 @@ def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
 class PixelView:
     """What one frame shows, as a function of the reduced coefficients of each axis.
 
-    Hypotheses of each axis lie along the second dimension of every argument, (axes, hypotheses, ...). ``level`` is that
+    Points of each axis lie along the second dimension of every argument, (axes, k, ...). ``level`` is that
     of the reduction's resolution.
     """
 
@@ -159,7 +159,7 @@ class PixelView:
         self.sensor, self.reduced = sensor, reduced
         line = isinstance(measured, Profile)
         self._optics = sensor.profile if line else sensor
-        at = quadrature.nodes_of(model, response, reduced.resolution.levels[level])
+        at = quadrature.quadrature_paths(model, response, reduced.resolution.levels[level])
         self._basis = at.basis @ reduced.expand
         self._weights = at.weights
         self._inputs = at.inputs
@@ -215,20 +215,20 @@ class PixelView:
         """Their squares, the mean over the exposure and the sum over outputs, (n, n)."""
         return np.asarray((self.rows * np.tile(self._weights, self.outputs)[:, None]).T @ self.rows)
 
-    def moments(self, about: Belief) -> tuple[FloatArray, FloatArray, Regression]:
+    def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
         """Windowed moments about a belief of t, their noise and regression, as `Windowed.look`; of all axes."""
-        at = Nodes(basis=self._basis, weights=self._weights, inputs=self._inputs)
+        at = QuadraturePaths(basis=self._basis, weights=self._weights, inputs=self._inputs)
         return self._windowed.look(at, about, self._measured)
 
     def paths(self, t: FloatArray) -> FloatArray:
-        """Outputs at the nodes, (axes, hypotheses, n_outputs, nodes)."""
+        """Outputs at the nodes, (axes, k, n_outputs, nodes)."""
         outputs, nodes, size = self._basis.shape
         rows = self._basis.reshape(-1, size)
         flat = batched.long_matmul(t, rows.T)
         return np.asarray(flat.reshape(*t.shape[:2], outputs, nodes) + self._inputs[:, None])
 
     def predicted(self, t: FloatArray) -> FloatArray:
-        """Densities of the pixels without noise, (axes, hypotheses, pixels)."""
+        """Densities of the pixels without noise, (axes, k, pixels)."""
         path, w = self.paths(t), self._weights
         edges = self._optics.profile.edges
         if self._line:
@@ -268,7 +268,7 @@ class PixelView:
         )  # fmt: skip
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The same and their Jacobian, (axes, hypotheses, pixels, n)."""
+        """The same and their Jacobian, (axes, k, pixels, n)."""
         path, w = self.paths(t), self._weights[:, None]
         edges, D = self._optics.profile.edges, self._optics.pixel_size
         lead, size = t.shape[:2], t.shape[2]
@@ -298,7 +298,7 @@ class PixelView:
         return light.reshape(*lead, -1) / D, slopes.reshape(*lead, -1, size) / D
 
     def log_likelihood(self, f: FloatArray) -> FloatArray:
-        """Of the usable pixels where these are expected, up to a constant, (axes, hypotheses)."""
+        """Of the usable pixels where these are expected, up to a constant, (axes, k)."""
         R = self._variance(f)
         e = self.y[:, None] - f
         terms = e * e / R
@@ -307,7 +307,7 @@ class PixelView:
         return np.asarray(-0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1))
 
     def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Score and Fisher information of each pixel by what is expected of it, (axes, hypotheses, pixels).
+        """Score and Fisher information of each pixel by what is expected of it, (axes, k, pixels).
 
         The variance grows with what is expected (shot noise), which is information of its own.
         """

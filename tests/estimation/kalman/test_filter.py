@@ -10,7 +10,7 @@ from scipy import linalg, stats
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.path_moments import PathMoments, many_moments, predicted_moments
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.kalman.update import blocked_update, joseph_update
@@ -341,7 +341,7 @@ def test_written_out_it_is_the_correction_in_matrices(gain):
     model = exposure_model(plant, N)
     roots = rng.standard_normal((2, 50, 2, 2))
     P, noise = roots @ roots.swapaxes(-1, -2)
-    prior, y = Belief(rng.standard_normal((50, 2)), P), rng.standard_normal((50, 2))
+    prior, y = Gaussian(rng.standard_normal((50, 2)), P), rng.standard_normal((50, 2))
     response = model.response(0.01 * rng.standard_normal((N, 50)))
     ours = PathMoments(plant, (1, 2), gain).update(model, response, prior, Measurement(value=y, covariance=noise))
     h, H = predicted_moments(model, response, prior.mean, (1, 2))
@@ -363,7 +363,7 @@ def test_the_short_correction_is_josephs(rank, first, correlation, one_noise):
     model = exposure_model(dataclasses.replace(PLANT, axes=axes), N)
     response = model.response(rng.normal(0, 0.01, (N, axes)))
     root = rng.standard_normal((axes, 2, rank))
-    prior = Belief(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2))
+    prior = Gaussian(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2))
     noise = 1e-3 * np.array([[first, correlation], [correlation, 1.0]])
     noises = np.broadcast_to(noise, (axes, 2, 2)) if one_noise else noise * rng.uniform(0.5, 2, (axes, 1, 1))
     moments = rng.standard_normal((axes, 2))
@@ -384,7 +384,7 @@ def test_by_blocks_it_is_the_same_correction(blocks, rank, fixed):
     """Few states, measurements whose noise is shared within blocks of two; priors that may be singular."""
     rng, axes, n, m = np.random.default_rng(2), 3, 5, 2 * blocks
     root = rng.standard_normal((axes, n, rank))
-    prior = Belief(rng.standard_normal((axes, n)), root @ root.swapaxes(1, 2))
+    prior = Gaussian(rng.standard_normal((axes, n)), root @ root.swapaxes(1, 2))
     R = rng.standard_normal((axes, blocks, 2, 2))
     R = 1e-3 * (R @ R.swapaxes(2, 3) + np.eye(2))
     H, innovation = rng.standard_normal((axes, m, n)), rng.standard_normal((axes, m))

@@ -10,8 +10,8 @@ from scipy import linalg
 from aolink.estimation import Status, exposure_model, make_estimator, run, score
 from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.gaussian import Belief
-from aolink.estimation.model.quadrature import blocks, nodes_of
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.quadrature import blocks, quadrature_paths
 from aolink.estimation.moments import windowed
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.optics.camera import pixel_noise_variance
@@ -85,11 +85,11 @@ def spread_prior(rig, share=0.3):
     n = rig.plant.n_states
     covariance[:n, :n] = rig.plant.initial_covariance * share
     mean[0, :n] = np.linalg.cholesky(rig.plant.initial_covariance) @ np.random.default_rng(0).normal(0, 0.7, n)
-    return model, Belief(mean, covariance[None])
+    return model, Gaussian(mean, covariance[None])
 
 
 def at_prior(rig, observation, prior, model):
-    nodes = nodes_of(model, model.response(np.zeros((200, 1))), blocks(200, observation.most_nodes))
+    nodes = quadrature_paths(model, model.response(np.zeros((200, 1))), blocks(200, observation.most_nodes))
     spots, (height, width) = observation.spots, rig.sensor.window
     whole = SpotWindows(
         density=np.zeros((1, spots, height, width)), mask=np.ones((1, spots, height, width), dtype=bool)

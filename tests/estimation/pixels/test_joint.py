@@ -13,9 +13,9 @@ from aolink.errors import EstimatorError
 from aolink.estimation import Status, exposure_model, make_estimator, run, score, smooth
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman import path_moments, predict
+from aolink.estimation.kalman import information_form, path_moments, predict
 from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.path_moments import PathMoments
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model import joint_paths
@@ -32,7 +32,6 @@ from aolink.estimation.pixels.joint_pixels import JointPixels, find_mode
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.estimation.pixels.modes import find_modes, whitened
 from aolink.exposure import Exposure
-from aolink.numerics import information
 from aolink.optics.sensor import Kernel
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.model import simulate
@@ -58,7 +57,7 @@ class Frame:
     model: FactoredModel
     exposure: Exposure
     windows: object
-    prior: Belief
+    prior: Gaussian
     """Of the state, (1, n_states)."""
 
     @property
@@ -74,7 +73,7 @@ def frame(rig) -> Frame:
         estimate = estimator.step(each)
     windows, _ = measure(rig, exposures[2], estimator.filter.needs)
     model = exposure_model(rig.plant, 200, exposures[2].start_offset)
-    return Frame(model, exposures[2], windows, Belief(estimate.end_state, estimate.end_covariance))
+    return Frame(model, exposures[2], windows, Gaussian(estimate.end_state, estimate.end_covariance))
 
 
 def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
@@ -99,11 +98,11 @@ def joint_view(rig: Rig, frame: Frame, paths: JointPaths) -> JointPixels:
     )
 
 
-def whole_prior(frame: Frame, size: int) -> Belief:
+def whole_prior(frame: Frame, size: int) -> Gaussian:
     n = frame.model.plant.n_states
     mean, covariance = np.zeros((1, size)), np.eye(size)[None].copy()
     mean[:, :n], covariance[:, :n, :n] = frame.prior.mean, frame.prior.covariance
-    return Belief(mean, covariance)
+    return Gaussian(mean, covariance)
 
 
 # The pixels
@@ -243,7 +242,7 @@ def test_the_gain_of_o1_solves_the_riccati_equation(small_membrane):
     # A plant that keeps what it is never shown: two actuators in the place of each, of which only sums are seen.
     A = np.kron(np.eye(80), [[1.0]])
     assert (
-        information.steady_gain(A, np.kron(np.eye(40), [[1.0, 1.0]]), np.eye(80), np.tile(np.eye(2), (20, 1, 1)))
+        information_form.steady_gain(A, np.kron(np.eye(40), [[1.0, 1.0]]), np.eye(80), np.tile(np.eye(2), (20, 1, 1)))
         is None
     )
 

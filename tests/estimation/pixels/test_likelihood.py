@@ -7,7 +7,7 @@ import pytest
 
 from aolink.estimation import exposure_model
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.gaussian import Belief
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
@@ -121,7 +121,7 @@ def test_what_the_reduction_leaves_out_is_small_and_accounted_for(kind):
     assert np.sqrt(rest.mean()) <= 0.1 * np.sqrt(least)
     assert reduced.widening == pytest.approx(rest.mean(axis=1).sum() / model.plant.n_outputs)
     # Coefficients and end state without a measurement are the prior's.
-    state = Belief(rig.plant.initial_mean[None], rig.plant.initial_covariance[None])
+    state = Gaussian(rig.plant.initial_mean[None], rig.plant.initial_covariance[None])
     t = reduced.prior(state)
     after = reduced.coefficients(t)
     expected = np.eye(model.n_coefficients)

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from aolink.estimation import BlurFilter, EstimatorRow, Needs
-from aolink.estimation.kalman.update import joseph_update
+from aolink.estimation import BlurFilter, EstimatorRow, Needs, joseph_update
 
 THRESHOLD = 0.2  # of the brightest pixel
 CENTROID_SD = 0.1  # slope units
