@@ -24,7 +24,7 @@ class Batch:
         self._plant = rig.plant
         kinds = {(each.n_steps, each.start_offset, each.inputs.shape) for each in exposures}
         self.model: ExposureModel | None = None
-        """Of all exposures, where they have the same; so much for `responses` and `finite`."""
+        """The model of all exposures, where they have the same; `responses` and `finite` are there only then."""
         if len(kinds) > 1:
             return
         ((n_steps, offset, _),) = kinds

@@ -61,7 +61,7 @@ class Estimate:
     end_covariance: FloatArray
     """(axes, n_states, n_states)"""
     coefficients: FloatArray
-    """Of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
+    """Coefficients of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
     coefficient_covariance: FloatArray
     """(axes, n_coefficients, n_coefficients)"""
     inputs: FloatArray

@@ -41,7 +41,7 @@ class ExpectedError:
     end_rms: float
     """Error of the output one step after the exposure, slope units: what a controller acts on."""
     noise_rms: float
-    """Of the centroid by read-out and shot noise, slope units."""
+    """Standard deviation of the centroid by read-out and shot noise, slope units."""
 
 
 def candidates(rig: Rig) -> list[int]:

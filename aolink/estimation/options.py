@@ -20,7 +20,7 @@ class Options:
     """Choices that the paper leaves open."""
 
     gain: str = "steady-state"
-    """Of o1: "steady-state", or "time-varying", which a plant without a steady-state gain always gets."""
+    """The gain of o1: "steady-state", or "time-varying", which a plant without a steady-state gain always gets."""
     process_noise: Noise = "lifted"
     """Noise that an exposure adds to the state: "lifted", or "printed" for the paper's B_w W B_w'."""
     flux: Flux = "known"
@@ -30,13 +30,13 @@ class Options:
     engine: Engine = "aolink"
     """What o1 to o3 run on: "aolink", or "filterpy", for one axis."""
     orders: tuple[int, ...] = (0, 1, 2, 3)
-    """Of `moments`: which functions of the basis; 0 is the light in the window."""
+    """Orders of `moments`: which functions of the basis; 0 is the light in the window."""
     basis: Basis = "monomial"
-    """Of `moments`: "monomial", "legendre" or "fourier"."""
+    """Basis of `moments`: "monomial", "legendre" or "fourier"."""
     particles: int = 3000
-    """Of `sampled`."""
+    """Number of particles of `sampled`."""
     seed: int = 0
-    """Of `sampled`: the same one gives the same estimates, bit for bit."""
+    """Seed of `sampled`: the same one gives the same estimates, bit for bit."""
 
 
 def checked_options(**options: Any) -> Options:

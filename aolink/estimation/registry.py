@@ -269,7 +269,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
 
 
 def _is_line(rig: Rig) -> bool:
-    """Of spots on a plane the pixels' own filters would make a demo long."""
+    """Whether the sensor is a line: on spots on a plane the filters of pixels would make a demo long."""
     return isinstance(rig.sensor, Sensor)
 
 

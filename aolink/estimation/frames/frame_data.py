@@ -64,7 +64,7 @@ class Profile:
     """False for axes of which nothing was measured, (axes,); None if there are none."""
 
     def part(self, axes: slice) -> Profile:
-        """Of these axes alone."""
+        """The part of these axes."""
         light = None if self.light is None else self.light[axes]
         return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
 
@@ -90,7 +90,7 @@ class SpotWindows:
         return SpotWindows(density=self.density / light[..., None, None], mask=self.mask, light=light)
 
     def part(self, axes: slice) -> SpotWindows:
-        """Of these axes alone."""
+        """The part of these axes."""
         light = None if self.light is None else self.light[axes]
         return SpotWindows(density=self.density[axes], mask=self.mask[axes], light=light)
 

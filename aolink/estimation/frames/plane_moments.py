@@ -54,7 +54,7 @@ def measure_moments_2d(
     light:
         Light of each spot, of a whole one, (axes,); one where None.
     photoelectrons:
-        Of a whole spot; 0 for so many that shot noise does not matter.
+        Photoelectrons of a whole spot; 0 for so many that shot noise does not matter.
 
     Returns
     -------

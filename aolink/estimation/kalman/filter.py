@@ -37,7 +37,7 @@ class Posterior:
     """What one exposure came to."""
 
     coefficients: Gaussian
-    """Of the exposure basis; the start state comes first."""
+    """Coefficients of the exposure basis; the start state comes first."""
     end: Gaussian
     status: NDArray[np.int64]
     """`Status` of each axis, (axes,)."""
@@ -172,7 +172,7 @@ class BlurFilter(Filter):
         """The correction where there is one that can be believed, the prior elsewhere; and the status of each axis."""
         after, missed = done.posterior, self._missed
         used = done.nis <= self._gate
-        # Sums are finite where all is; those that overflow are looked at again, axis by axis.
+        # Sums are finite where all is; those that overflow are checked again, axis by axis.
         if not (_has_finite_sum(after.mean) and _has_finite_sum(after.covariance)):
             used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
         if usable is None and used.all() and not self._missed.any():

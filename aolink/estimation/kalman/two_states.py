@@ -1,6 +1,6 @@
 """Two states, the mean and the mean square of one output: o3 of a spot's axis, written out line by line.
 
-The same lines take arrays with a value for each axis, or plain numbers of a single one, to the same bits. Of a single
+The same lines take arrays with a value for each axis, or plain numbers of a single one, to the same bits. For a single
 axis a series of exposures is one loop over numbers (`run`): as arrays they would take thirty times as long.
 """
 
@@ -126,7 +126,7 @@ def run(
             (x, v), (p, q, r), (z1, z2), ((f0, f1), (2 * half0, 2 * half1)), (noise, shared, rest),
             together=shared != 0.0,
         )  # fmt: skip
-        # What is not a number, or too large, or not believed, is looked at by who can tell why.
+        # The caller takes what is not a number, or too large, or gated, step by step, and says why.
         if not (after[8] <= gate and math.isfinite(sum(after) + z1 + z2)):
             break
         x0, v0, p0, q0_, r0 = after[:5]

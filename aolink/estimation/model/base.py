@@ -202,8 +202,8 @@ class ExposureModel(ABC):
 def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:
     """Inputs of the rig as each copy of the plant has them, (k, axes * n_inputs) -> (axes, k, n_inputs).
 
-    Of several exposures, (exposures, k, axes * n_inputs) -> (exposures * axes, k, n_inputs). What is not a number is
-    taken as zero: it must not poison every estimate that follows.
+    Inputs of several exposures are split alike, (exposures, k, axes * n_inputs) -> (exposures * axes, k, n_inputs).
+    What is not a number is taken as zero: it must not poison every estimate that follows.
     """
     known = np.isfinite(inputs)
     finite = inputs if known.all() else np.where(known, inputs, 0.0)

@@ -43,7 +43,7 @@ def path_from_coefficients(
     coefficients:
         Of ``model.basis``, (axes, n_states) or more of its columns.
     covariance:
-        Of the coefficients, (axes, n, n).
+        Covariance of the coefficients, (axes, n, n).
     inputs:
         The exposure's, (n_steps, axes * n_inputs); an exposure of another length has a model of its own.
     """

@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 # Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
 # out, for many spots tell a displacement of all of them more finely.
 _LEFT_OUT = 0.05
-# Of all coefficients, to find the number of nodes.
+# Random draws of all coefficients, to find the number of nodes.
 _DRAWS = 4
 
 
@@ -87,7 +87,7 @@ class JointPaths:
         return joint_paths(model, sensor).resolution
 
     def _unseen(self) -> FloatArray:
-        """Paths of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
+        """Paths of the outputs of a plant without a camera, (paths, n_steps)."""
         z = np.random.default_rng(0).standard_normal((_DRAWS, self.size))
         n = self.model.plant.n_states
         z[:, :n] = z[:, :n] @ psd_root(self.model.plant.initial_covariance).T
@@ -108,7 +108,7 @@ class JointPaths:
         Parameters
         ----------
         mean:
-            Of the coefficients before the exposure, (size,).
+            Mean of the coefficients before the exposure, (size,).
         """
         paths, path = copy(self), response.path[axis]
         expected = self.shares(mean) @ self._functions.T + path

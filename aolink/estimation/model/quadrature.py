@@ -1,11 +1,11 @@
-"""Few points in time in the place of an exposure's fast steps.
+"""Few points in time, with weights, in the place of an exposure's fast steps.
 
-Blur is a mean over the steps, and paths are smooth: so it is a mean over few nodes as well. Of a spot that moves little
-these are the nodes of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree 2 n - 1
-(zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969)), between two
-steps on a straight line. Of one that goes back and forth they are means over equal blocks of steps. As many are taken
-as show the light of paths like the plant's as right as the noise of the camera asks for; and of an axis whose path is
-foreseen to go further from one to the next than a spot is wide, more.
+Blur is a mean over the steps, and paths are smooth: so it is a mean over few nodes as well. For a spot that moves
+little, the nodes are those of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree
+2 n - 1 (zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969));
+between two steps the path is a straight line. For a spot that goes back and forth, the nodes are means over equal
+blocks of steps. There are so many nodes that the light of paths like the plant's is right to a share of the camera's
+noise; and more for an axis whose path is expected to go further from one node to the next than a spot is wide.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class QuadraturePaths:
     """Variance of the slopes about each node that no coefficient has, slope units squared."""
 
     def part(self, axes: slice) -> QuadraturePaths:
-        """Of these axes alone."""
+        """The part of these axes."""
         return replace(self, inputs=self.inputs[axes])
 
 
@@ -111,7 +111,7 @@ def quadrature_paths(model: ExposureModel, response: InputResponse, q: Quadratur
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """How finely the time of an exposure is to be looked at: the coarser, the less a path moves."""
+    """How finely the time of an exposure is to be resolved: the coarser, the less a path moves."""
 
     levels: tuple[QuadratureRule, ...]
     """From what does for paths about rest to all steps."""
@@ -144,7 +144,7 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     paths:
         Like the plant's about rest, of one spot each, (paths, n_steps).
     variance:
-        Of the kernel, slope units squared.
+        Variance of the kernel, slope units squared.
     sensor:
         Pixels and their noise.
     """

@@ -43,7 +43,7 @@ class WindowedSpots(Windowed[SpotWindows]):
     Parameters
     ----------
     spots:
-        Of one copy; its outputs are spot 0's x and y, spot 1's x and y, ...
+        Number of spots of one copy; its outputs are spot 0's x and y, spot 1's x and y, ...
     orders:
         Which functions of the basis, along x and along y; 0 is the light in the window.
     crosses:
@@ -90,7 +90,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         Parameters
         ----------
         mean, variance:
-            Of the path, (axes, spots, nodes, 2).
+            Mean and variance of the path, (axes, spots, nodes, 2).
         mask:
             (axes, spots, rows, columns)
         """
@@ -124,7 +124,7 @@ class WindowedSpots(Windowed[SpotWindows]):
 
         Returns
         -------
-        Of order n, n from 0 to 3, the derivatives by x (n - i) times and by y i times, i from 0 to n:
+        For order n, n from 0 to 3, the derivatives by x (n - i) times and by y i times, i from 0 to n:
         (axes, spots, nodes, n + 1, m).
         """
         kernel, edges = self.sensor.kernel.covariance, self.sensor.profile.edges
@@ -153,11 +153,11 @@ class WindowedSpots(Windowed[SpotWindows]):
         along, across:
             Functions of columns and rows, (axes, spots, m, pixels).
         mean, spread:
-            Of the path, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, spots, nodes, 2).
+            Mean and covariance of the path, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, spots, nodes, 2).
         rows:
-            Of the exposure basis, (spots * nodes * 2, n_coefficients).
+            Rows of the exposure basis, (spots * nodes * 2, n_coefficients).
         weights:
-            Of the nodes, (nodes,).
+            Weights of the nodes, (nodes,).
         widening:
             Variance of the path about its nodes that no coefficient has.
         """

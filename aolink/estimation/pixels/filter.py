@@ -60,9 +60,9 @@ class MixtureUpdate:
     """What a frame made of a prior."""
 
     coefficients: Gaussian
-    """Of the reduced coefficients t."""
+    """The posterior of the reduced coefficients t."""
     end: GaussianMixture
-    """Of the state at the exposure's end, without what inputs do."""
+    """The posterior of the state at the exposure's end, without what inputs do."""
     innovation: Innovation
     several: BoolArray
     """Whether it saw more than one reading of the blur, (axes,)."""

@@ -32,7 +32,7 @@ class GaussianMixture:
     """(axes, components, n, n)"""
 
     def part(self, axes: slice | NDArray[np.intp]) -> GaussianMixture:
-        """Of these axes alone."""
+        """The part of these axes."""
         return GaussianMixture(self.log_weight[axes], self.mean[axes], self.covariance[axes])
 
     @property
@@ -57,7 +57,7 @@ class GaussianMixture:
         return log_sum(self.component_log_densities(points), axis=1)
 
     def component_log_densities(self, points: FloatArray) -> FloatArray:
-        """Of each component times its weight, (axes, components, points)."""
+        """The log-density of each component times its weight, (axes, components, points)."""
         n = points.shape[-1]
         root = cholesky(self.covariance)
         away = points[:, None] - self.mean[:, :, None]

@@ -46,7 +46,7 @@ _COMPONENTS = 6
 # is too sure. And steps of the search for the power.
 _LEAST_EFFECTIVE = 128.0
 _HALVINGS = 6
-# Points of a round for each pair of coefficients; as many as the next power of two. Of one or two coefficients that
+# Points of a round for each pair of coefficients; as many as the next power of two. For one or two coefficients that
 # would be fewer than are to count.
 _POINTS = 14
 _FEWEST_POINTS = 128
@@ -84,7 +84,7 @@ def posterior(
 ) -> GaussianMixture:  # fmt: skip
     """The posterior of t in the exposure of this number as the mixture that fits it.
 
-    Of the usual number of points each round has this ``share``, and so many are to count, but for axes with ``several``
+    Each round has this ``share`` of the usual number of points, and so many are to count, but for axes with ``several``
     modes. Axes that are not ``believed`` are not worth tempering.
     """
     fit, effective = importance_corrected(view, prior, proposal, share, np.where(several, _ENOUGH, share * _ENOUGH))

@@ -25,6 +25,7 @@ from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import cholesky, lower_inverse
+from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, next_damping
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
 
@@ -33,9 +34,6 @@ BoolArray = NDArray[np.bool_]
 
 _PASSES = 16
 _BROAD_PASSES = 2
-_FIRST_DAMPING = 0.01
-_LARGEST_DAMPING = 1e6
-_FREE_DAMPING = 0.1
 _NO_NOISE = 1e-14
 # The objective changes by less than this at a mode, which is near enough to draw points about it.
 _CONVERGED = 0.03
@@ -82,7 +80,7 @@ def find_modes(
     Parameters
     ----------
     prior:
-        Of each axis.
+        Prior of each axis.
     starts:
         In whitened coordinates, (axes, starts, n).
     """
@@ -97,7 +95,7 @@ def find_modes(
     m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
     s = starts.reshape(-1, n)
     at = _at(rows, m, L, s)
-    damping = np.full(len(s), _FIRST_DAMPING)
+    damping = np.full(len(s), FIRST_DAMPING)
     active = np.arange(len(s))
     for _ in range(passes):
         if not len(active):
@@ -114,11 +112,10 @@ def find_modes(
         for mine, theirs in ((at.H, there.H), (at.g, there.g), (at.objective, there.objective)):
             mine[took] = theirs[better]
         before = damping[active]
-        damping[active] = np.where(better, damping[active] / 8, np.maximum(damping[active], 1e-3) * 8)
-        # A short step says nothing where it is the damping that made it short.
-        free = before <= _FREE_DAMPING
+        damping[active] = next_damping(damping[active], better)
+        free = before <= FREE_DAMPING
         settled = (free & better & (gain < converged)) | (free & (batched.dot(step, g) < converged))
-        settled |= damping[active] > _LARGEST_DAMPING
+        settled |= damping[active] > LARGEST_DAMPING
         active = active[~settled]
     covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(at.H), dtype=np.float64)))
     _, log_H = np.linalg.slogdet(at.H)
@@ -143,7 +140,7 @@ def _found_compiled(
     )  # fmt: skip
     compiled_modes.find_modes(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
-        of_axis, whole, reversed_precision, passes, _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged,
+        of_axis, whole, reversed_precision, passes, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, converged,
         found.mean, found.covariance, found.log_evidence, found.distance, found.objective,
     )  # fmt: skip
     return found
@@ -319,7 +316,7 @@ def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
 def _innovations(
     view: PixelView, prior: Gaussian, t: FloatArray, k: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
+    """Innovations at points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
     L, s = cholesky(prior.covariance), whitened(prior, t[:, None])[:, 0]
     f, J = view.linearised(t[:, None])
     score, information = (each[:, 0] for each in view.information(f))

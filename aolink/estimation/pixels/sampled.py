@@ -58,9 +58,9 @@ class TemperedUpdater:
         Parameters
         ----------
         prior:
-            Of the start state; the noise coefficients have N(0, I).
+            Prior of the start state; the noise coefficients have N(0, I).
         number:
-            Of the exposure: with the seed and the axis it makes the random numbers.
+            Number of the exposure: with the seed and the axis it makes the random numbers.
         """
         each = [np.array([axis]) for axis in range(len(prior.mean))]
         keys = [(self.seed, number, int(axis)) for axis in view.axes]

@@ -36,7 +36,7 @@ def tempered_points(view: PixelView, prior: GaussianMixture, count: int, key: tu
     Parameters
     ----------
     prior:
-        Of the start state; the noise coefficients have N(0, I).
+        Prior of the start state; the noise coefficients have N(0, I).
     key:
         The same one gives the same points.
     """
@@ -80,7 +80,7 @@ def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> 
 
     Returns
     -------
-    Of the points themselves, one axis; its mean is theirs, and its covariance to a thousandth.
+    The mixture of the points themselves, one axis; its mean is theirs, and its covariance to a thousandth.
     """
     rng, seen = np.random.default_rng(seed), points @ rows.T
     k = seen.shape[1]

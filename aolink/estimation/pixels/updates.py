@@ -28,11 +28,11 @@ from aolink.optics.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 
-# Of the prior is what the plant would be without a camera; and how rarely chance makes it looked at.
+# Share of the prior that is what the plant would be without a camera; and how rarely chance makes it searched.
 _DOUBT = 1e-3
 _DOUBTED = 1e-3
-# A second mode is one if the posterior gives it this much. Of a tenth of it are many points worth the while, for modes'
-# own evidence is rough.
+# A second mode is one if the posterior gives it this much. Many points are worth the while from a tenth of it, for the
+# evidence of modes is rough.
 _LEAST_SHARE = 0.05
 _LEAST_DOUBTED_SHARE = 0.005
 
@@ -46,7 +46,7 @@ class ImportanceUpdater:
     free: float
     """Fewer, where mergers lose less than this, in nats."""
     share: float
-    """Of the usual number of points; and of those that are to count, where there is one mode."""
+    """Share of the usual number of points; and of those that are to count, where there is one mode."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
