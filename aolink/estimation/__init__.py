@@ -1,18 +1,29 @@
 """Estimation: the motion inside each exposure, from its blur. Pure: no time, no files, no ports."""
 
+from typing import TYPE_CHECKING, Any
+
 from aolink.estimation.driver import Driver, run
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.frames.moments import Measurement, measure_moments
+from aolink.estimation.estimator import Estimator
+from aolink.estimation.frames.frame_data import Measurement, Needs, Profile, SpotWindows
+from aolink.estimation.frames.moments import measure_moments
 from aolink.estimation.frames.plane_moments import measure_moments_2d
-from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.observation import PathMoments
-from aolink.estimation.model.exposure_model import ExposureModel, exposure_model, path_from_coefficients
-from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.kalman.filter import BlurFilter, Filter, Posterior
+from aolink.estimation.kalman.gaussian import Gaussian, Update
+from aolink.estimation.kalman.path_moments import PathMoments
+from aolink.estimation.kalman.update import joseph_update
+from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.model.exposure_model import exposure_model, path_from_coefficients
+from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Engine, Options
-from aolink.estimation.registry import ESTIMATOR_NAMES, Estimator, make_estimator
+from aolink.estimation.registry import EstimatorRow, estimator_row, estimator_rows, make_estimator
 from aolink.estimation.score import Consistency, Score, Scorer, score
 from aolink.estimation.smoother import smooth
+
+if TYPE_CHECKING:
+    ESTIMATOR_NAMES: tuple[str, ...]
+    """The names that `make_estimator` knows, by rank."""
 
 __all__ = [
     "ESTIMATOR_NAMES",
@@ -22,18 +33,27 @@ __all__ = [
     "Engine",
     "Estimate",
     "Estimator",
+    "EstimatorRow",
     "ExposureModel",
+    "Filter",
+    "Gaussian",
     "Measurement",
+    "Needs",
     "Options",
     "PathMoments",
+    "Posterior",
     "Profile",
     "Score",
     "Scorer",
     "SpotWindows",
     "Status",
+    "Update",
     "WindowedMoments",
     "WindowedSpots",
+    "estimator_row",
+    "estimator_rows",
     "exposure_model",
+    "joseph_update",
     "make_estimator",
     "measure_moments",
     "measure_moments_2d",
@@ -42,3 +62,12 @@ __all__ = [
     "score",
     "smooth",
 ]
+
+
+if not TYPE_CHECKING:  # the type checker would believe in any name
+
+    def __getattr__(name: str) -> Any:
+        """The names of all estimators are looked for in other packages as well, when somebody wants to know them."""
+        if name == "ESTIMATOR_NAMES":
+            return tuple(row.name for row in estimator_rows())
+        raise AttributeError(f"module 'aolink.estimation' has no attribute {name!r}")

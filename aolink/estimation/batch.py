@@ -6,16 +6,17 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, exposure_model
+from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 
-# Exposures together, and numbers in them: some megabytes. What a block costs whatever its size is nothing beside them.
+# Exposures together, and numbers in them: some megabytes. What a batch costs whatever its size is nothing beside them.
 _AT_ONCE = 512
 _NUMBERS_AT_ONCE = 1_000_000
 
 
-class Block:
+class Batch:
     """Some exposures with the responses to their inputs, each to the same bits as alone."""
 
     def __init__(self, rig: Rig, exposures: Sequence[Exposure]) -> None:
@@ -23,7 +24,7 @@ class Block:
         self._plant = rig.plant
         kinds = {(each.n_steps, each.start_offset, each.inputs.shape) for each in exposures}
         self.model: ExposureModel | None = None
-        """Of all exposures, where they have the same; so much for `responses` and `finite`."""
+        """The model of all exposures, where they have the same; `responses` and `finite` are there only then."""
         if len(kinds) > 1:
             return
         ((n_steps, offset, _),) = kinds
@@ -47,7 +48,7 @@ class Block:
         return self.responses.of(slice(k * axes, (k + 1) * axes))
 
 
-def blocks(rig: Rig, exposures: Iterable[Exposure]) -> Iterator[Block]:
+def batches(rig: Rig, exposures: Iterable[Exposure]) -> Iterator[Batch]:
     """Some exposures at a time, a few megabytes of them."""
     some: list[Exposure] = []
     numbers = 0
@@ -55,7 +56,7 @@ def blocks(rig: Rig, exposures: Iterable[Exposure]) -> Iterator[Block]:
         some.append(exposure)
         numbers += exposure.inputs.size + exposure.pixels.size
         if len(some) == _AT_ONCE or numbers >= _NUMBERS_AT_ONCE:
-            yield Block(rig, some)
+            yield Batch(rig, some)
             some, numbers = [], 0
     if some:
-        yield Block(rig, some)
+        yield Batch(rig, some)

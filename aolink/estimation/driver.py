@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.batch import Block, blocks
+from aolink.estimation.batch import Batch, batches
 from aolink.estimation.estimate import Estimate
+from aolink.estimation.estimator import Estimator
 from aolink.estimation.options import Engine
-from aolink.estimation.registry import Estimator, make_estimator
+from aolink.estimation.registry import make_estimator
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 
@@ -73,36 +74,36 @@ class Driver:
 
     def step(self, exposure: Exposure) -> list[Estimate]:
         """What each of them that gets an exposure says about it, in the order of the names."""
-        ((_, estimates),) = self._steps(Block(self.rig, [exposure]))
+        ((_, estimates),) = self._steps(Batch(self.rig, [exposure]))
         return estimates
 
     def steps(self, exposures: Iterable[Exposure]) -> Iterator[tuple[Exposure, list[Estimate]]]:
         """The same for a series, to the same bits; what knows no recursion is done for many exposures at once.
 
-        It is ahead of what it has given by up to a block, so it must be taken to its end before the next step.
+        It is ahead of what it has given by up to a batch, so it must be taken to its end before the next step.
         """
-        for block in blocks(self.rig, exposures):
-            yield from self._steps(block)
+        for batch in batches(self.rig, exposures):
+            yield from self._steps(batch)
 
-    def _steps(self, block: Block) -> Iterator[tuple[Exposure, list[Estimate]]]:
-        series = [self._series(estimator, block) for estimator in self.estimators]
-        for exposure in block.exposures:
+    def _steps(self, batch: Batch) -> Iterator[tuple[Exposure, list[Estimate]]]:
+        series = [self._series(estimator, batch) for estimator in self.estimators]
+        for exposure in batch.exposures:
             yield exposure, [estimate for estimate in map(next, series) if estimate is not None]
 
-    def _series(self, estimator: Estimator, block: Block) -> Iterator[Estimate | None]:
-        """The estimates of a block, None for each exposure that the estimator does not get."""
+    def _series(self, estimator: Estimator, batch: Batch) -> Iterator[Estimate | None]:
+        """The estimates of a batch, None for each exposure that the estimator does not get."""
         if estimator.name not in self._skipped:
-            return estimator.steps(block)
+            return estimator.steps(batch)
         skipped, inputs = self._skipped[estimator.name], self._inputs[estimator.name]
         given: list[Exposure | None] = []
-        for exposure in block.exposures:
+        for exposure in batch.exposures:
             if exposure.frame_id in skipped:
                 inputs.skip(exposure)
                 given.append(None)
             else:
                 given.append(inputs.leading(exposure))
         some = [exposure for exposure in given if exposure is not None]
-        made = estimator.steps(Block(self.rig, some)) if some else iter(())
+        made = estimator.steps(Batch(self.rig, some)) if some else iter(())
         return (None if exposure is None else next(made) for exposure in given)
 
 

@@ -1,4 +1,4 @@
-"""`Estimate`: what an estimator says about one exposure, as plain data."""
+"""`Estimate`: what an estimator says about one exposure, as plain data; and sums of its outputs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.model.exposure_model import ExposureModel, path_from_coefficients
-from aolink.estimation.motion import coefficient_roots, motion
+from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.model.exposure_model import path_from_coefficients
+from aolink.numerics.covariance import psd_root
 from aolink.plain import plain_data
 
 FloatArray = NDArray[np.float64]
@@ -60,7 +61,7 @@ class Estimate:
     end_covariance: FloatArray
     """(axes, n_states, n_states)"""
     coefficients: FloatArray
-    """Of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
+    """Coefficients of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
     coefficient_covariance: FloatArray
     """(axes, n_coefficients, n_coefficients)"""
     inputs: FloatArray
@@ -115,3 +116,44 @@ class Estimate:
 
 COMPARED = (*(each.name for each in fields(Estimate) if each.compare), "path", "path_sd")
 """What of two estimates must agree if they are the same."""
+
+
+def coefficient_roots(estimate: Estimate) -> list[FloatArray]:
+    """Roots of the covariance of each axis's coefficients."""
+    return [psd_root(each) for each in estimate.coefficient_covariance]
+
+
+def motion(
+    estimate: Estimate, mix: FloatArray, roots: Sequence[FloatArray], *, after: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """A sum of an estimate's outputs at each fast step, and a root of its covariance.
+
+    Parameters
+    ----------
+    mix:
+        Weights of the outputs, (k, n_outputs).
+    roots:
+        The estimate's `coefficient_roots`.
+    after:
+        With the step after the last.
+
+    Returns
+    -------
+    (k, n_steps), and R of the covariance R R', (k n_steps, n), slope units; the covariance without the path's share
+    that the exposure's basis leaves out. With ``after`` n_steps is one more.
+    """
+    model, path = estimate.model, estimate.path
+    if after:
+        last = (model.plant.C @ estimate.end_state[..., None]).reshape(-1, 1)
+        path = np.concatenate([path, last], axis=1)
+    axes, count = estimate.coefficient_covariance.shape[:2]
+    weights = mix.reshape(len(mix), axes, -1)
+    each = [np.zeros((len(mix) * path.shape[1], 0))]
+    for axis in range(axes):
+        if weights[:, axis].any():
+            rows = model.mixed_rows(weights[:, axis], count)
+            if after:
+                end = weights[:, axis] @ model.plant.C @ model.end_rows[:, :count]
+                rows = np.concatenate([rows, end[:, None]], axis=1)
+            each.append(rows.reshape(-1, count) @ roots[axis])
+    return mix @ path, np.concatenate(each, axis=1)

@@ -17,8 +17,8 @@ from scipy import linalg
 
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.centroid_noise import centroid_covariance
-from aolink.estimation.kalman.filter import added_noise
-from aolink.estimation.kalman.observation import steady_gain
+from aolink.estimation.kalman.predict import added_noise
+from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.numerics.covariance import psd_root
 from aolink.plant.alike import MANY_STATES
@@ -41,7 +41,7 @@ class ExpectedError:
     end_rms: float
     """Error of the output one step after the exposure, slope units: what a controller acts on."""
     noise_rms: float
-    """Of the centroid by read-out and shot noise, slope units."""
+    """Standard deviation of the centroid by read-out and shot noise, slope units."""
 
 
 def candidates(rig: Rig) -> list[int]:

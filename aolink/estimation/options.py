@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, get_args
 
-from aolink.estimation.frames.moments import Flux
-from aolink.estimation.kalman.filter import Noise
+from aolink.errors import EstimatorError
+from aolink.estimation.frames.frame_data import Flux
+from aolink.estimation.kalman.predict import Noise
 from aolink.estimation.moments.windowed import Basis
 
 Engine = Literal["aolink", "filterpy"]
+
+_HIGHEST_ORDER = 8
 
 
 @dataclass(frozen=True)
@@ -17,7 +20,7 @@ class Options:
     """Choices that the paper leaves open."""
 
     gain: str = "steady-state"
-    """Of o1: "steady-state", or "time-varying", which a plant without a steady-state gain always gets."""
+    """The gain of o1: "steady-state", or "time-varying", which a plant without a steady-state gain always gets."""
     process_noise: Noise = "lifted"
     """Noise that an exposure adds to the state: "lifted", or "printed" for the paper's B_w W B_w'."""
     flux: Flux = "known"
@@ -27,10 +30,33 @@ class Options:
     engine: Engine = "aolink"
     """What o1 to o3 run on: "aolink", or "filterpy", for one axis."""
     orders: tuple[int, ...] = (0, 1, 2, 3)
-    """Of `moments`: which functions of the basis; 0 is the light in the window."""
+    """Orders of `moments`: which functions of the basis; 0 is the light in the window."""
     basis: Basis = "monomial"
-    """Of `moments`: "monomial", "legendre" or "fourier"."""
+    """Basis of `moments`: "monomial", "legendre" or "fourier"."""
     particles: int = 3000
-    """Of `sampled`."""
+    """Number of particles of `sampled`."""
     seed: int = 0
-    """Of `sampled`: the same one gives the same estimates, bit for bit."""
+    """Seed of `sampled`: the same one gives the same estimates, bit for bit."""
+
+
+def checked_options(**options: Any) -> Options:
+    """Options by their names. Raises EstimatorError: there is no such option, or it cannot have this value."""
+    known = Options.__dataclass_fields__
+    for key in options:
+        if key not in known:
+            raise EstimatorError(f"estimators have no option {key!r}: use {', '.join(known)}")
+    chosen = Options(**options)
+    choices = {
+        "gain": ("steady-state", "time-varying"),
+        "process_noise": get_args(Noise),
+        "flux": get_args(Flux),
+        "basis": get_args(Basis),
+        "engine": get_args(Engine),
+    }
+    for key, values in choices.items():
+        if getattr(chosen, key) not in values:
+            raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
+    orders = tuple(chosen.orders)
+    if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
+        raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")
+    return chosen

@@ -1,4 +1,4 @@
-"""A whole recording looked at together: what later exposures say of earlier ones.
+"""The smoother of a whole recording: what later exposures say of earlier ones.
 
 An exposure's coefficients and its end state are jointly Gaussian, cov(z, end) = P E', E the rows of the end state, and
 between exposures the state goes on by the plant's transition A_g over the gap. So Rauch, Tung and Striebel's
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.model.exposure_model import by_axis
+from aolink.estimation.model.base import by_axis
 from aolink.exposure import Exposure
 from aolink.numerics import batched
 from aolink.plant.lifting import input_response, lift

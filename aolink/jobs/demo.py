@@ -14,19 +14,15 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from aolink.errors import AolinkError, DeviceError, EstimatorError, ViewerError
-from aolink.estimation import make_estimator
+from aolink.errors import AolinkError, DeviceError, ViewerError
+from aolink.estimation import estimator_rows
 from aolink.files import writing
-from aolink.optics.sensor import Sensor
 from aolink.recording.deblur import Summary, write_deblurred
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import Rig
 from aolink.session import Report, record
 
-ESTIMATORS = ("open-loop", "o1", "o2", "o3", "moments")
-_OF_LINES = ("profile", "mixture")
-"""For line sensors as well; of spots on a plane they would make a demo long."""
 _RIG_START_S = 20.0
 _RIG_END_S = 5.0
 
@@ -55,13 +51,8 @@ class DemoResult:
 
 
 def possible_estimators(rig: Rig) -> tuple[str, ...]:
-    """Those that can work on a rig: not each of them knows plants that move many spots."""
-    possible = []
-    for name in (*ESTIMATORS, *(_OF_LINES if isinstance(rig.sensor, Sensor) else ())):
-        with contextlib.suppress(EstimatorError):
-            make_estimator(rig, name)
-            possible.append(name)
-    return tuple(possible)
+    """Those that can work on a rig and would not make its demo long, by rank."""
+    return tuple(row.name for row in estimator_rows() if row.in_demo(rig) and row.refusal(rig) is None)
 
 
 @contextlib.contextmanager

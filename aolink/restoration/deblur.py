@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import RestorationError
 from aolink.estimation import Estimate
-from aolink.estimation.motion import coefficient_roots, motion
+from aolink.estimation.estimate import coefficient_roots, motion
 from aolink.exposure import Exposure, step_shares
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.scene import SceneSensor, scene_motion

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import zlib
+
+from aolink.errors import EstimatorError
+from aolink.estimation import estimator_row
 
 Colour = tuple[int, int, int]
 
@@ -14,18 +18,6 @@ MISSING: Colour = (90, 20, 40)
 """A pixel or a frame that never came."""
 NOTHING: Colour = (13, 13, 13)
 """Where there was no exposure yet: the viewer's own background."""
-
-ESTIMATORS: dict[str, Colour] = {
-    "open-loop": (204, 121, 167),
-    "o1": (86, 180, 233),
-    "o2": (120, 130, 255),
-    "o3": (240, 110, 50),
-    "moments": (0, 175, 125),
-    "profile": (140, 210, 80),
-    "mixture": (240, 80, 140),
-    "sampled": (190, 130, 80),
-}
-"""In the order of rank: the last one in a recording is what a user wants to look at first."""
 
 _OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120), (255, 160, 160), (140, 180, 255))
 _SERIES: tuple[Colour, ...] = (
@@ -53,8 +45,11 @@ STATUS_COLOURS: dict[str, Colour] = {
 
 
 def estimator_colour(name: str) -> Colour:
-    """Colour of an estimator; one that aolink does not know gets one by its name, the same each time."""
-    return ESTIMATORS.get(name) or _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
+    """Colour of an estimator; one that is not installed here gets one by its name, the same each time."""
+    try:
+        return estimator_row(name).colour
+    except EstimatorError:
+        return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
 
 
 def series_colour(index: int) -> Colour:
@@ -63,6 +58,12 @@ def series_colour(index: int) -> Colour:
 
 
 def by_rank(names: list[str]) -> list[str]:
-    """Estimators from the plainest to the one to look at first; those that aolink does not know come last."""
-    order = list(ESTIMATORS)
-    return sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
+    """Estimators from the plainest to the one to look at first; those that are not installed here come last."""
+
+    def rank(name: str) -> float:
+        try:
+            return estimator_row(name).rank
+        except EstimatorError:
+            return math.inf
+
+    return sorted(names, key=lambda name: (rank(name), name))

@@ -8,10 +8,12 @@ PROGRAM = """
 import hashlib
 import dataclasses
 import numpy as np
-from aolink.estimation import ESTIMATOR_NAMES, exposure_model, joint_profile, run
+from aolink.estimation import ESTIMATOR_NAMES, exposure_model, run
 from aolink.estimation.kalman.filter import BlurFilter
+from aolink.estimation.pixels import joint_pixels
 from aolink.estimation.frames.spots import measure_spots
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.frames.frame_data import Needs, Profile
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
@@ -31,14 +33,14 @@ small = load_rig("sh-4x4")
 sensor = dataclasses.replace(small.sensor, grid=(30, 30))
 plant = dataclasses.replace(small.plant, axes=1800)
 pixels = rng.integers(400, 700, sensor.shape).astype(np.uint16)
-chosen = dict(orders=(1, 2), flux="measured", least_usable=0.5, least_significance=-99.0)
-measured, _ = measure_spots(sensor, plant, pixels, np.ones(sensor.shape, bool), **chosen)
+needs = Needs(what="moments", orders=(1, 2), flux="measured")
+measured, _ = measure_spots(sensor, plant, pixels, np.ones(sensor.shape, bool), needs, least_significance=-99.0)
 digest.update(measured.value.tobytes() + measured.covariance.tobytes())
 membrane = load_rig("membrane-12x12")
 for estimates in run(membrane, simulate(membrane, 2), ["o3", "moments"]).values():
     for value in (estimates[-1].coefficients, estimates[-1].coefficient_covariance, estimates[-1].end_covariance):
         digest.update(value.tobytes())
-joint_profile._LARGEST_SPREAD = 9.0  # pixels from the first exposure on
+joint_pixels._LARGEST_SPREAD = 9.0  # pixels from the first exposure on
 e = run(membrane, simulate(membrane, 1), ["profile"])["profile"][0]
 digest.update(e.coefficients.tobytes() + e.coefficient_covariance.tobytes() + e.nis.tobytes())
 print(digest.hexdigest())

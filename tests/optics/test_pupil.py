@@ -12,8 +12,7 @@ from aolink.estimation import make_estimator, run
 from aolink.estimation.exposure_scan import exposure_scan
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import PathMoments
-from aolink.estimation.options import Options
+from aolink.estimation.kalman.path_moments import PathMoments
 from aolink.estimation.score import score
 from aolink.optics.camera import to_density
 from aolink.optics.frame import frame_density, spot_windows
@@ -108,10 +107,10 @@ def test_what_is_measured_is_as_sure_as_its_light_allows(rig, photoelectrons, or
         )
         tested = replace(SH, sensor=sensor, disturbance=None)
     exposures = simulate(tested, 40, seed=5)
-    observation = PathMoments(tested.plant.n_outputs, orders)
+    observation = PathMoments(tested.plant, orders)
     pulls = []
     for exposure in exposures:
-        found, remark = measure(tested, exposure, observation, Options())
+        found, remark = measure(tested, exposure, observation.needs)
         assert found is not None, remark
         path = exposure.truth.path
         truth = np.stack([(path**p).mean(axis=1) for p in orders], axis=1)

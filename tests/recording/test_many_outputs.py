@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation import run
-from aolink.estimation.motion import coefficient_roots, motion
+from aolink.estimation.estimate import coefficient_roots, motion
 from aolink.jobs.demo import simulated_rig
 from aolink.recording import convert
 from aolink.recording.reader import Recording

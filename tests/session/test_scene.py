@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 import aolink
 from aolink.cli import app
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
-from aolink.estimation.motion import coefficient_roots, motion
+from aolink.estimation.estimate import coefficient_roots, motion
 from aolink.exposure import Exposure
 from aolink.jobs.demo import simulated_rig
 from aolink.optics.camera import to_density

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.rig import load_rig
 

@@ -39,9 +39,9 @@ def filterpy_loop(model: Any, R: Any, values: Any) -> Callable[[], None]:
 
 def o3_step(effort: Effort) -> Row:
     """One exposure of 1800 axes, given their moments: correction and prediction."""
-    from aolink.estimation.frames.moments import Measurement
+    from aolink.estimation.frames.frame_data import Measurement
     from aolink.estimation.kalman.filter import BlurFilter
-    from aolink.estimation.kalman.observation import PathMoments
+    from aolink.estimation.kalman.path_moments import PathMoments
     from aolink.estimation.model.exposure_model import exposure_model
 
     axes, sample = 1800, effort.of(100)
@@ -52,7 +52,7 @@ def o3_step(effort: Effort) -> Row:
     R = np.diag([0.0067, 0.004])
     measured = Measurement(value=rng.normal(0, 0.1, (axes, 2)), covariance=np.broadcast_to(R, (axes, 2, 2)))
     response = model.response(np.zeros((200, axes)))
-    ours, turns = BlurFilter(plant, PathMoments(1, (1, 2))), effort.of(100)
+    ours, turns = BlurFilter(plant, PathMoments(plant, (1, 2))), effort.of(100)
     peer = filterpy_loop(model, R, measured.value[:sample])
 
     def steps() -> None:  # as long as the peer's turn, more or less: both find their own code in the caches
@@ -221,7 +221,8 @@ def spots_under_turbulence(effort: Effort) -> list[Row]:
 
 def membrane_in_real_time(effort: Effort) -> list[Row]:
     """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and what memory it takes."""
-    from aolink.estimation import ExposureModel, make_estimator
+    from aolink.estimation import make_estimator
+    from aolink.estimation.model.dense import DenseModel
     from aolink.plant.alike import alike_systems
     from aolink.simulation.model import simulate
 
@@ -254,7 +255,7 @@ def membrane_in_real_time(effort: Effort) -> list[Row]:
     tracemalloc.stop()
     systems, steps = alike_systems(rig.plant), rig.timing.exposure_steps
     assert systems is not None
-    coefficients = rig.n_inputs * ExposureModel(systems.one, steps).n_coefficients
+    coefficients = rig.n_inputs * DenseModel(systems.one, steps).n_coefficients
     dense = 8 * rig.n_outputs * steps * coefficients
     figure = "their memory, beside a dense basis"
     rows.append(Row(figure, f"{peak / 1e6:.0f} MB", f"{dense / 1e6:.0f} MB", dense / peak, 5))

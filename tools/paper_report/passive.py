@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from aolink.estimation.frames.moments import Measurement
-from aolink.estimation.kalman.observation import predicted_moments
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.frames.frame_data import Measurement
+from aolink.estimation.kalman.path_moments import predicted_moments
+from aolink.estimation.model.base import ExposureModel, InputResponse
 
 FloatArray = NDArray[np.float64]
 

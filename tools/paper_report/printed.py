@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.frames.moments import measure_moments
-from aolink.estimation.model.exposure_model import ExposureModel, exposure_model
+from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 

@@ -1,4 +1,4 @@
-"""Loops over axes, hypotheses and pixels, compiled by Numba: of line sensors, and of many spots of one plant.
+"""Loops over axes, components and pixels, compiled by Numba: of line sensors, and of many spots of one plant.
 
 What a whole-array call would do for thousands of axes at once runs through memory again and again; these keep one axis
 in the processor's cache. Each of a line sensor has a twin in NumPy that tests hold it to: those of `pixels.modes` and

@@ -22,7 +22,7 @@ _LARGE = 1e200
 
 
 class Line(NamedTuple):
-    """What frames of line sensors show, one row for each hypothesis."""
+    """What frames of line sensors show, one row for each axis and start."""
 
     y: FloatArray
     """Densities, (rows, pixels)."""

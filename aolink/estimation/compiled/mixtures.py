@@ -77,7 +77,7 @@ def mapped(
 def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most: int, free: float) -> None:
     """Components (axes, components, ...) merged by Runnalls' bound, in place; those that are gone weigh nothing.
 
-    As `Hypotheses.reduced`: until there are no more than ``most``, and as long as a merger costs less than ``free``.
+    As `GaussianMixture.reduced`: until there are no more than ``most``, and while a merger costs less than ``free``.
     """
     axes, count, n = mean.shape
     logs, cost = np.empty(count), np.empty((count, count))

@@ -171,7 +171,7 @@ def _corrected(
     mean: FloatArray, covariance: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray,
     out_mean: FloatArray, out_covariance: FloatArray,
 ) -> None:  # fmt: skip
-    """A Kalman correction in Joseph's form: as `aolink.estimation.kalman.observation.corrected`."""
+    """A Kalman update in Joseph's form: as `aolink.estimation.kalman.update.joseph_update`."""
     m, n = H.shape
     PH, S, root = np.empty((n, m)), np.empty((m, m)), np.empty((m, m))
     for i in range(n):

@@ -1,49 +1,38 @@
-"""What an observation takes of exposures: their moments, profiles or windows; it does not matter what came before."""
+"""What an estimator takes of exposures: their moments, profiles or windows; it does not matter what came before."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.moments import Measurement, least_significance, measure_moments, spot_significance
+from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile
+from aolink.estimation.frames.moments import least_significance, measure_moments, spot_significance
 from aolink.estimation.frames.spots import measure_spots
-from aolink.estimation.kalman.observation import Observation, PathMoments
-from aolink.estimation.moments.joint_moments import JointMoments
-from aolink.estimation.moments.spots import SpotWindows
-from aolink.estimation.moments.windowed import Profile
-from aolink.estimation.options import Options
-from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.exposure import Exposure
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]
-Measured = tuple[Measurement | Profile | SpotWindows | None, str]
-"""What an observation takes of an exposure, or nothing; and what there is to say about it."""
-
-# Share of the pixels that `moments` can do with; and of the spots, where hundreds of states hang together.
-_LEAST_USABLE = 0.5
+Measured = tuple[FrameData | None, str]
+"""What is taken of an exposure, or nothing; and what there is to say about it."""
 
 
 class Measurements:
-    """What an observation takes of each of some exposures, each to the same bits as alone.
+    """What an estimator needs of each of some exposures, each to the same bits as alone.
 
     Frames of a line sensor without a flaw are measured all at once, the others when they are asked for.
     """
 
-    def __init__(
-        self, rig: Rig, exposures: Sequence[Exposure], observation: Observation[Any] | None, options: Options
-    ) -> None:
-        self._rig, self._exposures, self._observation, self._options = rig, exposures, observation, options
+    def __init__(self, rig: Rig, exposures: Sequence[Exposure], needs: Needs | None) -> None:
+        self._rig, self._exposures, self._needs = rig, exposures, needs
         self.rows: list[int] = [-1] * len(exposures)
         """Row of each exposure in ``moments``, -1 where it has none."""
         self.moments: Measurement | None = None
         sensor = rig.sensor
-        if not (isinstance(sensor, Sensor) and sensor.shape[0] == 1 and isinstance(observation, PathMoments)):
+        if needs is None or needs.what != "moments" or not (isinstance(sensor, Sensor) and sensor.shape[0] == 1):
             return
         shape = sensor.shape
         sized = [k for k, each in enumerate(exposures) if each.pixels.shape == shape == each.mask.shape]
@@ -53,7 +42,7 @@ class Measurements:
         whole = np.concatenate([exposures[k].mask for k in sized]).all(axis=1)
         lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
         good = np.flatnonzero(whole & lit & ~is_saturated(sensor, pixels).any(axis=1))
-        moments = measure_moments(sensor, pixels[good], observation.orders, options.flux) if len(good) else ""
+        moments = measure_moments(sensor, pixels[good], needs.orders, needs.flux) if len(good) else ""
         if isinstance(moments, Measurement):
             self.moments = moments
             for row, k in enumerate(good.tolist()):
@@ -63,7 +52,7 @@ class Measurements:
         """What is taken of exposure k, or nothing; and what there is to say about it."""
         row = self.rows[k]
         if self.moments is None or row < 0:
-            return measure(self._rig, self._exposures[k], self._observation, self._options)
+            return measure(self._rig, self._exposures[k], self._needs)
         return self.some(row, row + 1), ""
 
     def some(self, row: int, end: int) -> Measurement:
@@ -72,20 +61,15 @@ class Measurements:
         return Measurement(value=self.moments.value[row:end], covariance=self.moments.covariance[row:end])
 
 
-def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, options: Options) -> Measured:
-    """What an observation takes of an exposure, or nothing; and what there is to say about it."""
-    if observation is None:
+def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:
+    """What an estimator needs of an exposure, or nothing; and what there is to say about it."""
+    if needs is None:
         return None, ""
     sensor, pixels = rig.sensor, exposure.pixels
     if pixels.shape != sensor.shape:
         return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
     if isinstance(sensor, SpotSensor):
-        orders = observation.orders if isinstance(observation, PathMoments) else None
-        return measure_spots(
-            sensor, rig.plant, pixels, exposure.mask, orders, options.flux,
-            least_usable=_LEAST_USABLE, least_significance=_least_significance(sensor),
-            least_spots=_LEAST_USABLE if isinstance(observation, JointMoments | JointProfile) else 1.0,
-        )  # fmt: skip
+        return measure_spots(sensor, rig.plant, pixels, exposure.mask, needs, _least_significance(sensor))
     sensor = sensor.profile
     saturated = is_saturated(sensor, pixels) & exposure.mask
     usable = exposure.mask & ~saturated
@@ -94,7 +78,7 @@ def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, 
         remark = f"{int((~exposure.mask).sum())} of {pixels.size} pixels are missing"
         if saturated.any():
             remark = f"{int(saturated.sum())} of {pixels.size} pixels are at an end of the scale"
-        if isinstance(observation, PathMoments) or usable.sum() < _LEAST_USABLE * pixels.size:
+        if usable.sum() < needs.least_usable * pixels.size:
             return None, remark
         remark += ": left out"
     density = np.where(usable, to_density(sensor, pixels), 0.0)
@@ -102,9 +86,9 @@ def measure(rig: Rig, exposure: Exposure, observation: Observation[Any] | None, 
     if significance < least_significance(sensor):
         return None, f"no spot: the brightest stretch is {significance:.1f} standard deviations of noise"
     rows = (rig.plant.axes, -1)
-    if not isinstance(observation, PathMoments):
+    if needs.what != "moments":
         return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
-    moments = measure_moments(sensor, pixels.reshape(rows), observation.orders, options.flux)
+    moments = measure_moments(sensor, pixels.reshape(rows), needs.orders, needs.flux)
     return (None, moments) if isinstance(moments, str) else (moments, "")
 
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.estimation.frames.frame_data import Flux, Measurement
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import kernel_moments
@@ -23,24 +22,11 @@ from aolink.optics.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 Counts = NDArray[np.uint16] | FloatArray
-Flux = Literal["known", "measured"]
 
 # Where the flux is measured, its sd must be this many times smaller: a ratio's variance is not finite otherwise.
 LEAST_FLUX = 5.0
 # A smeared spot falls short of the first about once in eighty; a frame without one reaches the second once in 270.
 _LEAST, _ENOUGH = 2.0, 4.0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Measurement:
-    """What was measured in one exposure, with Gaussian noise."""
-
-    value: FloatArray
-    """(axes, n_measurements)"""
-    covariance: FloatArray
-    """(axes, n_measurements, n_measurements), or blocks along its diagonal, (axes, blocks, size, size)."""
-    usable: NDArray[np.bool_] | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
 
 
 def raw_moments(sensor: Sensor, counts: Counts, highest: int) -> FloatArray:

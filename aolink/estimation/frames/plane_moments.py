@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.moments import LEAST_FLUX, Flux, Measurement
+from aolink.estimation.frames.frame_data import Flux, Measurement
+from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.numerics import batched
 from aolink.optics.plane import kernel_moments_2d
 
@@ -53,7 +54,7 @@ def measure_moments_2d(
     light:
         Light of each spot, of a whole one, (axes,); one where None.
     photoelectrons:
-        Of a whole spot; 0 for so many that shot noise does not matter.
+        Photoelectrons of a whole spot; 0 for so many that shot noise does not matter.
 
     Returns
     -------

@@ -7,25 +7,21 @@ that cannot be used takes its whole column out of the one and its whole row out 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile, SpotWindows
 from aolink.estimation.frames.moments import (
     LEAST_FLUX,
-    Flux,
-    Measurement,
     measure_moments,
     noise_integrals,
     raw_moments,
     spot_significance,
 )
 from aolink.estimation.frames.plane_moments import measure_moments_2d
-from aolink.estimation.moments.spots import SpotWindows
-from aolink.estimation.moments.windowed import Profile
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
 from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import Sensor, SpotSensor
@@ -69,29 +65,24 @@ def _summed(sensor: SpotSensor, light: NDArray[np.float32]) -> FloatArray:
 
 
 def measure_spots(
-    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, orders: Sequence[int] | None,
-    flux: Flux, *, least_usable: float, least_significance: FloatArray | float, least_spots: float = 1.0,
-) -> tuple[Measurement | Profile | SpotWindows | None, str]:  # fmt: skip
+    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, needs: Needs,
+    least_significance: FloatArray | float,
+) -> tuple[FrameData | None, str]:  # fmt: skip
     """What a frame says of each axis, or nothing; and how many axes it says nothing of, and why.
 
     Parameters
     ----------
     pixels, arrived:
         The frame and which of it there is, (rows, columns).
-    orders:
-        Of the moments to take, which need whole profiles; None for the profiles themselves, or where a copy
-        of the plant moves whole spots, the windows about them.
-    least_usable:
-        Share of a profile's pixels that the profiles themselves can do with.
+    needs:
+        What is to be taken of it.
     least_significance:
         By how many standard deviations of noise a spot must stand out, (n_outputs,) or one for all.
-    least_spots:
-        Share of the spots of one copy of the plant that must be usable; of the others' windows nothing is.
     """
     saturated = is_saturated(sensor, pixels) & arrived
     light = None if sensor.spot_light is None else np.repeat(sensor.spot_light, 2)
     seen: SpotWindows | None = None
-    if orders is None and plant.n_outputs > 1:
+    if needs.what == "windows":
         seen = _seen(sensor, plant, pixels, arrived & ~saturated)
         shone = seen.density.reshape(sensor.spots, *sensor.window) * sensor.pixel_width
         share = np.asarray(np.repeat(seen.mask.reshape(sensor.spots, -1).mean(axis=1), 2))
@@ -100,16 +91,16 @@ def measure_spots(
         found = profiles(sensor, pixels, arrived & ~saturated)
         share = np.count_nonzero(found.mask, axis=1) / sensor.profile.pixels
         density = np.where(found.mask, to_density(sensor.profile, found.counts), 0.0)
-    whole: BoolArray = share == 1 if orders else share >= least_usable
+    whole: BoolArray = share >= needs.least_usable
     lit = spot_significance(sensor.profile, density) >= least_significance
-    if orders and flux == "measured":
+    if needs.what == "moments" and needs.flux == "measured":
         lit &= _enough_light(sensor.profile, found.counts)
     good: BoolArray = np.asarray((whole & lit).reshape(plant.axes, plant.n_outputs))
     usable: BoolArray = np.asarray(good.all(axis=1))
     left_out = 0
-    if seen is not None and least_spots < 1:
+    if seen is not None and needs.least_spots < 1:
         of_spot: BoolArray = np.asarray(good.reshape(plant.axes, -1, 2).all(axis=2))
-        usable = np.asarray(of_spot.mean(axis=1) >= least_spots)
+        usable = np.asarray(of_spot.mean(axis=1) >= needs.least_spots)
         left_out = int(np.count_nonzero(~of_spot[usable]))
         kept = of_spot[:, :, None, None]
         seen = replace(seen, density=np.where(kept, seen.density, 0.0), mask=seen.mask & kept)
@@ -127,19 +118,21 @@ def measure_spots(
         remark += ": left out"
     if not usable.any():
         return None, remark
-    measured: Measurement | Profile | SpotWindows | str
+    measured: FrameData | str
     if seen is not None:
         measured = seen.per_light(sensor.spot_light)
-    elif orders is None:
+    elif needs.what == "profile":
         # An axis without a measurement needs one that can be computed with.
         if light is not None:
             density = density / light[:, None]
-        measured = Profile(density=density, mask=found.mask | ~usable[:, None], light=light)
+        measured = Profile(density=density, mask=found.mask | ~usable.repeat(plant.n_outputs)[:, None], light=light)
     elif plant.n_outputs == 1:
         counts = found.counts if usable.all() else found.counts[usable]
-        measured = measure_moments(sensor.profile, counts, orders, flux, None if light is None else light[usable])
+        measured = measure_moments(
+            sensor.profile, counts, needs.orders, needs.flux, None if light is None else light[usable]
+        )
     else:
-        measured = _coupled_moments(sensor, plant, pixels, usable, orders, flux)
+        measured = _coupled_moments(sensor, plant, pixels, usable, needs)
     if isinstance(measured, str):
         return None, measured
     if not usable.all():
@@ -164,7 +157,7 @@ def _enough_light(line: Sensor, counts: NDArray[Any]) -> BoolArray:
 
 
 def _coupled_moments(
-    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], usable: BoolArray, orders: Sequence[int], flux: Flux
+    sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], usable: BoolArray, needs: Needs
 ) -> Measurement | str:
     """Moments where one copy of the plant moves whole spots: a spot's two slopes share the noise of its pixels."""
     spots = plant.n_outputs // 2
@@ -172,10 +165,10 @@ def _coupled_moments(
     density = spot_windows(sensor, to_density(sensor, pixels))[used]
     light = None if sensor.spot_light is None else sensor.spot_light[used]
     edges = sensor.profile.edges
-    along = [(p, 0) for p in orders] + [(0, p) for p in orders]
+    along = [(p, 0) for p in needs.orders] + [(0, p) for p in needs.orders]
     noise = effective_noise_density(sensor)
     found = measure_moments_2d(
-        density, edges, edges, sensor.kernel.covariance, noise, along, flux, light, sensor.photoelectrons
+        density, edges, edges, sensor.kernel.covariance, noise, along, needs.flux, light, sensor.photoelectrons
     )
     if isinstance(found, str):
         return found
@@ -184,7 +177,7 @@ def _coupled_moments(
     return Measurement(value=value, covariance=found.covariance.reshape(copies, spots, m, m))
 
 
-def _spread(measured: Measurement | Profile | SpotWindows, usable: BoolArray) -> Measurement | Profile | SpotWindows:
+def _spread(measured: FrameData, usable: BoolArray) -> FrameData:
     """Moments of the usable axes in the places of these; the others get zero with unit covariance."""
     if not isinstance(measured, Measurement):
         return measured

@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.estimate import Status
-from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman import two_states
-from aolink.estimation.kalman.observation import MOST_COVARIANCES, Belief, Correction, Observation, PathMoments
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis
-from aolink.numerics import batched, entrywise, single_thread
-from aolink.plant.alike import MANY_STATES
+from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
+from aolink.estimation.kalman.path_moments import Observation
+from aolink.estimation.kalman.predict import Noise, Predict, added_noise, predict, predicted_mean
+from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
+from aolink.numerics import batched
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
 
 FloatArray = NDArray[np.float64]
-Noise = Literal["lifted", "printed"]
-Predict = Callable[[Belief, FloatArray, FloatArray, FloatArray], Belief]
 
 # A measurement that chi-square makes less likely than this is not used. It is wide: the paper's filters leave the
 # process noise inside an exposure out, and have every right to innovations larger than they expect.
@@ -37,9 +36,9 @@ _SETTLED = 1e-13
 class Posterior:
     """What one exposure came to."""
 
-    coefficients: Belief
-    """Of the exposure basis; the start state comes first."""
-    end: Belief
+    coefficients: Gaussian
+    """Coefficients of the exposure basis; the start state comes first."""
+    end: Gaussian
     status: NDArray[np.int64]
     """`Status` of each axis, (axes,)."""
     innovation: FloatArray
@@ -52,19 +51,34 @@ class Posterior:
     """Whether the blur was seen to have more than one reading, (axes,); None where nobody looked for it."""
 
     @property
-    def start(self) -> Belief:
+    def start(self) -> Gaussian:
         """The state at the exposure's first fast step."""
         n = self.end.mean.shape[1]
-        return Belief(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
+        return Gaussian(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
 
 
-def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
-    """What the process noise of one exposure adds to the state's covariance, (n_states, n_states)."""
-    plant = model.plant
-    return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
+class Filter(ABC):
+    """A filter of one rig: it is given what it needs of exposure after exposure, and says what each came to."""
+
+    @property
+    @abstractmethod
+    def needs(self) -> Needs | None:
+        """What it needs of each frame; None if it does not look at the camera."""
+
+    @abstractmethod
+    def bridge(self, inputs: FloatArray) -> None:
+        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
+
+    @abstractmethod
+    def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
+        """One exposure, with what was needed of its frame, or without."""
+
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
+        """`step` for several exposures at once, where the filter can; None where it cannot."""
+        return None
 
 
-class BlurFilter:
+class BlurFilter(Filter):
     """State and prior of all axes, carried from exposure to exposure.
 
     Timing: an exposure's measurement corrects the state at its start; the state at its end is the
@@ -78,29 +92,33 @@ class BlurFilter:
         Covariance that one exposure adds: "lifted", what N fast steps do, or "printed", the paper's B_w W B_w'.
     gate:
         Whether measurements that are too far from their prediction are left out.
-    predict:
-        Another engine's prediction in the place of `predicted`.
+    predictor:
+        Another engine's prediction in the place of `predict`.
     """
 
     def __init__(
         self, plant: Plant, observation: Observation[Any] | None, *, process_noise: Noise = "lifted",
-        gate: bool = True, predict: Predict | None = None,
+        gate: bool = True, predictor: Predict | None = None,
     ) -> None:  # fmt: skip
         self.plant, self.observation = plant, observation
-        self._process_noise, self._predict = process_noise, predict or predicted
-        prior = Belief(batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes))
+        self._process_noise, self._predict = process_noise, predictor or predict
+        prior = Gaussian(
+            batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes)
+        )
         self.belief = prior
         # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
-        self._unseen = Belief(prior.mean, prior.covariance[:1])
+        self._unseen = Gaussian(prior.mean, prior.covariance[:1])
         # The transition that no longer changes it.
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
-        self._written_out = predict is None and plant.axes == 1 and _is_two_states(plant, observation)
         self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
 
+    @property
+    def needs(self) -> Needs | None:
+        return self.observation.needs if self.observation else None
+
     def bridge(self, inputs: FloatArray) -> None:
-        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
         if len(inputs):
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
@@ -108,7 +126,6 @@ class BlurFilter:
             self._predict_unseen(transition, noise, kick)
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
-        """One exposure, with what the observation takes of it, or without."""
         axes, looks = self.plant.axes, self.observation
         lost = self._missed >= _PATIENCE
         prior = _where(lost, self._unseen, self.belief)
@@ -116,15 +133,15 @@ class BlurFilter:
         if with_noise:
             prior = _with_noise(prior, model.n_coefficients)
         if measured is None or looks is None:
-            done = Correction(prior, np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes))
+            done = Update(prior, np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes))
             status = np.full(axes, Status.PREDICTED if looks is None else Status.INPUT_INVALID, dtype=np.int64)
             coefficients = prior
         else:
-            done = looks.correct(model, response, prior, measured)
+            done = looks.update(model, response, prior, measured)
             done = _without(done, measured.usable)
             coefficients, status = self._trusted(prior, done, lost, measured.usable)
         if with_noise:
-            self.belief = predicted(coefficients, model.end_rows, model.end_remainder, response.end)
+            self.belief = predict(coefficients, model.end_rows, model.end_remainder, response.end)
         else:
             noise = added_noise(model, self._process_noise)
             self.belief = self._predict(coefficients, model.transition, noise, response.end)
@@ -138,53 +155,24 @@ class BlurFilter:
             nis=_numbers(done.nis),
         )
 
-    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
-        """`step` for exposures without a gap between them, all at once and to the same bits, as far as they can be
-        believed; None where that is none.
-
-        Parameters
-        ----------
-        responses, measured:
-            One row for each exposure.
-        """
-        if not self._written_out or self._missed[0]:
-            return None
-        noise, belief = added_noise(model, self._process_noise), self.belief
-        state, covariance = belief.mean[0], belief.covariance[0]
-        done = two_states.run(
-            model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
-        )
-        count = len(done.nis)
-        if not count:
-            return None
-        self.belief = Belief(done.end[-1], done.end_covariance[-1])
-        settled = None if self._settled_under is model.transition else _SETTLED
-        before = self._unseen
-        mean, covariance, is_settled = two_states.unseen(
-            model, before.mean[0], before.covariance[0], responses.end[:count], settled
-        )
-        self._unseen = Belief(mean[None], covariance[None])
-        self._settled_under = model.transition if is_settled else None
-        return done
-
     def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
         """Carry on what would be believed without a camera; a covariance that has settled is not computed again."""
         before = self._unseen
         if transition is self._settled_under:
-            self._unseen = Belief(_predicted_mean(before.mean, transition, kick), before.covariance)
+            self._unseen = Gaussian(predicted_mean(before.mean, transition, kick), before.covariance)
             return
-        self._unseen = after = predicted(before, transition, noise, kick)
+        self._unseen = after = predict(before, transition, noise, kick)
         change = np.abs(after.covariance - before.covariance).max()
         settled = change <= _SETTLED * np.abs(before.covariance).max()
         self._settled_under = transition if settled else None
 
     def _trusted(
-        self, prior: Belief, done: Correction, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
-    ) -> tuple[Belief, NDArray[np.int64]]:
+        self, prior: Gaussian, done: Update, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
+    ) -> tuple[Gaussian, NDArray[np.int64]]:
         """The correction where there is one that can be believed, the prior elsewhere; and the status of each axis."""
         after, missed = done.posterior, self._missed
         used = done.nis <= self._gate
-        # Sums are finite where all is; those that overflow are looked at again, axis by axis.
+        # Sums are finite where all is; those that overflow are checked again, axis by axis.
         if not (_has_finite_sum(after.mean) and _has_finite_sum(after.covariance)):
             used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
         if usable is None and used.all() and not self._missed.any():
@@ -202,43 +190,52 @@ class BlurFilter:
         return _where(refused, prior, after), status
 
 
-def _is_two_states(plant: Plant, observation: Observation[Any] | None) -> bool:
-    """Whether it is what `two_states` has written out."""
-    return (
-        type(observation) is PathMoments
-        and (plant.n_states, plant.n_outputs) == (2, 1)
-        and observation.orders == (1, 2)
-        and observation.gain is None
-    )
+class TwoStateFilter(BlurFilter):
+    """o3 of one axis with two states: a series of exposures is one loop over numbers, to the same bits."""
+
+    @staticmethod
+    def suits(plant: Plant) -> bool:
+        """Whether a plant is of this size."""
+        return (plant.axes, plant.n_states, plant.n_outputs) == (1, 2, 1)
+
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
+        """`step` for exposures without a gap between them, all at once and to the same bits, as far as they can be
+        believed; None where that is none.
+
+        Parameters
+        ----------
+        responses, measured:
+            One row for each exposure.
+        """
+        if self._missed[0]:
+            return None
+        noise, belief = added_noise(model, self._process_noise), self.belief
+        state, covariance = belief.mean[0], belief.covariance[0]
+        done = two_states.run(
+            model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
+        )
+        count = len(done.nis)
+        if not count:
+            return None
+        self.belief = Gaussian(done.end[-1], done.end_covariance[-1])
+        settled = None if self._settled_under is model.transition else _SETTLED
+        before = self._unseen
+        mean, covariance, is_settled = two_states.unseen(
+            model, before.mean[0], before.covariance[0], responses.end[:count], settled
+        )
+        self._unseen = Gaussian(mean[None], covariance[None])
+        self._settled_under = model.transition if is_settled else None
+        return done
 
 
-def predicted(belief: Belief, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
-    """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
-    mean = _predicted_mean(belief.mean, transition, kick)
-    if max(transition.shape) > entrywise.MOST_ROWS:
-        spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence
-        return Belief(mean, batched.symmetric(spread(transition, belief.covariance) + noise))
-    P, Q = entrywise.unpack(belief.covariance), entrywise.unpack(noise)
-    covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
-    return Belief(mean, entrywise.pack(covariance, len(belief.covariance)))
-
-
-def _predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:
-    """x -> A x + d"""
-    if max(transition.shape) > entrywise.MOST_ROWS:
-        return batched.matvec(transition, mean) + kick
-    moved = entrywise.times_vector(entrywise.unpack(transition), entrywise.columns(mean))
-    return entrywise.pack_vector(entrywise.add(moved, entrywise.columns(kick)), len(mean))
-
-
-def _without(done: Correction, usable: NDArray[np.bool_] | None) -> Correction:
+def _without(done: Update, usable: NDArray[np.bool_] | None) -> Update:
     """Innovations, their covariance and NIS of zero for axes of which nothing was measured."""
     if usable is None:
         return done
     innovation = np.where(usable[:, None], done.innovation, 0.0)
     covariance = done.innovation_covariance
     covariance = np.where(usable.reshape(-1, *[1] * (covariance.ndim - 1)), covariance, 0.0)
-    return Correction(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
+    return Update(done.posterior, innovation, covariance, np.where(usable, done.nis, 0.0))
 
 
 def _kept(covariance: FloatArray) -> FloatArray:
@@ -248,12 +245,12 @@ def _kept(covariance: FloatArray) -> FloatArray:
     return covariance
 
 
-def _with_noise(state: Belief, count: int) -> Belief:
+def _with_noise(state: Gaussian, count: int) -> Gaussian:
     """The start state and the noise coefficients, which nothing is known of before the exposure: N(0, I)."""
     axes, n = state.mean.shape
     mean, covariance = np.zeros((axes, count)), np.tile(np.eye(count), (axes, 1, 1))
     mean[:, :n], covariance[:, :n, :n] = state.mean, state.covariance
-    return Belief(mean, covariance)
+    return Gaussian(mean, covariance)
 
 
 def _numbers(values: FloatArray) -> FloatArray:
@@ -265,7 +262,7 @@ def _has_finite_sum(values: FloatArray) -> bool:
     return math.isfinite(np.add.reduce(values, axis=None))
 
 
-def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
+def _where(chosen: NDArray[np.bool_], first: Gaussian, second: Gaussian) -> Gaussian:
     """Axis by axis, the first belief where chosen."""
     which = np.flatnonzero(chosen)
     if not len(which):
@@ -273,4 +270,4 @@ def _where(chosen: NDArray[np.bool_], first: Belief, second: Belief) -> Belief:
     mean, covariance = second.mean.copy("K"), second.covariance.copy("K")
     mean[which] = first.mean[which]
     covariance[which] = first.covariance[which] if len(first.covariance) > 1 else first.covariance[0]
-    return Belief(mean, covariance)
+    return Gaussian(mean, covariance)

@@ -11,19 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from aolink.estimation.frames.moments import Measurement
-from aolink.estimation.kalman.observation import Belief, Correction, PathMoments, predicted_moments
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.frames.frame_data import Measurement
+from aolink.estimation.kalman.gaussian import Gaussian, Update
+from aolink.estimation.kalman.path_moments import PathMoments, predicted_moments
+from aolink.estimation.model.base import ExposureModel, InputResponse
 
 FloatArray = NDArray[np.float64]
 
 
 class FilterpyMoments(PathMoments):
-    """`PathMoments` with every correction and prediction done by filterpy."""
+    """`PathMoments` with every update and prediction done by filterpy."""
 
-    def correct(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Measurement
-    ) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
         """KalmanFilter for the centroid alone, ExtendedKalmanFilter where the second moment is taken."""
         from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 
@@ -35,7 +34,7 @@ class FilterpyMoments(PathMoments):
         noise = measured.covariance[0]
         ekf.R = linalg.block_diag(*noise) if noise.ndim == 3 else np.array(noise)
         if linear:
-            self._correct_linear(ekf, model, measured.value[0][:, None] - response.mean[0][:, None])
+            self._update_linear(ekf, model, measured.value[0][:, None] - response.mean[0][:, None])
         else:
             ekf.update(
                 measured.value[0][:, None],
@@ -43,9 +42,9 @@ class FilterpyMoments(PathMoments):
                 lambda x: predicted_moments(model, response, x.T, self.orders)[0].T,
             )
         nis = (ekf.y.T @ np.linalg.solve(ekf.S, ekf.y))[0]
-        return Correction(Belief(ekf.x.T, ekf.P[None]), ekf.y.T, ekf.S[None], nis)
+        return Update(Gaussian(ekf.x.T, ekf.P[None]), ekf.y.T, ekf.S[None], nis)
 
-    def _correct_linear(self, kf: Any, model: ExposureModel, z: FloatArray) -> None:
+    def _update_linear(self, kf: Any, model: ExposureModel, z: FloatArray) -> None:
         H = model.mean_row
         kf.H = H
         if self.gain is None:
@@ -59,7 +58,7 @@ class FilterpyMoments(PathMoments):
         kf.P = keep @ P @ keep.T + self.gain @ R @ self.gain.T
         kf.S = H @ P @ H.T + R
 
-    def predict(self, belief: Belief, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
+    def predict(self, belief: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
         """KalmanFilter.predict, the response to the inputs as its input."""
         from filterpy.kalman import KalmanFilter
 
@@ -68,4 +67,4 @@ class FilterpyMoments(PathMoments):
         kf.x, kf.P = belief.mean[0][:, None].copy(), belief.covariance[0].copy()
         kf.F, kf.Q, kf.B = transition, noise, np.eye(n)
         kf.predict(u=kick[0][:, None])
-        return Belief(kf.x.T, kf.P[None])
+        return Gaussian(kf.x.T, kf.P[None])

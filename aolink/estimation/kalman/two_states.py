@@ -1,6 +1,6 @@
 """Two states, the mean and the mean square of one output: o3 of a spot's axis, written out line by line.
 
-The same lines take arrays with a value for each axis, or plain numbers of a single one, to the same bits. Of a single
+The same lines take arrays with a value for each axis, or plain numbers of a single one, to the same bits. For a single
 axis a series of exposures is one loop over numbers (`run`): as arrays they would take thirty times as long.
 """
 
@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics.entrywise import Entry, reciprocal
 
 FloatArray = NDArray[np.float64]
 Weights = tuple[float, float, float]
 
 
-def corrected(
+def update(
     mean: Sequence[Entry], spread: Sequence[Entry], innovation: Sequence[Entry], slopes: Sequence[Sequence[Entry]],
     noise: Sequence[Entry], *, together: bool,
 ) -> tuple[Entry, ...]:  # fmt: skip
@@ -122,11 +122,11 @@ def run(
         half0, half1 = m00 * x + m01 * v + b0, m10 * x + m11 * v + b1
         z1 = y1 - (f0 * x + f1 * v + mean)
         z2 = y2 - (x * (half0 + b0) + v * (half1 + b1) + square)
-        after: tuple[float, ...] = corrected(  # type: ignore[assignment] # numbers in, numbers out
+        after: tuple[float, ...] = update(  # type: ignore[assignment] # numbers in, numbers out
             (x, v), (p, q, r), (z1, z2), ((f0, f1), (2 * half0, 2 * half1)), (noise, shared, rest),
             together=shared != 0.0,
         )  # fmt: skip
-        # What is not a number, or too large, or not believed, is looked at by who can tell why.
+        # The caller takes what is not a number, or too large, or gated, step by step, and says why.
         if not (after[8] <= gate and math.isfinite(sum(after) + z1 + z2)):
             break
         x0, v0, p0, q0_, r0 = after[:5]

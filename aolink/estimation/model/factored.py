@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis
+from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
 from aolink.numerics import batched, single_thread
 from aolink.plant.alike import AlikeSystems
 from aolink.plant.lifting import input_response, lift, output_rows
@@ -98,38 +98,39 @@ def noise_factors(systems: AlikeSystems, n_steps: int) -> NoiseFactors:
 
 
 class FactoredModel(ExposureModel):
-    """`ExposureModel` of alike systems side by side; `basis` is not needed for anything, and made where asked for."""
+    """`ExposureModel` of alike systems side by side."""
 
     def __init__(self, plant: Plant, n_steps: int, systems: AlikeSystems) -> None:
-        self.plant, self.n_steps, self.systems = plant, n_steps, systems
-        self.transition, self.process_noise = lift(plant, n_steps)
-        self.moved = 0.0
-        self._set_unmodelled()
+        self.systems = systems
         self.state_courses = output_rows(systems.one, n_steps)[0]
         """C_1 A_1^k of one system, (n_steps, n)."""
-        self.mean_row = self._of_states(self.state_courses.mean(axis=0))
+        super().__init__(plant, n_steps, self._of_states(self.state_courses.mean(axis=0)))
 
     def _of_states(self, each: FloatArray) -> FloatArray:
         """Rows over the plant's states from what one system has, (n,) or for each output (n_outputs, n)."""
         gains, order = self.systems.gains, self.systems.order
-        out = np.empty((len(gains), self.plant.n_states))
+        out = np.empty((len(gains), order.size))
         out[:, order] = gains[:, :, None] * (each if each.ndim == 1 else each[:, None, :])
         return out
 
     @property
-    def state_rows(self) -> FloatArray:  # type: ignore[override] # dense, for whoever asks
-        """C A^i, (n_outputs, n_steps, n_states)."""
+    def state_rows(self) -> FloatArray:
+        """Dense, for whoever asks."""
         return self.basis[..., : self.plant.n_states]
 
     @property
     def basis(self) -> FloatArray:
-        """The dense basis, (n_outputs, n_steps, n_coefficients)."""
+        """Dense, for whoever asks."""
         return np.asarray(self.patterns[:, None] * self.courses)
 
     @property
     def factors(self) -> tuple[FloatArray | None, FloatArray]:
         """Patterns and courses of the coefficients, (n_outputs, n_coefficients) and (n_steps, n_coefficients)."""
         return self.patterns, self.courses
+
+    def mixed_rows(self, weights: FloatArray, count: int) -> FloatArray:
+        mixed = weights @ self.patterns
+        return np.asarray(mixed[:, None, :count] * self.courses[:, :count])
 
     @cached_property
     def noise(self) -> NoiseFactors:
@@ -178,9 +179,8 @@ class FactoredModel(ExposureModel):
         missing = float(self.noise.left_out.sum())
         return math.sqrt(missing / (kept + missing)) if missing else 0.0
 
-    @cached_property
+    @property
     def end_remainder(self) -> FloatArray:
-        """Covariance of what the noise coefficients leave out of the end state, (n_states, n_states)."""
         return self.noise.end_remainder
 
     @property
@@ -188,12 +188,8 @@ class FactoredModel(ExposureModel):
         """f, (n_steps, n_coefficients)."""
         return self.functions[:, self.course_of]
 
-    @property
-    def _with_noise(self) -> tuple[FloatArray, FloatArray]:
-        return self.functions, self._end_rows
-
     @cached_property
-    def _end_rows(self) -> FloatArray:
+    def end_rows(self) -> FloatArray:
         unmodelled = np.zeros((len(self.transition), self.n_unmodelled))
         return np.concatenate([self.transition, unmodelled, self.noise.ends], axis=1)
 
@@ -202,7 +198,6 @@ class FactoredModel(ExposureModel):
         return [np.flatnonzero(self.course_of[:count] == c) for c in range(self.functions.shape[1])]
 
     def responses(self, inputs: FloatArray) -> InputResponse:
-        """`response` of many exposures, as of `ExposureModel`."""
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
         mean, square = batched.mean_over_path(path), batched.mean_over_path(path * path)
         slope = self._mean_slopes(path)
@@ -219,7 +214,6 @@ class FactoredModel(ExposureModel):
         )
 
     def times_quadratic(self, state: FloatArray) -> FloatArray:
-        """M x for each output, (axes, n_outputs, n_states)."""
         path = self.path(state, np.zeros((len(state), self.plant.n_outputs, self.n_steps)))
         slope = self._mean_slopes(path)
         if self.moved:
@@ -229,13 +223,12 @@ class FactoredModel(ExposureModel):
         return slope
 
     def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
-        """basis @ coefficients + c, as of `ExposureModel`."""
         count = coefficients.shape[1]
         patterns, courses = self.patterns[:, :count], self.courses[:, :count]
         return input_path + np.stack([single_thread.matmul(patterns * z, courses.T) for z in coefficients])
 
     def path_sd(self, covariance: FloatArray) -> FloatArray:
-        """Standard deviation of the path, as of `ExposureModel`; with process noise in it, also what is left out."""
+        # With process noise in it, also what is left out.
         variance = ((self.functions @ self.of_outputs(covariance)) * self.functions).sum(axis=3)
         if covariance.shape[1] > self.plant.n_states:
             variance += self.noise.left_out[:, None] + self.unmodelled_rest

@@ -19,11 +19,11 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.kalman import information
-from aolink.estimation.model.exposure_model import InputResponse, exposure_model
+from aolink.estimation.model.base import InputResponse
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.model.factored import FactoredModel
-from aolink.estimation.model.quadrature import Nodes, Quadrature, Resolution, resolution
-from aolink.numerics import single_thread
+from aolink.estimation.model.quadrature import QuadraturePaths, QuadratureRule, Resolution, resolution
+from aolink.numerics import information, single_thread
 from aolink.numerics.covariance import psd_root
 from aolink.optics.sensor import SpotSensor
 
@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 # Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
 # out, for many spots tell a displacement of all of them more finely.
 _LEFT_OUT = 0.05
-# Of all coefficients, to find the number of nodes.
+# Random draws of all coefficients, to find the number of nodes.
 _DRAWS = 4
 
 
@@ -87,13 +87,13 @@ class JointPaths:
         return joint_paths(model, sensor).resolution
 
     def _unseen(self) -> FloatArray:
-        """Paths of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
+        """Paths of the outputs of a plant without a camera, (paths, n_steps)."""
         z = np.random.default_rng(0).standard_normal((_DRAWS, self.size))
         n = self.model.plant.n_states
         z[:, :n] = z[:, :n] @ psd_root(self.model.plant.initial_covariance).T
         return np.concatenate([self.shares(each) @ self._functions.T for each in z])
 
-    def _at(self, q: Quadrature) -> tuple[FloatArray, FloatArray]:
+    def _at(self, q: QuadratureRule) -> tuple[FloatArray, FloatArray]:
         """Courses and weights of nodes."""
         functions, weights, moved = np.ascontiguousarray(q.at(self._functions.T).T), q.weights, self.model.moved
         if not moved:
@@ -108,7 +108,7 @@ class JointPaths:
         Parameters
         ----------
         mean:
-            Of the coefficients before the exposure, (size,).
+            Mean of the coefficients before the exposure, (size,).
         """
         paths, path = copy(self), response.path[axis]
         expected = self.shares(mean) @ self._functions.T + path
@@ -164,12 +164,12 @@ class JointPaths:
         compiled_loops().taken(np.ascontiguousarray(matrix), self.order, out)
         return out
 
-    def of_one_spot(self) -> Nodes:
+    def of_one_spot(self) -> QuadraturePaths:
         """The shares of a spot as coefficients of a basis of its own; each spot is an axis."""
         nodes, m = self.functions.shape
         basis = np.zeros((2, nodes, 2, m))
         basis[0, :, 0] = basis[1, :, 1] = self.functions
-        return Nodes(
+        return QuadraturePaths(
             basis=basis.reshape(2, nodes, 2 * m), weights=self.weights,
             inputs=self.inputs.reshape(self.spots, 2, nodes), widening=self.model.unmodelled_rest,
         )  # fmt: skip

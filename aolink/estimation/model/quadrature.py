@@ -1,11 +1,11 @@
-"""Few points in time in the place of an exposure's fast steps.
+"""Few points in time, with weights, in the place of an exposure's fast steps.
 
-Blur is a mean over the steps, and paths are smooth: so it is a mean over few nodes as well. Of a spot that moves little
-these are the nodes of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree 2 n - 1
-(zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969)), between two
-steps on a straight line. Of one that goes back and forth they are means over equal blocks of steps. As many are taken
-as show the light of paths like the plant's as right as the noise of the camera asks for; and of an axis whose path is
-foreseen to go further from one to the next than a spot is wide, more.
+Blur is a mean over the steps, and paths are smooth: so it is a mean over few nodes as well. For a spot that moves
+little, the nodes are those of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree
+2 n - 1 (zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969));
+between two steps the path is a straight line. For a spot that goes back and forth, the nodes are means over equal
+blocks of steps. There are so many nodes that the light of paths like the plant's is right to a share of the camera's
+noise; and more for an axis whose path is expected to go further from one node to the next than a spot is wide.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.sensor import Sensor
@@ -38,7 +38,7 @@ _STRIDE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
-class Quadrature:
+class QuadratureRule:
     """What the nodes are of the steps, and what each counts."""
 
     rows: FloatArray
@@ -52,18 +52,18 @@ class Quadrature:
 
 
 @lru_cache(maxsize=64)
-def blocks(n_steps: int, most: int) -> Quadrature:
+def blocks(n_steps: int, most: int) -> QuadratureRule:
     """Means over equal blocks, no more than ``most`` of them; the last may be shorter."""
     length = -(-n_steps // most)
     first = np.arange(0, n_steps, length)
     sizes = np.diff(np.append(first, n_steps))
     rows = np.zeros((len(first), n_steps))
     rows[np.repeat(np.arange(len(first)), sizes), np.arange(n_steps)] = np.repeat(1 / sizes, sizes)
-    return Quadrature(rows, sizes / n_steps)
+    return QuadratureRule(rows, sizes / n_steps)
 
 
 @lru_cache(maxsize=64)
-def gauss(n_steps: int, count: int) -> Quadrature:
+def gauss(n_steps: int, count: int) -> QuadratureRule:
     """Gauss's, of fewer nodes than steps."""
     k = np.arange(1, count)
     beside = np.sqrt(k**2 * (n_steps**2 - k**2) / (4 * (4 * k**2 - 1.0)))
@@ -74,11 +74,11 @@ def gauss(n_steps: int, count: int) -> Quadrature:
     rows = np.zeros((count, n_steps))
     rows[np.arange(count), before], rows[np.arange(count), before + 1] = before + 1 - place, place - before
     share = vectors[0] ** 2
-    return Quadrature(rows, (share + share[::-1]) / 2)
+    return QuadratureRule(rows, (share + share[::-1]) / 2)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Nodes:
+class QuadraturePaths:
     """Paths at the nodes of an exposure."""
 
     basis: FloatArray
@@ -90,12 +90,12 @@ class Nodes:
     widening: float = 0.0
     """Variance of the slopes about each node that no coefficient has, slope units squared."""
 
-    def part(self, axes: slice) -> Nodes:
-        """Of these axes alone."""
+    def part(self, axes: slice) -> QuadraturePaths:
+        """The part of these axes."""
         return replace(self, inputs=self.inputs[axes])
 
 
-def nodes_of(model: ExposureModel, response: InputResponse, q: Quadrature) -> Nodes:
+def quadrature_paths(model: ExposureModel, response: InputResponse, q: QuadratureRule) -> QuadraturePaths:
     """An exposure at its nodes, and at two more where it starts between two steps."""
     basis, weights = np.ascontiguousarray(q.at(model.basis.swapaxes(1, 2)).swapaxes(1, 2)), q.weights
     inputs = q.at(response.path)
@@ -106,14 +106,14 @@ def nodes_of(model: ExposureModel, response: InputResponse, q: Quadrature) -> No
         basis = np.concatenate([basis, np.stack(ends, axis=1)], axis=1)
         weights = np.append(weights, [-model.moved, model.moved])
         inputs = np.concatenate([inputs, np.stack(late, axis=2)], axis=2)
-    return Nodes(basis=basis, weights=weights, inputs=inputs, widening=model.unmodelled_rest)
+    return QuadraturePaths(basis=basis, weights=weights, inputs=inputs, widening=model.unmodelled_rest)
 
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """How finely the time of an exposure is to be looked at: the coarser, the less a path moves."""
+    """How finely the time of an exposure is to be resolved: the coarser, the less a path moves."""
 
-    levels: tuple[Quadrature, ...]
+    levels: tuple[QuadratureRule, ...]
     """From what does for paths about rest to all steps."""
     stride: float
     """How far a path may go from node to node, slope units."""
@@ -144,7 +144,7 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     paths:
         Like the plant's about rest, of one spot each, (paths, n_steps).
     variance:
-        Of the kernel, slope units squared.
+        Variance of the kernel, slope units squared.
     sensor:
         Pixels and their noise.
     """
@@ -152,7 +152,7 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     paths = paths - paths.mean(axis=1, keepdims=True)
     edges = (sensor.edges - sensor.edges.mean()) / math.sqrt(2 * variance)
 
-    def light(q: Quadrature) -> FloatArray:
+    def light(q: QuadratureRule) -> FloatArray:
         left: FloatArray = np.zeros((len(paths), len(edges)))
         for w, place in zip(q.weights, q.at(paths).T / math.sqrt(2 * variance), strict=True):
             left += w / 2 * erf(edges - place[:, None])
@@ -162,7 +162,7 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     noise = effective_noise_density(sensor) / sensor.pixel_size + shot_gain(sensor) * np.maximum(right, 0.0)
     seen = float(right.sum()) * sensor.pixel_width
 
-    def enough(q: Quadrature) -> bool:
+    def enough(q: QuadratureRule) -> bool:
         return float(((light(q) - right) ** 2 / noise).sum()) <= _WRONG**2 * seen
 
     count, found = _LEAST, blocks(n_steps, _MOST)

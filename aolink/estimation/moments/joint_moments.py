@@ -14,15 +14,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.moments import LEAST_FLUX, Flux
-from aolink.estimation.kalman import information
-from aolink.estimation.kalman.observation import Belief, Correction
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
+from aolink.estimation.frames.moments import LEAST_FLUX
+from aolink.estimation.kalman.gaussian import Gaussian, Update
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, joint_paths
-from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
-from aolink.estimation.moments.windowed import _NOT_BELIEVED, _PASSES, Basis, Regression, _memory, _slowest
-from aolink.numerics import batched, single_thread
+from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import NOT_BELIEVED, PASSES, Basis, Regression, error_memory, slowest
+from aolink.numerics import batched, information, single_thread
 from aolink.optics.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +40,7 @@ class JointMoments:
         As of `WindowedSpots`.
     """
 
+    needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
     models_noise = True
 
     def __init__(
@@ -51,27 +52,25 @@ class JointMoments:
         self.n_measurements = self._spot.n_measurements * (n_outputs // 2)
 
     @single_thread.by_one_thread
-    def correct(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
-    ) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
         """Iterated statistical linearisation, copy by copy of the plant."""
         assert isinstance(model, FactoredModel)
         paths, n = joint_paths(model, self.sensor), model.plant.n_states
         mean, covariance, rest = prior.mean.copy(), prior.covariance.copy(), []
         for axis in range(len(mean)):
             some = slice(0, paths.size)
-            before = Belief(mean[axis, some], covariance[axis, :n, :n])
+            before = Gaussian(mean[axis, some], covariance[axis, :n, :n])
             windows = by_spot(measured, axis)
             t, P, *told = self.corrected(model, paths.foreseen(mean[axis, some], response, axis), before, windows)
             mean[axis, some], covariance[axis, some, some] = t, P
             rest.append(told)
         new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))
-        return Correction(Belief(mean, covariance), new, S, nis)
+        return Update(Gaussian(mean, covariance), new, S, nis)
 
     def corrected(
-        self, model: FactoredModel, paths: JointPaths, prior: Belief, windows: SpotWindows
+        self, model: FactoredModel, paths: JointPaths, prior: Gaussian, windows: SpotWindows
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Of one copy, with a prior of the coefficients' mean and of the state's covariance.
+        """The update of one copy, with a prior of the coefficients' mean and of the state's covariance.
 
         Returns
         -------
@@ -80,17 +79,17 @@ class JointMoments:
         nodes = paths.of_one_spot()
         precision = paths.prior_information(prior.covariance)
         wide = paths.prior_covariance(prior.covariance)
-        # Of hundreds of states the frames hardly show some, whose errors last as long as the plant remembers.
-        memory = _memory(_slowest(model.transition_of_one[None]))[0]
+        # The frames hardly show some of hundreds of states, whose errors last as long as the plant remembers.
+        memory = error_memory(slowest(model.transition_of_one[None]))[0]
         t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
         spread = first = paths.spread_of_spots(wide)
-        for to_come in reversed(range(_PASSES)):
-            y, noise, fit = self._spot.look(nodes, Belief(paths.shares_of_spots(t), spread), windows)
+        for to_come in reversed(range(PASSES)):
+            y, noise, fit = self._spot.look(nodes, Gaussian(paths.shares_of_spots(t), spread), windows)
             noise = noise + _NO_NOISE * np.eye(noise.shape[-1])
             light = None
             if self._spot.flux == "measured":
                 light = (y[lit] / np.sqrt(np.einsum("skk->sk", noise[lit])))[:, 0].min()
-                y, noise, fit = self._spot._ratios(y, noise, fit)
+                y, noise, fit = self._spot.ratios(y, noise, fit)
             new = y - fit.expected - batched.matvec(fit.slope, paths.shares_of_spots(prior.mean - t))
             H, score = _told(paths, fit, noise + memory * fit.remainder, new)
             P = information.covariance(precision + H)
@@ -103,7 +102,7 @@ class JointMoments:
         weighted = np.linalg.solve(own, new[..., None])[..., 0]
         nis = np.asarray((new * weighted).sum() - score @ information.solve(precision + H, score))
         if light is not None and light < LEAST_FLUX:
-            nis = np.asarray(_NOT_BELIEVED)
+            nis = np.asarray(NOT_BELIEVED)
         S = np.einsum("skk->sk", batched.congruence(fit.slope, first) + own)
         return t, P, new.ravel(), S.ravel(), nis
 

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.moments import Flux
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.quadrature import Nodes
+from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.quadrature import QuadraturePaths
 from aolink.estimation.moments.windowed import Basis, Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
 from aolink.optics.sensor import SpotSensor
@@ -38,39 +37,13 @@ _HIGHEST = 7
 _LEAST_OF_A_ROW = 0.5
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SpotWindows:
-    """Densities of the pixels about each spot of each copy of the plant."""
-
-    density: FloatArray
-    """One over slope units squared, zero where the mask is, (axes, spots, rows, columns)."""
-    mask: BoolArray
-    """True where the pixel can be used, (axes, spots, rows, columns)."""
-    light: FloatArray | None = None
-    """Light of each spot, of a whole one, which densities are divided by, (axes, spots); one where None."""
-    usable: BoolArray | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
-
-    def per_light(self, light: FloatArray | None) -> SpotWindows:
-        """The same with densities divided by the light of each spot in the rig's order, (axes * spots,)."""
-        if light is None:
-            return self
-        light = light.reshape(self.density.shape[:2])
-        return SpotWindows(density=self.density / light[..., None, None], mask=self.mask, light=light)
-
-    def part(self, axes: slice) -> SpotWindows:
-        """Of these axes alone."""
-        light = None if self.light is None else self.light[axes]
-        return SpotWindows(density=self.density[axes], mask=self.mask[axes], light=light)
-
-
 class WindowedSpots(Windowed[SpotWindows]):
     """Windowed moments of all spots that one copy of the plant moves.
 
     Parameters
     ----------
     spots:
-        Of one copy; its outputs are spot 0's x and y, spot 1's x and y, ...
+        Number of spots of one copy; its outputs are spot 0's x and y, spot 1's x and y, ...
     orders:
         Which functions of the basis, along x and along y; 0 is the light in the window.
     crosses:
@@ -91,9 +64,12 @@ class WindowedSpots(Windowed[SpotWindows]):
         self.orders = [*light, *((p, 0) for p in beyond), *((0, p) for p in beyond), *([(1, 1)] if crosses else [])]
         each = len(self.orders)
         lights = [k * each for k in range(spots)]
+        self.needs = Needs(what="windows", least_usable=HALF)
         super().__init__(basis, flux, lights=lights, light_of=[k for k in lights for _ in range(each)])
 
-    def look(self, nodes: Nodes, about: Belief, measured: SpotWindows) -> tuple[FloatArray, FloatArray, Regression]:
+    def look(
+        self, nodes: QuadraturePaths, about: Gaussian, measured: SpotWindows
+    ) -> tuple[FloatArray, FloatArray, Regression]:
         """The weighted sums, their noise, and their regression on the coefficients."""
         axes, (_, count, size) = len(about.mean), nodes.basis.shape
         rows = nodes.basis.reshape(self.spots, 2, count, size).swapaxes(1, 2).reshape(-1, size)
@@ -114,7 +90,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         Parameters
         ----------
         mean, variance:
-            Of the path, (axes, spots, nodes, 2).
+            Mean and variance of the path, (axes, spots, nodes, 2).
         mask:
             (axes, spots, rows, columns)
         """
@@ -148,7 +124,7 @@ class WindowedSpots(Windowed[SpotWindows]):
 
         Returns
         -------
-        Of order n, n from 0 to 3, the derivatives by x (n - i) times and by y i times, i from 0 to n:
+        For order n, n from 0 to 3, the derivatives by x (n - i) times and by y i times, i from 0 to n:
         (axes, spots, nodes, n + 1, m).
         """
         kernel, edges = self.sensor.kernel.covariance, self.sensor.profile.edges
@@ -177,11 +153,11 @@ class WindowedSpots(Windowed[SpotWindows]):
         along, across:
             Functions of columns and rows, (axes, spots, m, pixels).
         mean, spread:
-            Of the path, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, spots, nodes, 2).
+            Mean and covariance of the path, (axes, spots, nodes, 2) and (axes, spots, nodes, 2, spots, nodes, 2).
         rows:
-            Of the exposure basis, (spots * nodes * 2, n_coefficients).
+            Rows of the exposure basis, (spots * nodes * 2, n_coefficients).
         weights:
-            Of the nodes, (nodes,).
+            Weights of the nodes, (nodes,).
         widening:
             Variance of the path about its nodes that no coefficient has.
         """

@@ -30,10 +30,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.estimation.frames.moments import LEAST_FLUX, Flux
-from aolink.estimation.kalman.observation import Belief, Correction, corrected
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
-from aolink.estimation.model.quadrature import Nodes, blocks, nodes_of
+from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
+from aolink.estimation.frames.moments import LEAST_FLUX
+from aolink.estimation.kalman.gaussian import Gaussian, Update
+from aolink.estimation.kalman.update import joseph_update
+from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.quadrature import QuadraturePaths, blocks, quadrature_paths
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import BaseSensor, Sensor
@@ -41,7 +43,7 @@ from aolink.optics.sensor import BaseSensor, Sensor
 FloatArray = NDArray[np.float64]
 Basis = Literal["monomial", "legendre", "fourier"]
 
-_PASSES = 3
+PASSES = 3
 # Half width of the window beyond the path's mean, in standard deviations of the path, and of the kernel beyond that.
 PATH_REACH = 3.0
 KERNEL_REACH = 2.0
@@ -51,36 +53,17 @@ _MOST_MEMORY = 1e3
 # Axes together: more of them do not fit into the processor's cache.
 _AT_ONCE = 8
 # NIS of a ratio to light that is lost in its noise.
-_NOT_BELIEVED = 1e12
+NOT_BELIEVED = 1e12
 
 
 class Seen(Protocol):
     """What an exposure shows of each axis; its parts can be taken."""
 
     def part(self: Self, axes: slice) -> Self:
-        """Of these axes alone."""
+        """The part of these axes."""
 
 
-Light = TypeVar("Light", bound=Seen)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Profile:
-    """Densities of one row of pixels for each axis."""
-
-    density: FloatArray
-    """One over slope units, (axes, pixels)."""
-    mask: NDArray[np.bool_]
-    """True where the pixel can be used, (axes, pixels)."""
-    light: FloatArray | None = None
-    """Light of each spot, of a whole one, which densities are divided by, (axes,); one where None."""
-    usable: NDArray[np.bool_] | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
-
-    def part(self, axes: slice) -> Profile:
-        """Of these axes alone."""
-        light = None if self.light is None else self.light[axes]
-        return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
+Data = TypeVar("Data", bound=Seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +78,13 @@ class Regression:
     """Omega, covariance of what is not linear, (axes, m, m)."""
 
 
-class Windowed(ABC, Generic[Light]):
+class Windowed(ABC, Generic[Data]):
     """Iterated statistical linearisation: what line sensors and spots on a plane have in common.
 
     Parameters
     ----------
     basis:
-        Of u in [-1, 1] across the window: "monomial" u^p, "legendre" P_p(u), or "fourier", where
+        Functions of u in [-1, 1] across the window: "monomial" u^p, "legendre" P_p(u), or "fourier", where
         orders 2q - 1 and 2q are sin(pi q u) and cos(pi q u).
     flux:
         "known": the light of a frame sums to one; "measured": all is divided by the light in the window,
@@ -120,42 +103,44 @@ class Windowed(ABC, Generic[Light]):
         self._lights, self._light_of = list(lights), np.array(light_of)
         self.n_measurements = len(light_of) - (len(self._lights) if flux == "measured" else 0)
 
-    def correct(self, model: ExposureModel, response: InputResponse, prior: Belief, measured: Light) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
         """Iterated statistical linearisation, from the prior to the posterior."""
-        nodes = nodes_of(model, response, blocks(model.n_steps, self.most_nodes))
+        nodes = quadrature_paths(model, response, blocks(model.n_steps, self.most_nodes))
         parts = [
-            self._correct(model, nodes.part(s), Belief(prior.mean[s], prior.covariance[s]), measured.part(s))
+            self._update(model, nodes.part(s), Gaussian(prior.mean[s], prior.covariance[s]), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
         ]
         if len(parts) == 1:
             return parts[0]
         joined = [np.concatenate(arrays) for arrays in zip(*(_arrays(part) for part in parts), strict=True)]
-        return Correction(Belief(joined[0], joined[1]), *joined[2:])
+        return Update(Gaussian(joined[0], joined[1]), *joined[2:])
 
-    def _correct(self, model: ExposureModel, nodes: Nodes, prior: Belief, measured: Light) -> Correction:
-        about, rho = prior, np.full(len(prior.mean), _slowest(model.transition[None])[0])
-        memory = _memory(rho)
-        for to_come in reversed(range(_PASSES)):
+    def _update(self, model: ExposureModel, nodes: QuadraturePaths, prior: Gaussian, measured: Data) -> Update:
+        about, rho = prior, np.full(len(prior.mean), slowest(model.transition[None])[0])
+        memory = error_memory(rho)
+        for to_come in reversed(range(PASSES)):
             y, noise, fit = self.look(nodes, about, measured)
             if self.flux == "measured":
                 light = (y / np.sqrt(np.einsum("akk->ak", noise)))[:, self._lights].min(axis=1)
-                y, noise, fit = self._ratios(y, noise, fit)
+                y, noise, fit = self.ratios(y, noise, fit)
             innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
             R = noise + memory[:, None, None] * fit.remainder
-            done = corrected(prior, innovation, fit.slope, R)
+            done = joseph_update(prior, innovation, fit.slope, R)
             about = done.posterior
             if to_come:
-                memory = _memory(np.sqrt(rho * _slowest(_closed_loop(model, prior, fit.slope, R))))
+                memory = error_memory(np.sqrt(rho * slowest(_closed_loop(model, prior, fit.slope, R))))
         # The spread to expect of this one innovation is without the memory.
         HP = batched.matmul(fit.slope, prior.covariance)
         S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
         nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
         if self.flux == "measured":
-            nis = np.where(light < LEAST_FLUX, _NOT_BELIEVED, nis)
-        return Correction(about, innovation, S, nis)
+            nis = np.where(light < LEAST_FLUX, NOT_BELIEVED, nis)
+        return Update(about, innovation, S, nis)
 
     @abstractmethod
-    def look(self, nodes: Nodes, about: Belief, measured: Light) -> tuple[FloatArray, FloatArray, Regression]:
+    def look(
+        self, nodes: QuadraturePaths, about: Gaussian, measured: Data
+    ) -> tuple[FloatArray, FloatArray, Regression]:
         """The sums (axes, sums), their noise (axes, sums, sums), and their regression on the coefficients."""
 
     def window(
@@ -168,7 +153,7 @@ class Windowed(ABC, Generic[Light]):
         kernel:
             Variance of the kernel in this direction, slope units squared.
         mean, variance:
-            Of the path at its nodes, (axes, nodes).
+            Mean and variance of the path at its nodes, (axes, nodes).
         mask:
             True where a pixel can be used, (axes, pixels).
         """
@@ -192,7 +177,7 @@ class Windowed(ABC, Generic[Light]):
             return np.asarray(u**order)
         return np.asarray(np.polynomial.legendre.legval(u, np.eye(order + 1)[order]))
 
-    def _ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
+    def ratios(self, y: FloatArray, noise: FloatArray, fit: Regression) -> tuple[FloatArray, FloatArray, Regression]:
         """Everything divided by the light that belongs to it, to first order."""
         kept = [k for k in range(y.shape[1]) if k not in self._lights]
         lights = self._light_of[kept]
@@ -231,9 +216,12 @@ class WindowedMoments(Windowed[Profile]):
         self.sensor = sensor
         # A ratio to the light in the window needs the light first.
         self.orders = tuple(orders) if flux == "known" else (0, *(p for p in orders if p))
+        self.needs = Needs(what="profile", least_usable=HALF)
         super().__init__(basis, flux, lights=[0], light_of=[0] * len(self.orders))
 
-    def look(self, nodes: Nodes, about: Belief, measured: Profile) -> tuple[FloatArray, FloatArray, Regression]:
+    def look(
+        self, nodes: QuadraturePaths, about: Gaussian, measured: Profile
+    ) -> tuple[FloatArray, FloatArray, Regression]:
         """The weighted sums, their noise, and their regression on the coefficients."""
         basis = nodes.basis[0]
         mean = batched.matvec(basis, about.mean) + nodes.inputs[:, 0]
@@ -258,7 +246,7 @@ class WindowedMoments(Windowed[Profile]):
         W:
             (axes, m, pixels)
         mean, spread:
-            Of the path at its nodes, (axes, nodes) and (axes, nodes, nodes).
+            Mean and covariance of the path at its nodes, (axes, nodes) and (axes, nodes, nodes).
         basis, weights:
             Rows of the exposure basis at the nodes, (nodes, n_coefficients), and the nodes' weights, (nodes,).
         widening:
@@ -345,25 +333,25 @@ def expected_response(
     return [batched.matmul(d, steps) for d in derivatives[: highest + 1]]
 
 
-def _arrays(correction: Correction) -> tuple[FloatArray, ...]:
+def _arrays(correction: Update) -> tuple[FloatArray, ...]:
     after = correction.posterior
     rest = correction.innovation, correction.innovation_covariance, correction.nis
     return (after.mean, after.covariance, *rest)
 
 
-def _slowest(transition: FloatArray) -> FloatArray:
+def slowest(transition: FloatArray) -> FloatArray:
     """Modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
     finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
     # What is not finite is refused by the filter; here it must only not stop the others.
     return np.asarray(np.abs(np.linalg.eigvals(np.where(finite, transition, 0.0))).max(axis=1))
 
 
-def _memory(rho: FloatArray) -> FloatArray:
+def error_memory(rho: FloatArray) -> FloatArray:
     """Variance of a mean of errors with this correlation from frame to frame, over that of independent ones."""
     return np.asarray(np.minimum(_MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
 
 
-def _closed_loop(model: ExposureModel, prior: Belief, H: FloatArray, R: FloatArray) -> FloatArray:
+def _closed_loop(model: ExposureModel, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:
     """How an error of the start state goes on to the next exposure's, A (I - K H), (axes, n_states, n_states)."""
     n = len(model.transition)
     PH = batched.matmul(prior.covariance, batched.transpose(H))

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from aolink.estimation.compiled.modes import drop_repeats
 from aolink.estimation.estimate import Status
-from aolink.estimation.kalman.filter import Posterior, predicted
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, by_axis, exposure_model
-from aolink.estimation.moments.spots import SpotWindows
-from aolink.estimation.moments.windowed import Profile
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, single
+from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
+from aolink.estimation.kalman.filter import Filter, Posterior
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.kalman.predict import predict
+from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
+from aolink.estimation.model.exposure_model import exposure_model
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, single
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.numerics import batched
 from aolink.numerics.workers import in_threads, thread_count
@@ -55,47 +56,47 @@ class Innovation:
 
 
 @dataclass(frozen=True, eq=False)
-class Update:
+class MixtureUpdate:
     """What a frame made of a prior."""
 
-    coefficients: Belief
-    """Of the reduced coefficients t."""
-    end: Hypotheses
-    """Of the state at the exposure's end, without what inputs do."""
+    coefficients: Gaussian
+    """The posterior of the reduced coefficients t."""
+    end: GaussianMixture
+    """The posterior of the state at the exposure's end, without what inputs do."""
     innovation: Innovation
     several: BoolArray
     """Whether it saw more than one reading of the blur, (axes,)."""
 
 
-class Updates(Protocol):
+class MixtureUpdater(Protocol):
     """A way to update a mixture with the pixels of an exposure."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
 
-    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
         """The posterior of axes with a prior of their start states, in the exposure of this number.
 
         ``unseen`` is what the start states would be without a camera.
         """
 
 
-class HypothesisFilter:
+class MixtureFilter(Filter):
     """A mixture for each axis, carried from exposure to exposure.
 
     Parameters
     ----------
-    updates:
+    updater:
         How a frame corrects it.
     gate:
         Whether frames that cannot be believed are left out.
     """
 
-    def __init__(self, plant: Plant, sensor: BaseSensor, updates: Updates, *, gate: bool = True) -> None:
-        self.plant, self.sensor, self._updates, self._gate = plant, sensor, updates, gate
+    def __init__(self, plant: Plant, sensor: BaseSensor, updater: MixtureUpdater, *, gate: bool = True) -> None:
+        self.plant, self.sensor, self._updater, self._gate = plant, sensor, updater, gate
         n, axes = plant.n_states, plant.axes
         self.belief = single(
-            Belief(
+            Gaussian(
                 np.broadcast_to(plant.initial_mean, (axes, n)).copy(),
                 np.broadcast_to(plant.initial_covariance, (axes, n, n)).copy(),
             )
@@ -105,7 +106,7 @@ class HypothesisFilter:
         self._missed = np.zeros(axes, dtype=np.int64)
         self._number = 0
 
-    def warm_up(self, updates: Updates) -> None:
+    def warm_up(self, updater: MixtureUpdater) -> None:
         """Have an exposure of one axis updated by these: what they compile, a session need not wait for."""
         one = slice(0, 1)
         twice = joined(self.belief.part(one), self.belief.part(one))
@@ -117,38 +118,40 @@ class HypothesisFilter:
         model, pixels = exposure_model(self.plant, 2), self.sensor.profile.pixels
         dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
-        view = PixelView(self.sensor, model, response, dark, updates.reduction(model, self.sensor))
-        updates.update(view.part(one), self.belief.part(one), _part(self._unseen, one), 0)
+        view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
+        updater.update(view.part(one), self.belief.part(one), _part(self._unseen, one), 0)
         view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
 
+    @property
+    def needs(self) -> Needs:
+        return Needs(what="windows" if self.plant.n_outputs > 1 else "profile", least_usable=HALF)
+
     def bridge(self, inputs: FloatArray) -> None:
-        """Predict over fast steps that no exposure covers, with their inputs, (k, axes * n_inputs)."""
         if len(inputs):
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
             self.belief = _moved(self.belief, transition, noise, kick)
             self._unseen = self._unwatched(transition, noise, kick)
 
-    def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Belief:
+    def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
         """The next of `_unseen`; that of an unstable plant stays where it is so wide that it says nothing."""
-        now, later = self._unseen, predicted(self._unseen, transition, noise, kick)
+        now, later = self._unseen, predict(self._unseen, transition, noise, kick)
         widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
         grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)
-        return Belief(
+        return Gaussian(
             np.where(grows[:, None], later.mean, now.mean),
             np.where(grows[:, None, None], later.covariance, now.covariance),
         )
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
-        """One exposure, with its pixels or without."""
         axes = self.plant.axes
-        reduced = self._updates.reduction(model, self.sensor)
+        reduced = self._updater.reduction(model, self.sensor)
         lost = self._missed >= _PATIENCE
         prior = _chosen(lost, single(self._unseen), self.belief)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
         new = Innovation(np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes), np.ones(axes, dtype=bool))
         several = np.zeros(axes, dtype=bool)
-        done: list[Update] = []
+        done: list[MixtureUpdate] = []
         took = np.zeros(0, dtype=np.intp)
         if measured is not None:
             usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
@@ -163,9 +166,9 @@ class HypothesisFilter:
                 parts += [alike[j : j + at_once] for j in range(0, len(alike), at_once)]
             seen = np.concatenate([usable[:0], *parts])
 
-            def updated(p: NDArray[np.intp]) -> Update:
+            def updated(p: NDArray[np.intp]) -> MixtureUpdate:
                 view = views[int(level[p[0]])].part(p)
-                u = self._updates.update(view, prior.part(p), _part(self._unseen, p), self._number)
+                u = self._updater.update(view, prior.part(p), _part(self._unseen, p), self._number)
                 return replace(u, coefficients=reduced.coefficients(u.coefficients))
 
             done = in_threads(updated, parts)
@@ -183,10 +186,10 @@ class HypothesisFilter:
             after = [np.concatenate(each) for each in zip(*(_arrays(d, most) for d in done), strict=True)]
             if len(took) < len(trusted):
                 after = [each[trusted] for each in after]
-            kicked = Hypotheses(after[0], after[1] + response.end[took][:, None], after[2])
+            kicked = GaussianMixture(after[0], after[1] + response.end[took][:, None], after[2])
             several[took] = after[5]
             if np.array_equal(took, np.arange(axes)):
-                coefficients, end = Belief(after[3], after[4]), kicked
+                coefficients, end = Gaussian(after[3], after[4]), kicked
             else:
                 coefficients.mean[took], coefficients.covariance[took] = after[3], after[4]
                 end = end.replaced(took, kicked)
@@ -199,11 +202,11 @@ class HypothesisFilter:
         )  # fmt: skip
 
 
-def _part(belief: Belief, axes: slice | NDArray[np.intp]) -> Belief:
-    return Belief(belief.mean[axes], belief.covariance[axes])
+def _part(belief: Gaussian, axes: slice | NDArray[np.intp]) -> Gaussian:
+    return Gaussian(belief.mean[axes], belief.covariance[axes])
 
 
-def _arrays(done: Update, components: int) -> tuple[NDArray[Any], ...]:
+def _arrays(done: MixtureUpdate, components: int) -> tuple[NDArray[Any], ...]:
     e, c = done.end.with_components(components), done.coefficients
     return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several)
 
@@ -220,15 +223,15 @@ def _spread(parts: Sequence[Innovation], seen: NDArray[np.intp], axes: int) -> I
     return out
 
 
-def _moved(h: Hypotheses, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Hypotheses:
+def _moved(h: GaussianMixture, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> GaussianMixture:
     """x -> A x + d, P -> A P A' + Q for each component."""
-    return Hypotheses(
+    return GaussianMixture(
         h.log_weight,
         batched.matvec(transition, h.mean) + kick[:, None],
         batched.symmetric(batched.congruence(transition, h.covariance) + noise),
     )
 
 
-def _chosen(which: BoolArray, first: Hypotheses, second: Hypotheses) -> Hypotheses:
+def _chosen(which: BoolArray, first: GaussianMixture, second: GaussianMixture) -> GaussianMixture:
     rows = np.flatnonzero(which)
     return second.replaced(rows, first.part(rows)) if len(rows) else second

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.numerics import batched
 
 FloatArray = NDArray[np.float64]
@@ -21,7 +21,7 @@ _JITTER = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Hypotheses:
+class GaussianMixture:
     """A mixture of Gaussians for each axis."""
 
     log_weight: FloatArray
@@ -31,22 +31,22 @@ class Hypotheses:
     covariance: FloatArray
     """(axes, components, n, n)"""
 
-    def part(self, axes: slice | NDArray[np.intp]) -> Hypotheses:
-        """Of these axes alone."""
-        return Hypotheses(self.log_weight[axes], self.mean[axes], self.covariance[axes])
+    def part(self, axes: slice | NDArray[np.intp]) -> GaussianMixture:
+        """The part of these axes."""
+        return GaussianMixture(self.log_weight[axes], self.mean[axes], self.covariance[axes])
 
     @property
-    def belief(self) -> Belief:
+    def belief(self) -> Gaussian:
         """Mean and covariance of the mixture."""
         axes, _, n = self.mean.shape
-        out = Belief(np.empty((axes, n)), np.empty((axes, n, n)))
+        out = Gaussian(np.empty((axes, n)), np.empty((axes, n, n)))
         compiled_mixtures.moments(*self.contiguous, out.mean, out.covariance)
         return out
 
-    def mapped(self, rows: FloatArray, remainder: FloatArray) -> Hypotheses:
+    def mapped(self, rows: FloatArray, remainder: FloatArray) -> GaussianMixture:
         """Of M t + e instead of t, M being ``rows`` (m, n) and the independent e's covariance ``remainder`` (m, m)."""
         (axes, count, _), m = self.mean.shape, len(rows)
-        out = Hypotheses(self.log_weight, np.zeros((axes, count, m)), np.zeros((axes, count, m, m)))
+        out = GaussianMixture(self.log_weight, np.zeros((axes, count, m)), np.zeros((axes, count, m, m)))
         compiled_mixtures.mapped(
             *self.contiguous, np.ascontiguousarray(rows), np.ascontiguousarray(remainder), out.mean, out.covariance
         )
@@ -57,7 +57,7 @@ class Hypotheses:
         return log_sum(self.component_log_densities(points), axis=1)
 
     def component_log_densities(self, points: FloatArray) -> FloatArray:
-        """Of each component times its weight, (axes, components, points)."""
+        """The log-density of each component times its weight, (axes, components, points)."""
         n = points.shape[-1]
         root = cholesky(self.covariance)
         away = points[:, None] - self.mean[:, :, None]
@@ -75,18 +75,18 @@ class Hypotheses:
             np.ascontiguousarray(self.covariance),
         )
 
-    def reduced(self, most: int, free: float = 0.0) -> Hypotheses:
+    def reduced(self, most: int, free: float = 0.0) -> GaussianMixture:
         """The same with ``most`` components, or fewer if mergers cost less than ``free``.
 
         Those two are merged, again and again, whose merger costs least. The cost is Runnalls' bound on the
         Kullback-Leibler divergence; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to
         Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
         """
-        merged = Hypotheses(self.log_weight.copy(), self.mean.copy(), self.covariance.copy())
+        merged = GaussianMixture(self.log_weight.copy(), self.mean.copy(), self.covariance.copy())
         compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
-    def with_components(self, count: int) -> Hypotheses:
+    def with_components(self, count: int) -> GaussianMixture:
         """The same with components that are not there after its own."""
         more = count - self.mean.shape[1]
         if more <= 0:
@@ -96,51 +96,51 @@ class Hypotheses:
             np.concatenate([each, np.repeat(each[:, :1], more, axis=1)], axis=1)
             for each in (self.mean, self.covariance)
         )
-        return Hypotheses(log_weight, mean, covariance)
+        return GaussianMixture(log_weight, mean, covariance)
 
-    def replaced(self, axes: NDArray[np.intp], by: Hypotheses) -> Hypotheses:
+    def replaced(self, axes: NDArray[np.intp], by: GaussianMixture) -> GaussianMixture:
         """The same with these axes' mixtures replaced."""
         count = max(self.mean.shape[1], by.mean.shape[1])
         old, new = self.with_components(count), by.with_components(count)
-        out = Hypotheses(old.log_weight.copy(), old.mean.copy(), old.covariance.copy())
+        out = GaussianMixture(old.log_weight.copy(), old.mean.copy(), old.covariance.copy())
         out.log_weight[axes], out.mean[axes], out.covariance[axes] = new.log_weight, new.mean, new.covariance
         return out
 
-    def ordered(self, most: int | None = None) -> Hypotheses:
+    def ordered(self, most: int | None = None) -> GaussianMixture:
         """The heaviest components first, without columns of which none is there."""
         order = np.argsort(-self.log_weight, axis=1, kind="stable")[:, :most]
         rows = np.arange(len(order))[:, None]
         kept = self.log_weight[rows, order]
         count = max(1, int(np.isfinite(kept).sum(axis=1).max(initial=1)))
         order = order[:, :count]
-        return Hypotheses(kept[:, :count], self.mean[rows, order], self.covariance[rows, order])
+        return GaussianMixture(kept[:, :count], self.mean[rows, order], self.covariance[rows, order])
 
 
-def single(belief: Belief) -> Hypotheses:
+def single(belief: Gaussian) -> GaussianMixture:
     """A mixture of one component."""
-    return Hypotheses(np.zeros((len(belief.mean), 1)), belief.mean[:, None], belief.covariance[:, None])
+    return GaussianMixture(np.zeros((len(belief.mean), 1)), belief.mean[:, None], belief.covariance[:, None])
 
 
-def joined(*mixtures: Hypotheses) -> Hypotheses:
+def joined(*mixtures: GaussianMixture) -> GaussianMixture:
     """All components of several mixtures, their weights normalised together."""
     log_weight = np.concatenate([each.log_weight for each in mixtures], axis=1)
-    return Hypotheses(
+    return GaussianMixture(
         log_weight - log_sum(log_weight, axis=1)[:, None],
         np.concatenate([each.mean for each in mixtures], axis=1),
         np.concatenate([each.covariance for each in mixtures], axis=1),
     )
 
 
-def stacked_axes(mixtures: Sequence[Hypotheses]) -> Hypotheses:
+def stacked_axes(mixtures: Sequence[GaussianMixture]) -> GaussianMixture:
     """Mixtures of different axes, one after the other."""
-    return Hypotheses(
+    return GaussianMixture(
         np.concatenate([each.log_weight for each in mixtures]),
         np.concatenate([each.mean for each in mixtures]),
         np.concatenate([each.covariance for each in mixtures]),
     )
 
 
-def with_noise(prior: Hypotheses, t: FloatArray) -> FloatArray:
+def with_noise(prior: GaussianMixture, t: FloatArray) -> FloatArray:
     """Log-densities of t = (start state, standard normal noise coefficients), (axes, points, n) -> (axes, points)."""
     states = prior.mean.shape[2]
     rest = t[..., states:]

@@ -6,7 +6,7 @@ weighted against all densities together (Veach's balance heuristic; in this use 
 importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and frame.
 
 Some posteriors no such mixture comes near: of a spot that hardly moves, seen through little noise, the blur fixes the
-sum of many squares, and the posterior is a shell. There points are annealed (`aolink.estimation.pixels.tempering`).
+sum of many squares, and the posterior is a shell. There points are tempered (`aolink.estimation.pixels.tempering`).
 """
 
 from __future__ import annotations
@@ -20,10 +20,17 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, joined, log_sum, stacked_axes, with_noise
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.pixels.gaussian_mixture import (
+    GaussianMixture,
+    cholesky,
+    joined,
+    log_sum,
+    stacked_axes,
+    with_noise,
+)
 from aolink.estimation.pixels.likelihood import PixelView
-from aolink.estimation.pixels.tempering import annealed, fitted
+from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.numerics import batched
 
 FloatArray = NDArray[np.float64]
@@ -32,14 +39,14 @@ BoolArray = NDArray[np.bool_]
 # Rounds at most, where fewer points than these count.
 _ROUNDS = 4
 _ENOUGH = 100.0
-# If it is fewer still, so many are annealed, and their end states described by so many Gaussians.
-_ANNEALED = 600
+# If it is fewer still, so many are tempered, and their end states described by so many Gaussians.
+_TEMPERED = 600
 _COMPONENTS = 6
 # Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
 # is too sure. And steps of the search for the power.
 _LEAST_EFFECTIVE = 128.0
 _HALVINGS = 6
-# Points of a round for each pair of coefficients; as many as the next power of two. Of one or two coefficients that
+# Points of a round for each pair of coefficients; as many as the next power of two. For one or two coefficients that
 # would be fewer than are to count.
 _POINTS = 14
 _FEWEST_POINTS = 128
@@ -60,25 +67,25 @@ _LOOSENED = 2.0
 _NEGLIGIBLE = 1e-3
 
 
-def proposed(modes_weight: FloatArray, modes: Belief, wide_weight: FloatArray, wide: Belief) -> Hypotheses:
+def proposed(modes_weight: FloatArray, modes: Gaussian, wide_weight: FloatArray, wide: Gaussian) -> GaussianMixture:
     """Modes, flattened a little, and the wide Gaussians of windowed moments about them, to draw points from.
 
     Both weights are logarithms; covariances and means (axes, components, ...).
     """
     weight = _EVIDENCE * (modes_weight - np.maximum.reduce(modes_weight, axis=1, keepdims=True))
     weight += math.log(1 - _WIDE) - log_sum(weight, axis=1)[:, None]
-    narrow = Hypotheses(weight, modes.mean, modes.covariance * _INFLATION)
-    return joined(narrow, Hypotheses(wide_weight + math.log(_WIDE), wide.mean, wide.covariance))
+    narrow = GaussianMixture(weight, modes.mean, modes.covariance * _INFLATION)
+    return joined(narrow, GaussianMixture(wide_weight + math.log(_WIDE), wide.mean, wide.covariance))
 
 
 def posterior(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, number: int, believed: BoolArray, share: float,
+    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, number: int, believed: BoolArray, share: float,
     several: BoolArray,
-) -> Hypotheses:  # fmt: skip
+) -> GaussianMixture:  # fmt: skip
     """The posterior of t in the exposure of this number as the mixture that fits it.
 
-    Of the usual number of points each round has this ``share``, and so many are to count, but for axes with ``several``
-    modes. Axes that are not ``believed`` are not worth annealing.
+    Each round has this ``share`` of the usual number of points, and so many are to count, but for axes with ``several``
+    modes. Axes that are not ``believed`` are not worth tempering.
     """
     fit, effective = importance_corrected(view, prior, proposal, share, np.where(several, _ENOUGH, share * _ENOUGH))
     few = np.flatnonzero(believed & ~(effective >= share * _ENOUGH))
@@ -86,21 +93,23 @@ def posterior(
         return fit
     rows = view.reduced.end_rows
     points = (
-        annealed(view.part(few[k : k + 1]), prior.part(few[k : k + 1]), _ANNEALED, (number, int(view.axes[few[k]])))
+        tempered_points(
+            view.part(few[k : k + 1]), prior.part(few[k : k + 1]), _TEMPERED, (number, int(view.axes[few[k]]))
+        )
         for k in range(len(few))
     )
     return fit.replaced(few, stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points]))
 
 
 def importance_corrected(
-    view: PixelView, prior: Hypotheses, proposal: Hypotheses, share: float, enough: FloatArray
-) -> tuple[Hypotheses, FloatArray]:
+    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float, enough: FloatArray
+) -> tuple[GaussianMixture, FloatArray]:
     """The mixture that fits weighted points, and how many of them count, (axes,): ``enough``, if so many do."""
     n = view.reduced.size
     points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
     if (line := view.line) is not None:
         numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]
-        fit = Hypotheses(
+        fit = GaussianMixture(
             *(np.array(each, order="C") for each in (proposal.log_weight, proposal.mean, proposal.covariance))
         )
         effective = np.empty(len(prior.mean))
@@ -110,7 +119,7 @@ def importance_corrected(
             n * _LAST_PRIOR_POINTS, _LOOSENED, _NEGLIGIBLE, effective,
         )  # fmt: skip
         return fit, effective
-    proposal, proposals = proposal.ordered(), list[Hypotheses]()
+    proposal, proposals = proposal.ordered(), list[GaussianMixture]()
     t = np.zeros((len(prior.mean), 0, n))
     target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
     fit, going_on = proposal, np.ones(len(t), dtype=bool)
@@ -132,9 +141,9 @@ def importance_corrected(
     return fit, effective
 
 
-def _where(which: NDArray[np.bool_], first: Hypotheses, second: Hypotheses) -> Hypotheses:
+def _where(which: NDArray[np.bool_], first: GaussianMixture, second: GaussianMixture) -> GaussianMixture:
     """The first in these axes, the second in the others."""
-    return Hypotheses(
+    return GaussianMixture(
         np.where(which[:, None], first.log_weight, second.log_weight),
         np.where(which[:, None, None], first.mean, second.mean),
         np.where(which[:, None, None, None], first.covariance, second.covariance),
@@ -156,7 +165,7 @@ def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
     return w - log_sum(w, axis=1)[:, None]
 
 
-def _drawn(proposal: Hypotheses, count: int, number: int) -> FloatArray:
+def _drawn(proposal: GaussianMixture, count: int, number: int) -> FloatArray:
     """Points of a mixture, (axes, count, n); those of each round have a number."""
     axes, _, n = proposal.mean.shape
     u, e = _quasi_random(count, n, number)
@@ -178,8 +187,8 @@ def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArr
 
 
 def _refitted(
-    mixture: Hypotheses, points: FloatArray, log_weight: FloatArray, beside: Hypotheses, prior_points: float
-) -> Hypotheses:
+    mixture: GaussianMixture, points: FloatArray, log_weight: FloatArray, beside: GaussianMixture, prior_points: float
+) -> GaussianMixture:
     """One step of expectation and maximisation with weighted points, and the covariances of ``beside`` as some more."""
     logs = mixture.component_log_densities(points)
     share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
@@ -194,4 +203,4 @@ def _refitted(
     covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
     mass = np.where(mass > _NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
     with np.errstate(divide="ignore"):
-        return Hypotheses(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)
+        return GaussianMixture(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

@@ -24,24 +24,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.kalman import information
-from aolink.estimation.kalman.observation import Belief, Correction
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse
+from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
+from aolink.estimation.kalman.gaussian import Gaussian, Update
+from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
 from aolink.estimation.moments.joint_moments import JointMoments, by_spot
-from aolink.estimation.moments.spots import SpotWindows
-from aolink.estimation.pixels.likelihood import _masses, mehler_series
-from aolink.numerics import single_thread
+from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, next_damping
+from aolink.estimation.pixels.likelihood import mehler_series, pixel_masses
+from aolink.numerics import information, single_thread
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
 
 _PASSES = 12
-_FIRST_DAMPING = 0.01
-_LARGEST_DAMPING = 1e6
-_FREE_DAMPING = 0.1
 # The objective, which is of hundreds of coefficients, changes by less than this at a mode.
 _CONVERGED = 0.3
 # Rms of a path's prior, in standard deviations of the kernel, up to which there is one mode that matters.
@@ -56,7 +53,7 @@ class JointPixels:
     Parameters
     ----------
     density, mask, light:
-        Of one copy of the plant: (spots, rows, columns) twice, and (spots,) or None, as of `SpotWindows`.
+        Data of one copy of the plant: (spots, rows, columns) twice, and (spots,) or None, as of `SpotWindows`.
     """
 
     def __init__(
@@ -76,13 +73,13 @@ class JointPixels:
 
     @property
     def kernel_variance(self) -> float:
-        """Of the narrowest direction, slope units squared."""
+        """Variance of the kernel in its narrowest direction, slope units squared."""
         return float(np.linalg.eigvalsh(self._kernel)[0])
 
     def at(self, t: FloatArray) -> Linearised:
         """All that is known of the neighbourhood of a point."""
         path, highest = self.paths.positions(t), len(self._terms)
-        X, Y = (np.stack(_masses(self._kernel[d, d], self._edges, path[:, d], highest)) for d in (0, 1))
+        X, Y = (np.stack(pixel_masses(self._kernel[d, d], self._edges, path[:, d], highest)) for d in (0, 1))
         # A displacement is one more course.
         courses = np.column_stack([self.paths.functions, np.ones(len(self.paths.weights))])
         spots, m = len(path), courses.shape[1]
@@ -139,7 +136,7 @@ def find_mode(
     view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray, passes: int = _PASSES
 ) -> Mode:
     """Where a start leads, for a prior with this mean and information."""
-    paths, damping = view.paths, _FIRST_DAMPING
+    paths, damping = view.paths, FIRST_DAMPING
 
     def pulled(t: FloatArray, log_likelihood: float) -> tuple[FloatArray, float]:
         """By the prior, and the objective."""
@@ -154,8 +151,8 @@ def find_mode(
         damped = H.copy()
         np.fill_diagonal(damped, np.diagonal(H) * (1 + damping))
         step = information.solve(damped, g)
-        free = damping <= _FREE_DAMPING
-        # What a step would gain says when it is at a mode, before the pixels are looked at again.
+        free = damping <= FREE_DAMPING
+        # What a step would gain says when it is at a mode, before the pixels are linearised again.
         if free and 0.5 * step @ g < _CONVERGED:
             break
         there = view.at(t + step)
@@ -163,12 +160,12 @@ def find_mode(
         pull_there, value = pulled(t + step, there.log_likelihood)
         if value < now:
             gain, now, t, at, pull = now - value, value, t + step, there, pull_there
-            H, damping = precision + paths.information(at.information), damping / 8
+            H, damping = precision + paths.information(at.information), float(next_damping(damping, True))
             if free and gain < _CONVERGED:
                 break
         else:
-            damping = max(damping, 1e-3) * 8
-            if damping > _LARGEST_DAMPING:
+            damping = float(next_damping(damping, False))
+            if damping > LARGEST_DAMPING:
                 break
     return Mode(t, H, now, used, at)
 
@@ -180,6 +177,7 @@ class JointProfile:
     one number for each output, chi-square together if all is well.
     """
 
+    needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
     models_noise = True
 
     def __init__(self, sensor: SpotSensor, n_outputs: int) -> None:
@@ -187,9 +185,7 @@ class JointProfile:
         self._moments = JointMoments(sensor, n_outputs)
 
     @single_thread.by_one_thread
-    def correct(
-        self, model: ExposureModel, response: InputResponse, prior: Belief, measured: SpotWindows
-    ) -> Correction:
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
         """The mode of the posterior, copy by copy of the plant."""
         assert isinstance(model, FactoredModel)
         paths, n = joint_paths(model, self.sensor), model.plant.n_states
@@ -204,12 +200,12 @@ class JointProfile:
                 mode = find_mode(view, before, paths.prior_information(P), before)
                 t, after, at = mode.t, information.covariance(mode.precision), mode.at
             else:
-                t, after, *_ = self._moments.corrected(model, view.paths, Belief(before, P), by_spot(measured, axis))
+                t, after, *_ = self._moments.corrected(model, view.paths, Gaussian(before, P), by_spot(measured, axis))
                 at = view.at(t)
             mean[axis, : paths.size], covariance[axis, : paths.size, : paths.size] = t, after
             found.append(innovation(view.paths, before, P, t, at))
         new, S, nis = (np.stack(each) for each in zip(*found, strict=True))
-        return Correction(Belief(mean, covariance), new, S, nis)
+        return Update(Gaussian(mean, covariance), new, S, nis)
 
 
 def innovation(

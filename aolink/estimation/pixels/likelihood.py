@@ -1,7 +1,7 @@
 """The pixels of an exposure as a function of few coefficients, for the estimators that use the blur whole.
 
 A pixel is E[Y | path] = (1/N) sum_k (kernel integrated over it, the spot resting at theta_k) / D, and theta is linear
-in the coefficients z = (x(k0), xi) of the exposure. Of xi only those directions are kept that move the spot by
+in the coefficients z = (x(k0), xi) of the exposure. Only those directions of xi are kept that move the spot by
 something that the kernel does not hide: of the singular vectors of the noise path those whose
 remainder is a tenth of the kernel's standard deviation, rms. What is left out keeps its prior and widens the kernel by
 its variance, which is right to second order. Start states are kept whole.
@@ -21,12 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.frames.frame_data import Profile, SpotWindows
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
-from aolink.estimation.model.exposure_model import ExposureModel, InputResponse, exposure_model
-from aolink.estimation.model.quadrature import Nodes
-from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
-from aolink.estimation.moments.windowed import Profile, Regression, Windowed, WindowedMoments
+from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.exposure_model import exposure_model
+from aolink.estimation.model.quadrature import QuadraturePaths
+from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import Regression, Windowed, WindowedMoments
 from aolink.numerics import batched
 from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import effective_noise_density, shot_gain
@@ -45,7 +47,7 @@ _PATHS = 64
 # Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
 _SERIES = 1e-6
 _MOST_TERMS = 30
-# Of a pixel's light by the spot's place: points in one standard deviation of the kernel, and where it ends.
+# The table of a pixel's light by the spot's place: points in one standard deviation of the kernel, and where it ends.
 _POINTS = 16
 _REACH = 5.0
 
@@ -71,24 +73,24 @@ class Reduction:
         """n"""
         return int(self.expand.shape[1])
 
-    def prior(self, state: Belief) -> Belief:
-        """Of t, from that of the start state; leading axes as they come."""
+    def prior(self, state: Gaussian) -> Gaussian:
+        """The prior of t, from that of the start state; leading axes as they come."""
         *lead, states = state.mean.shape
         mean, covariance = np.zeros((*lead, self.size)), np.zeros((*lead, self.size, self.size))
         mean[..., :states] = state.mean
         covariance[...] = np.eye(self.size)
         covariance[..., :states, :states] = state.covariance
-        return Belief(mean, covariance)
+        return Gaussian(mean, covariance)
 
-    def end(self, t: Belief) -> Belief:
-        """Of the state at the exposure's end, without what inputs do; leading axes as they come."""
+    def end(self, t: Gaussian) -> Gaussian:
+        """The Gaussian of the state at the exposure's end, without what inputs do; leading axes as they come."""
         spread = batched.congruence(self.end_rows, t.covariance) + self.end_remainder
-        return Belief(batched.matvec(self.end_rows, t.mean), batched.symmetric(spread))
+        return Gaussian(batched.matvec(self.end_rows, t.mean), batched.symmetric(spread))
 
-    def coefficients(self, t: Belief) -> Belief:
-        """Of z, from that of t, one for each axis."""
+    def coefficients(self, t: Gaussian) -> Gaussian:
+        """The Gaussian of z, from that of t, one for each axis."""
         spread = batched.congruence(self.expand, t.covariance) + self.left_out
-        return Belief(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
+        return Gaussian(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
 
 
 def reduction(
@@ -136,7 +138,7 @@ def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_st
 
 
 def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
-    """Of the outputs of a plant that no camera has looked at, (paths, n_steps)."""
+    """Paths of the outputs of a plant without a camera, (paths, n_steps)."""
     t = np.random.default_rng(0).standard_normal((_PATHS, expand.shape[1]))
     n = model.plant.n_states
     t[:, :n] = t[:, :n] @ psd_root(model.plant.initial_covariance).T
@@ -146,7 +148,7 @@ def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
 class PixelView:
     """What one frame shows, as a function of the reduced coefficients of each axis.
 
-    Hypotheses of each axis lie along the second dimension of every argument, (axes, hypotheses, ...). ``level`` is that
+    Points of each axis lie along the second dimension of every argument, (axes, k, ...). ``level`` is that
     of the reduction's resolution.
     """
 
@@ -157,7 +159,7 @@ class PixelView:
         self.sensor, self.reduced = sensor, reduced
         line = isinstance(measured, Profile)
         self._optics = sensor.profile if line else sensor
-        at = quadrature.nodes_of(model, response, reduced.resolution.levels[level])
+        at = quadrature.quadrature_paths(model, response, reduced.resolution.levels[level])
         self._basis = at.basis @ reduced.expand
         self._weights = at.weights
         self._inputs = at.inputs
@@ -176,7 +178,7 @@ class PixelView:
         self._measured, self._windowed = measured, _windowed(sensor, line, model.plant.n_outputs)
 
     def part(self, axes: slice | NDArray[np.intp]) -> PixelView:
-        """Of these axes alone."""
+        """The part of these axes."""
         view = copy(self)
         view.y, view.mask, view._inputs = self.y[axes], self.mask[axes], self._inputs[axes]
         view._measured = replace(self._measured, density=self._measured.density[axes], mask=self._measured.mask[axes])
@@ -185,7 +187,7 @@ class PixelView:
 
     @property
     def outputs(self) -> int:
-        """Of one axis."""
+        """Outputs of one axis."""
         return int(self._basis.shape[0])
 
     @property
@@ -200,7 +202,7 @@ class PixelView:
 
     @property
     def kernel_variance(self) -> float:
-        """Of the narrowest direction, slope units squared."""
+        """Variance of the kernel in its narrowest direction, slope units squared."""
         return float(np.linalg.eigvalsh(self._kernel)[0])
 
     @property
@@ -213,33 +215,33 @@ class PixelView:
         """Their squares, the mean over the exposure and the sum over outputs, (n, n)."""
         return np.asarray((self.rows * np.tile(self._weights, self.outputs)[:, None]).T @ self.rows)
 
-    def moments(self, about: Belief) -> tuple[FloatArray, FloatArray, Regression]:
+    def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
         """Windowed moments about a belief of t, their noise and regression, as `Windowed.look`; of all axes."""
-        at = Nodes(basis=self._basis, weights=self._weights, inputs=self._inputs)
+        at = QuadraturePaths(basis=self._basis, weights=self._weights, inputs=self._inputs)
         return self._windowed.look(at, about, self._measured)
 
     def paths(self, t: FloatArray) -> FloatArray:
-        """Outputs at the nodes, (axes, hypotheses, n_outputs, nodes)."""
+        """Outputs at the nodes, (axes, k, n_outputs, nodes)."""
         outputs, nodes, size = self._basis.shape
         rows = self._basis.reshape(-1, size)
         flat = batched.long_matmul(t, rows.T)
         return np.asarray(flat.reshape(*t.shape[:2], outputs, nodes) + self._inputs[:, None])
 
     def predicted(self, t: FloatArray) -> FloatArray:
-        """Densities of the pixels without noise, (axes, hypotheses, pixels)."""
+        """Densities of the pixels without noise, (axes, k, pixels)."""
         path, w = self.paths(t), self._weights
         edges = self._optics.profile.edges
         if self._line:
-            (mass,) = _masses(self._kernel[0, 0], edges, path[:, :, 0], 0)
+            (mass,) = pixel_masses(self._kernel[0, 0], edges, path[:, :, 0], 0)
             return batched.matmul(w[None], mass)[..., 0, :] / self._optics.pixel_size
         spots, terms = path.shape[2] // 2, self._terms()
         path = path.reshape(*path.shape[:2], spots, 2, -1)
-        X, Y = (_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
+        X, Y = (pixel_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
         light = sum(c * batched.long_matmul(batched.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms))
         return np.asarray(light).reshape(*t.shape[:2], -1) / self._optics.pixel_size
 
     def log_likelihoods(self, t: FloatArray) -> FloatArray:
-        """Of many points (axes, points, n), (axes, points)."""
+        """Log-likelihoods of many points (axes, points, n), (axes, points)."""
         line = self.line
         if line is None:
             return self.log_likelihood(self.predicted(t))
@@ -266,18 +268,18 @@ class PixelView:
         )  # fmt: skip
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The same and their Jacobian, (axes, hypotheses, pixels, n)."""
+        """The same and their Jacobian, (axes, k, pixels, n)."""
         path, w = self.paths(t), self._weights[:, None]
         edges, D = self._optics.profile.edges, self._optics.pixel_size
         lead, size = t.shape[:2], t.shape[2]
         if self._line:
-            mass, slope = _masses(self._kernel[0, 0], edges, path[:, :, 0], 1)
+            mass, slope = pixel_masses(self._kernel[0, 0], edges, path[:, :, 0], 1)
             f = batched.matmul(self._weights[None], mass)[..., 0, :] / D
             J = batched.long_matmul(batched.transpose(slope * w), self._basis[0]) / D
             return f, J
         spots, terms = path.shape[2] // 2, self._terms()
         path = path.reshape(*lead, spots, 2, -1)
-        X, Y = (_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms)) for d in (0, 1))
+        X, Y = (pixel_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms)) for d in (0, 1))
         along, across = (self._basis.reshape(spots, 2, -1, size)[:, d] for d in (0, 1))
         light: FloatArray = np.zeros(())
         slopes: FloatArray = np.zeros(())
@@ -296,7 +298,7 @@ class PixelView:
         return light.reshape(*lead, -1) / D, slopes.reshape(*lead, -1, size) / D
 
     def log_likelihood(self, f: FloatArray) -> FloatArray:
-        """Of the usable pixels where these are expected, up to a constant, (axes, hypotheses)."""
+        """Log-likelihood of the usable pixels where these are expected, up to a constant, (axes, k)."""
         R = self._variance(f)
         e = self.y[:, None] - f
         terms = e * e / R
@@ -305,7 +307,7 @@ class PixelView:
         return np.asarray(-0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1))
 
     def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Score and Fisher information of each pixel by what is expected of it, (axes, hypotheses, pixels).
+        """Score and Fisher information of each pixel by what is expected of it, (axes, k, pixels).
 
         The variance grows with what is expected (shot noise), which is information of its own.
         """
@@ -348,11 +350,11 @@ def _light_table(variance: float, pixel: float) -> FloatArray:
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1
     places = (np.arange(points) + 0.5) * pixel / points
-    masses = _masses(variance, pixel * np.arange(-half, half + 1.0), places, 3)
+    masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, 3)
     return np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
 
 
-def _masses(variance: float, edges: FloatArray, positions: FloatArray, highest: int) -> list[FloatArray]:
+def pixel_masses(variance: float, edges: FloatArray, positions: FloatArray, highest: int) -> list[FloatArray]:
     """Share of the light of a Gaussian spot that each pixel gets, and its derivatives by the position.
 
     (..., nodes) -> (..., nodes, pixels), 0 to ``highest``.

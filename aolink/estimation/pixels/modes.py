@@ -20,10 +20,12 @@ from scipy import special
 from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.compiled import moments as compiled_moments
 from aolink.estimation.compiled.line import Line
-from aolink.estimation.kalman.observation import Belief, corrected
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import cholesky, lower_inverse
+from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, next_damping
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
 
@@ -32,9 +34,6 @@ BoolArray = NDArray[np.bool_]
 
 _PASSES = 16
 _BROAD_PASSES = 2
-_FIRST_DAMPING = 0.01
-_LARGEST_DAMPING = 1e6
-_FREE_DAMPING = 0.1
 _NO_NOISE = 1e-14
 # The objective changes by less than this at a mode, which is near enough to draw points about it.
 _CONVERGED = 0.03
@@ -74,14 +73,14 @@ class Modes:
 
 
 def find_modes(
-    view: PixelView, prior: Belief, starts: FloatArray, passes: int = _PASSES, converged: float = _CONVERGED
+    view: PixelView, prior: Gaussian, starts: FloatArray, passes: int = _PASSES, converged: float = _CONVERGED
 ) -> Modes:
     """Where each start leads.
 
     Parameters
     ----------
     prior:
-        Of each axis.
+        Prior of each axis.
     starts:
         In whitened coordinates, (axes, starts, n).
     """
@@ -89,14 +88,14 @@ def find_modes(
     if (line := view.line) is not None:
         return _found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0, passes, converged)
     if prior.mean.ndim == 2:
-        prior = Belief(
+        prior = Gaussian(
             np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
         )
     rows = view.part(np.repeat(np.arange(axes), count))
     m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
     s = starts.reshape(-1, n)
     at = _at(rows, m, L, s)
-    damping = np.full(len(s), _FIRST_DAMPING)
+    damping = np.full(len(s), FIRST_DAMPING)
     active = np.arange(len(s))
     for _ in range(passes):
         if not len(active):
@@ -113,11 +112,10 @@ def find_modes(
         for mine, theirs in ((at.H, there.H), (at.g, there.g), (at.objective, there.objective)):
             mine[took] = theirs[better]
         before = damping[active]
-        damping[active] = np.where(better, damping[active] / 8, np.maximum(damping[active], 1e-3) * 8)
-        # A short step says nothing where it is the damping that made it short.
-        free = before <= _FREE_DAMPING
+        damping[active] = next_damping(damping[active], better)
+        free = before <= FREE_DAMPING
         settled = (free & better & (gain < converged)) | (free & (batched.dot(step, g) < converged))
-        settled |= damping[active] > _LARGEST_DAMPING
+        settled |= damping[active] > LARGEST_DAMPING
         active = active[~settled]
     covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(at.H), dtype=np.float64)))
     _, log_H = np.linalg.slogdet(at.H)
@@ -131,7 +129,7 @@ def find_modes(
 
 
 def _found_compiled(
-    line: Line, prior: Belief, starts: FloatArray, of_axis: NDArray[np.intp], whole: int, reversed_precision: float,
+    line: Line, prior: Gaussian, starts: FloatArray, of_axis: NDArray[np.intp], whole: int, reversed_precision: float,
     passes: int = _PASSES, converged: float = _CONVERGED,
 ) -> Modes:  # fmt: skip
     axes, count, n = starts.shape
@@ -142,13 +140,13 @@ def _found_compiled(
     )  # fmt: skip
     compiled_modes.find_modes(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
-        of_axis, whole, reversed_precision, passes, _FIRST_DAMPING, _LARGEST_DAMPING, _FREE_DAMPING, converged,
+        of_axis, whole, reversed_precision, passes, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, converged,
         found.mean, found.covariance, found.log_evidence, found.distance, found.objective,
     )  # fmt: skip
     return found
 
 
-def modes_of(view: PixelView, prior: Belief, wide: Belief) -> Modes:
+def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
     """The modes of a posterior, looked for from what windowed moments make of the prior.
 
     Starts lie there and on both sides along the most uncertain direction of the path; where that is wider than so many
@@ -162,7 +160,7 @@ def modes_of(view: PixelView, prior: Belief, wide: Belief) -> Modes:
         return _found_compiled(line, prior, starts, of_axis, view.whole_nodes, _reversed_precision(view))
     found = find_modes(view, prior, starts[:, :3])
     if len(some := np.flatnonzero(many)):
-        of_some = Belief(prior.mean[some], prior.covariance[some])
+        of_some = Gaussian(prior.mean[some], prior.covariance[some])
         found = with_more(found, some, find_modes(view.part(some), of_some, starts[some, 3:]))
     return with_reversals(view, prior, found)
 
@@ -175,7 +173,7 @@ class _Point:
 
 
 def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
-    """Information, gradient and objective at whitened coordinates, one hypothesis a row."""
+    """Information, gradient and objective at whitened coordinates, one start a row."""
     f, J = rows.linearised(m + batched.matvec(L, s)[:, None])
     score, information = rows.information(f)
     J = batched.long_matmul(J[:, 0], L)
@@ -192,10 +190,10 @@ def without_repeats(modes: Modes) -> Modes:
     return Modes(*(each[:, : max(most, 1)] for each in kept))
 
 
-def broad(view: PixelView, prior: Belief) -> Belief:
+def broad(view: PixelView, prior: Gaussian) -> Gaussian:
     """What windowed moments make of the prior of t: wide where the blur has several readings."""
     if (line := view.line) is not None:
-        after = Belief(np.empty_like(prior.mean), np.empty_like(prior.covariance))
+        after = Gaussian(np.empty_like(prior.mean), np.empty_like(prior.covariance))
         compiled_moments.broad(
             line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), _BROAD_PASSES, _NO_NOISE,
             PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
@@ -207,11 +205,11 @@ def broad(view: PixelView, prior: Belief) -> Belief:
         innovation = y - fit.expected - batched.matvec(fit.slope, prior.mean - about.mean)
         # A window without a pixel that can be used has neither moments nor noise.
         spread = noise + fit.remainder + _NO_NOISE * np.eye(y.shape[1])
-        about = corrected(prior, innovation, fit.slope, spread).posterior
+        about = joseph_update(prior, innovation, fit.slope, spread).posterior
     return about
 
 
-def spread_starts(view: PixelView, prior: Belief, wide: Belief) -> tuple[FloatArray, FloatArray]:
+def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[FloatArray, FloatArray]:
     """The mean of a wide belief and points on both sides of it along the path's most uncertain directions.
 
     Returns
@@ -241,7 +239,7 @@ def _reversed_precision(view: PixelView) -> float:
     return 1 / (_REVERSED_TO**2 * view.kernel_variance)
 
 
-def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> FloatArray:
+def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> FloatArray:
     """Whitened coordinates of paths that blur like those of points (axes, k, n), (axes, 3 k, n).
 
     Run backwards, which gives the same blur; mirrored about their mean, which gives the same where the blur is
@@ -264,7 +262,7 @@ def reversed_starts(view: PixelView, prior: Belief, points: FloatArray) -> Float
     return np.asarray(np.linalg.solve(H, batched.transpose(right)).swapaxes(-1, -2))
 
 
-def with_reversals(view: PixelView, prior: Belief, modes: Modes) -> Modes:
+def with_reversals(view: PixelView, prior: Gaussian, modes: Modes) -> Modes:
     """The same modes, and those that the reversal of the best one and its mirror images lead to."""
     back = reversed_starts(view, prior, modes.mean[np.arange(len(modes.mean)), modes.best][:, None])
     more = find_modes(view, prior, back)
@@ -284,13 +282,13 @@ def with_more(modes: Modes, axes: slice | NDArray[np.intp], more: Modes) -> Mode
     return Modes(*(both(f.name) for f in fields(Modes)))
 
 
-def whitened(prior: Belief, points: FloatArray) -> FloatArray:
+def whitened(prior: Gaussian, points: FloatArray) -> FloatArray:
     """Points (axes, k, n) in coordinates in which the prior is N(0, I)."""
     inverse = lower_inverse(cholesky(prior.covariance))
     return batched.matmul(points - prior.mean[:, None], batched.transpose(inverse))
 
 
-def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
+def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
     """Innovation of the pixels linearised at the best mode, in units of their noise.
 
     With A = R^(-1/2) J L = U S V', the pixels' innovation has variance 1 + S^2 along U's columns, and 1 elsewhere.
@@ -316,9 +314,9 @@ def innovation(view: PixelView, prior: Belief, modes: Modes) -> Innovation:
 
 
 def _innovations(
-    view: PixelView, prior: Belief, t: FloatArray, k: int
+    view: PixelView, prior: Gaussian, t: FloatArray, k: int
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Of points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
+    """Innovations at points t (axes, n) in k directions: values, S^2, NIS, and e'e with e = R^(-1/2) (y - f)."""
     L, s = cholesky(prior.covariance), whitened(prior, t[:, None])[:, 0]
     f, J = view.linearised(t[:, None])
     score, information = (each[:, 0] for each in view.information(f))

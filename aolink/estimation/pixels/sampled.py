@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.exposure_model import ExposureModel
-from aolink.estimation.pixels.filter import Update
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, stacked_axes
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.pixels.filter import MixtureUpdate
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, stacked_axes
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import innovation
-from aolink.estimation.pixels.tempering import annealed, fitted
+from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.estimation.pixels.updates import explored, has_several
 from aolink.numerics import batched
 from aolink.optics.sensor import BaseSensor
@@ -29,7 +29,7 @@ _COMPONENTS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class SampledUpdates:
+class TemperedUpdater:
     """Particles of one axis after another; a mixture of Gaussians is fitted to their end states."""
 
     particles: int = 3000
@@ -39,31 +39,34 @@ class SampledUpdates:
         """The coefficients that it works with."""
         return reduction(model, sensor, left_out=_LEFT_OUT, all_steps=True)
 
-    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
         """The posterior of axes with a prior of their start states."""
         t = self.sample(view, prior, number)
         reduced, before = view.reduced, view.reduced.prior(prior.belief)
         mean = t.mean(axis=1)
         away = t - mean[:, None]
-        after = Belief(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
+        after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))
         modes, _ = explored(view, prior)
         new = innovation(view, before, modes)
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
-        end = reduced.end(Belief(fit.mean, fit.covariance))
-        return Update(after, Hypotheses(fit.log_weight, end.mean, end.covariance), new, has_several(modes))
+        end = reduced.end(Gaussian(fit.mean, fit.covariance))
+        return MixtureUpdate(after, GaussianMixture(fit.log_weight, end.mean, end.covariance), new, has_several(modes))
 
-    def sample(self, view: PixelView, prior: Hypotheses, number: int) -> FloatArray:
+    def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> FloatArray:
         """Equally likely particles of the posterior, (axes, particles, n).
 
         Parameters
         ----------
         prior:
-            Of the start state; the noise coefficients have N(0, I).
+            Prior of the start state; the noise coefficients have N(0, I).
         number:
-            Of the exposure: with the seed and the axis it makes the random numbers.
+            Number of the exposure: with the seed and the axis it makes the random numbers.
         """
         each = [np.array([axis]) for axis in range(len(prior.mean))]
         keys = [(self.seed, number, int(axis)) for axis in view.axes]
         return np.stack(
-            [annealed(view.part(a), prior.part(a), self.particles, key) for a, key in zip(each, keys, strict=True)]
+            [
+                tempered_points(view.part(a), prior.part(a), self.particles, key)
+                for a, key in zip(each, keys, strict=True)
+            ]
         )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, log_sum, with_noise
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
 
 FloatArray = NDArray[np.float64]
@@ -30,24 +30,24 @@ _LEAST_SPREAD = 1e-3
 _WHOLE = 4
 
 
-def annealed(view: PixelView, prior: Hypotheses, count: int, key: tuple[int, ...]) -> FloatArray:
+def tempered_points(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...]) -> FloatArray:
     """Equally likely points of the posterior of one axis, (count, n).
 
     Parameters
     ----------
     prior:
-        Of the start state; the noise coefficients have N(0, I).
+        Prior of the start state; the noise coefficients have N(0, I).
     key:
         The same one gives the same points.
     """
     rng, n = np.random.default_rng(key), view.reduced.size
     t = _drawn(prior, rng, count, n)
-    log_prior, log_light = _log_prior(prior, t), _log_likelihood(view, t)
+    log_prior, log_likelihood = _log_prior(prior, t), _log_likelihood(view, t)
     power = 0.0
     while power < 1.0:
-        power, before = _next_power(log_light, power), power
-        chosen = _resampled(np.exp((power - before) * (log_light - log_light.max())), rng)
-        t, log_prior, log_light = t[chosen], log_prior[chosen], log_light[chosen]
+        power, before = _next_power(log_likelihood, power), power
+        chosen = _resampled(np.exp((power - before) * (log_likelihood - log_likelihood.max())), rng)
+        t, log_prior, log_likelihood = t[chosen], log_prior[chosen], log_likelihood[chosen]
         root = cholesky(np.cov(t, rowvar=False).reshape(n, n))
         size = 1.0
         for move in range(_MOVES):
@@ -58,17 +58,17 @@ def annealed(view: PixelView, prior: Hypotheses, count: int, key: tuple[int, ...
                 length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * size
                 step = length * (t[first] - t[second]) + 0.01 * rng.standard_normal((count, n)) @ root.T
             there = t + step
-            its_prior, its_light = _log_prior(prior, there), _log_likelihood(view, there)
-            gain = its_prior - log_prior + power * (its_light - log_light)
+            its_prior, its_likelihood = _log_prior(prior, there), _log_likelihood(view, there)
+            gain = its_prior - log_prior + power * (its_likelihood - log_likelihood)
             taken = np.log(rng.random(count)) < gain
-            t[taken], log_prior[taken], log_light[taken] = there[taken], its_prior[taken], its_light[taken]
+            t[taken], log_prior[taken], log_likelihood[taken] = there[taken], its_prior[taken], its_likelihood[taken]
             if move % _WHOLE:
                 # Towards a quarter of the moves taken.
                 size *= math.exp(taken.mean() - 0.25)
     return t
 
 
-def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> Hypotheses:
+def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> GaussianMixture:
     """A mixture of Gaussians for equally likely points of one axis, by expectation and maximisation.
 
     Parameters
@@ -80,7 +80,7 @@ def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> 
 
     Returns
     -------
-    Of the points themselves, one axis; its mean is theirs, and its covariance to a thousandth.
+    The mixture of the points themselves, one axis; its mean is theirs, and its covariance to a thousandth.
     """
     rng, seen = np.random.default_rng(seed), points @ rows.T
     k = seen.shape[1]
@@ -93,7 +93,7 @@ def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> 
     return _with_shares(points, share)
 
 
-def _with_shares(points: FloatArray, share: FloatArray) -> Hypotheses:
+def _with_shares(points: FloatArray, share: FloatArray) -> GaussianMixture:
     """Components with these shares of points, (points, components)."""
     mass = share.sum(axis=0) + 1e-300
     mean = (share.T @ points) / mass[:, None]
@@ -101,7 +101,7 @@ def _with_shares(points: FloatArray, share: FloatArray) -> Hypotheses:
     spread = np.einsum("kc,kci,kcj->cij", share, away, away, optimize=True) / mass[:, None, None]
     spread += _LEAST_SPREAD * np.cov(points, rowvar=False)
     with np.errstate(divide="ignore"):
-        return Hypotheses(np.log(mass / len(points))[None], mean[None], spread[None])
+        return GaussianMixture(np.log(mass / len(points))[None], mean[None], spread[None])
 
 
 def _spread_centres(white: FloatArray, count: int, rng: np.random.Generator) -> list[int]:
@@ -116,7 +116,7 @@ def _spread_centres(white: FloatArray, count: int, rng: np.random.Generator) -> 
     return chosen
 
 
-def _drawn(prior: Hypotheses, rng: np.random.Generator, count: int, n: int) -> FloatArray:
+def _drawn(prior: GaussianMixture, rng: np.random.Generator, count: int, n: int) -> FloatArray:
     """Points of the prior: start states of the mixture of one axis, standard normal numbers after them."""
     weights, states = np.exp(prior.log_weight[0]), prior.mean.shape[2]
     component = rng.choice(len(weights), size=count, p=weights / weights.sum())
@@ -126,7 +126,7 @@ def _drawn(prior: Hypotheses, rng: np.random.Generator, count: int, n: int) -> F
     return t
 
 
-def _log_prior(prior: Hypotheses, t: FloatArray) -> FloatArray:
+def _log_prior(prior: GaussianMixture, t: FloatArray) -> FloatArray:
     return np.asarray(with_noise(prior, t[None])[0])
 
 
@@ -134,9 +134,9 @@ def _log_likelihood(view: PixelView, t: FloatArray) -> FloatArray:
     return np.asarray(view.log_likelihoods(t[None])[0])
 
 
-def _next_power(log_light: FloatArray, power: float) -> float:
+def _next_power(log_likelihood: FloatArray, power: float) -> float:
     """The largest one up to 1 that leaves the effective sample size that is wanted."""
-    away = log_light - log_light.max()
+    away = log_likelihood - log_likelihood.max()
 
     def excess(more: float) -> float:
         w = np.exp(more * away)

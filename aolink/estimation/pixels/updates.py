@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.exposure_model import ExposureModel
-from aolink.estimation.pixels.filter import Update
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, joined, log_sum, single
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.pixels.filter import MixtureUpdate
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, single
 from aolink.estimation.pixels.importance import posterior, proposed
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import Modes, broad, innovation, modes_of, without_repeats
@@ -28,17 +28,17 @@ from aolink.optics.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 
-# Of the prior is what the plant would be without a camera; and how rarely chance makes it looked at.
+# Share of the prior that is what the plant would be without a camera; and how rarely chance makes it searched.
 _DOUBT = 1e-3
 _DOUBTED = 1e-3
-# A second mode is one if the posterior gives it this much. Of a tenth of it are many points worth the while, for modes'
-# own evidence is rough.
+# A second mode is one if the posterior gives it this much. Many points are worth the while from a tenth of it, for the
+# evidence of modes is rough.
 _LEAST_SHARE = 0.05
 _LEAST_DOUBTED_SHARE = 0.005
 
 
 @dataclass(frozen=True)
-class PixelUpdates:
+class ImportanceUpdater:
     """A mixture in, a mixture out."""
 
     carried: int
@@ -46,33 +46,33 @@ class PixelUpdates:
     free: float
     """Fewer, where mergers lose less than this, in nats."""
     share: float
-    """Of the usual number of points; and of those that are to count, where there is one mode."""
+    """Share of the usual number of points; and of those that are to count, where there is one mode."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
         return reduction(model, sensor)
 
-    def update(self, view: PixelView, prior: Hypotheses, unseen: Belief, number: int) -> Update:
+    def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
         """The posterior of axes with a prior of their start states."""
         reduced = view.reduced
         modes, proposal = explored(view, prior)
         new = innovation(view, reduced.prior(prior.belief), modes)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
         if len(doubted):
-            _, more = explored(view.part(doubted), single(Belief(unseen.mean[doubted], unseen.covariance[doubted])))
+            _, more = explored(view.part(doubted), single(Gaussian(unseen.mean[doubted], unseen.covariance[doubted])))
             proposal = proposal.replaced(doubted, joined(proposal.part(doubted), more))
-        rest = Hypotheses(prior.log_weight + math.log1p(-_DOUBT), prior.mean, prior.covariance)
-        wide = Hypotheses(
+        rest = GaussianMixture(prior.log_weight + math.log1p(-_DOUBT), prior.mean, prior.covariance)
+        wide = GaussianMixture(
             np.full((len(unseen.mean), 1), math.log(_DOUBT)), unseen.mean[:, None], unseen.covariance[:, None]
         )
         several = has_several(modes, _LEAST_DOUBTED_SHARE)
         after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
-        return Update(after.belief, carried, new, has_several(modes))
+        return MixtureUpdate(after.belief, carried, new, has_several(modes))
 
 
-PROFILE = PixelUpdates(carried=3, free=0.1, share=0.25)
-MIXTURE = PixelUpdates(carried=6, free=1e-3, share=1.0)
+PROFILE = ImportanceUpdater(carried=3, free=0.1, share=0.25)
+MIXTURE = ImportanceUpdater(carried=6, free=1e-3, share=1.0)
 
 
 def has_several(modes: Modes, least: float = _LEAST_SHARE) -> NDArray[np.bool_]:
@@ -81,15 +81,15 @@ def has_several(modes: Modes, least: float = _LEAST_SHARE) -> NDArray[np.bool_]:
     return np.asarray((share > least).sum(axis=1) > 1)
 
 
-def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
+def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMixture]:
     """The modes that each component of a prior of the start state leads to, and a mixture to draw points from.
 
     The modes' log-evidence has the weights of the components in it.
     """
-    before = view.reduced.prior(Belief(prior.mean, prior.covariance))
+    before = view.reduced.prior(Gaussian(prior.mean, prior.covariance))
     axes, count, _ = before.mean.shape
     there = np.nonzero(np.isfinite(prior.log_weight))
-    rows, each = view.part(there[0]), Belief(before.mean[there], before.covariance[there])
+    rows, each = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
     wide = broad(rows, each)
     found = modes_of(rows, each, wide)
     of_each = found.mean.shape[1]
@@ -106,6 +106,6 @@ def explored(view: PixelView, prior: Hypotheses) -> tuple[Modes, Hypotheses]:
             placed(found.distance, 0.0), placed(found.objective, math.inf),
         )
     )  # fmt: skip
-    flat = Belief(np.zeros_like(before.mean), np.zeros_like(before.covariance))
+    flat = Gaussian(np.zeros_like(before.mean), np.zeros_like(before.covariance))
     flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
-    return modes, proposed(modes.log_evidence, Belief(modes.mean, modes.covariance), prior.log_weight, flat)
+    return modes, proposed(modes.log_evidence, Gaussian(modes.mean, modes.covariance), prior.log_weight, flat)

@@ -8,7 +8,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from aolink.estimation.frames.plane_moments import PLANE_ORDERS, measure_moments_2d
 from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.observation import PathMoments, predicted_moments
+from aolink.estimation.kalman.path_moments import PathMoments, predicted_moments
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.optics.plane import kernel_covariance, pixel_mass_2d
 from aolink.plant.lifting import lift
@@ -101,7 +101,7 @@ def test_predicted_moments_and_jacobian_with_cross_terms(tilt):
 def test_every_step_is_filterpys(tilt):
     rng = np.random.default_rng(3)
     model = exposure_model(tilt, N)
-    ours = BlurFilter(tilt, PathMoments(2, (1, 2), crosses=True))
+    ours = BlurFilter(tilt, PathMoments(tilt, (1, 2), crosses=True))
     A_N, Q = lift(tilt, N)
     ekf = ExtendedKalmanFilter(dim_x=2, dim_z=5, dim_u=2)
     ekf.x, ekf.P = tilt.initial_mean[:, None].copy(), tilt.initial_covariance.copy()

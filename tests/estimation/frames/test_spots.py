@@ -10,6 +10,7 @@ import pytest
 from aolink.estimation import run
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.centroid_noise import centroid_covariance
+from aolink.estimation.frames.frame_data import Needs
 from aolink.estimation.frames.moments import measure_moments, spot_significance
 from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.estimation.frames.spots import measure_spots, profiles
@@ -51,9 +52,8 @@ def counts_of(sensor: SpotSensor, frames: list[np.ndarray]) -> np.ndarray:
 
 def measured_of(sensor: SpotSensor, plant: Plant, frame: np.ndarray, orders=(1, 2), flux="known"):
     everywhere = np.ones(frame.shape, dtype=bool)
-    return measure_spots(
-        sensor, plant, frame, everywhere, orders, flux, least_usable=0.5, least_significance=4.0
-    )  # fmt: skip
+    needs = Needs(what="moments", orders=orders, flux=flux)
+    return measure_spots(sensor, plant, frame, everywhere, needs, least_significance=4.0)
 
 
 @pytest.mark.parametrize("sensor", [ONE, replace(ONE, noise_density=0.0, counts_per_density=1.7)])

@@ -8,17 +8,12 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 from scipy import linalg, stats
 
 from aolink.estimation.estimate import Status
-from aolink.estimation.frames.moments import Measurement
+from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.observation import (
-    Belief,
-    PathMoments,
-    corrected,
-    corrected_by_blocks,
-    many_moments,
-    predicted_moments,
-    steady_gain,
-)
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.kalman.path_moments import PathMoments, many_moments, predicted_moments
+from aolink.estimation.kalman.steady_gain import steady_gain
+from aolink.estimation.kalman.update import blocked_update, joseph_update
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.plant.lifting import lift
 from aolink.rig import load_rig
@@ -66,7 +61,7 @@ def selected(orders):
 
 
 def our_steps(plant, orders, u, moments, gain=None, **options):
-    filter_ = BlurFilter(plant, PathMoments(plant.n_outputs, orders, gain), **options)
+    filter_ = BlurFilter(plant, PathMoments(plant, orders, gain), **options)
     model = exposure_model(plant, u.shape[1])
     pick = selected(orders)
     for inputs, y in zip(u, moments, strict=True):
@@ -240,7 +235,7 @@ def test_one_wild_moment_is_gated_and_many_start_the_filter_again():
 
 def test_a_filter_that_was_lost_starts_again_from_the_plant_and_finds_the_spot():
     u, moments, states = scenario(30)
-    lost = BlurFilter(PLANT, PathMoments(1, (1, 2)))
+    lost = BlurFilter(PLANT, PathMoments(PLANT, (1, 2)))
     lost.belief = dataclasses.replace(lost.belief, mean=np.array([[9.0, 0.0]]), covariance=np.eye(2)[None] * 1e-6)
     model = exposure_model(PLANT, N)
     statuses = []
@@ -282,7 +277,7 @@ def test_innovations_of_a_linear_world_are_consistent():
     root = np.linalg.cholesky(plant.initial_covariance)
     x = rng.standard_normal((axes, 2)) @ root.T
     y = x @ model.mean_row.T + np.sqrt(R[0, 0]) * rng.standard_normal((axes, 1))
-    step = BlurFilter(plant, PathMoments(1, (1,))).step(
+    step = BlurFilter(plant, PathMoments(plant, (1,))).step(
         model, model.response(np.zeros((N, axes))), Measurement(value=y, covariance=R[None, :1, :1])
     )
     assert stats.kstest(step.nis, stats.chi2(1).cdf).pvalue > 1e-3
@@ -303,7 +298,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(orders, axes, which, mimo, w
     y[5, ::3] = 1e6  # some are gated
 
     def steps(n_axes):
-        filter_ = BlurFilter(with_axes(plant, n_axes), PathMoments(plant.n_outputs, orders))
+        filter_ = BlurFilter(with_axes(plant, n_axes), PathMoments(plant, orders))
         model = exposure_model(filter_.plant, 50)
         filter_.bridge(u[0, :13, : n_axes * plant.n_inputs])
         for inputs, moments in zip(u, y, strict=True):
@@ -326,7 +321,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(orders, axes, which, mimo, w
 def test_what_is_believed_without_a_camera_settles_and_moves_on_with_gaps():
     """The covariance is not computed again where it no longer changes; a gap, or another exposure, changes it."""
     cold = dataclasses.replace(PLANT, initial_covariance=np.zeros((2, 2)))
-    filter_, model = BlurFilter(cold, PathMoments(1, (1,))), exposure_model(cold, N)
+    filter_, model = BlurFilter(cold, PathMoments(cold, (1,))), exposure_model(cold, N)
     response = model.response(np.zeros((N, 1)))
     expected = np.zeros((2, 2))
     for _ in range(100):
@@ -346,11 +341,11 @@ def test_written_out_it_is_the_correction_in_matrices(gain):
     model = exposure_model(plant, N)
     roots = rng.standard_normal((2, 50, 2, 2))
     P, noise = roots @ roots.swapaxes(-1, -2)
-    prior, y = Belief(rng.standard_normal((50, 2)), P), rng.standard_normal((50, 2))
+    prior, y = Gaussian(rng.standard_normal((50, 2)), P), rng.standard_normal((50, 2))
     response = model.response(0.01 * rng.standard_normal((N, 50)))
-    ours = PathMoments(1, (1, 2), gain).correct(model, response, prior, Measurement(value=y, covariance=noise))
+    ours = PathMoments(plant, (1, 2), gain).update(model, response, prior, Measurement(value=y, covariance=noise))
     h, H = predicted_moments(model, response, prior.mean, (1, 2))
-    theirs = corrected(prior, y - h, H, noise, gain)
+    theirs = joseph_update(prior, y - h, H, noise, gain)
     np.testing.assert_allclose(ours.posterior.mean, theirs.posterior.mean, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, rtol=1e-7, atol=1e-11)
     np.testing.assert_allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-9)
@@ -368,13 +363,13 @@ def test_the_short_correction_is_josephs(rank, first, correlation, one_noise):
     model = exposure_model(dataclasses.replace(PLANT, axes=axes), N)
     response = model.response(rng.normal(0, 0.01, (N, axes)))
     root = rng.standard_normal((axes, 2, rank))
-    prior = Belief(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2))
+    prior = Gaussian(rng.standard_normal((axes, 2)), root @ root.swapaxes(1, 2))
     noise = 1e-3 * np.array([[first, correlation], [correlation, 1.0]])
     noises = np.broadcast_to(noise, (axes, 2, 2)) if one_noise else noise * rng.uniform(0.5, 2, (axes, 1, 1))
     moments = rng.standard_normal((axes, 2))
-    ours = PathMoments(1, (1, 2)).correct(model, response, prior, Measurement(value=moments, covariance=noises))
+    ours = PathMoments(PLANT, (1, 2)).update(model, response, prior, Measurement(value=moments, covariance=noises))
     h, H = predicted_moments(model, response, prior.mean, (1, 2))
-    josephs = corrected(prior, moments - h, H, noises)
+    josephs = joseph_update(prior, moments - h, H, noises)
     np.testing.assert_allclose(ours.posterior.mean, josephs.posterior.mean, rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(ours.posterior.covariance, josephs.posterior.covariance, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(ours.innovation_covariance, josephs.innovation_covariance, rtol=1e-9, atol=1e-12)
@@ -389,13 +384,13 @@ def test_by_blocks_it_is_the_same_correction(blocks, rank, fixed):
     """Few states, measurements whose noise is shared within blocks of two; priors that may be singular."""
     rng, axes, n, m = np.random.default_rng(2), 3, 5, 2 * blocks
     root = rng.standard_normal((axes, n, rank))
-    prior = Belief(rng.standard_normal((axes, n)), root @ root.swapaxes(1, 2))
+    prior = Gaussian(rng.standard_normal((axes, n)), root @ root.swapaxes(1, 2))
     R = rng.standard_normal((axes, blocks, 2, 2))
     R = 1e-3 * (R @ R.swapaxes(2, 3) + np.eye(2))
     H, innovation = rng.standard_normal((axes, m, n)), rng.standard_normal((axes, m))
     gain = 0.01 * rng.standard_normal((n, m)) if fixed else None
-    ours = corrected_by_blocks(prior, innovation, H, R, gain)
-    theirs = corrected(prior, innovation, H, np.array([linalg.block_diag(*each) for each in R]), gain)
+    ours = blocked_update(prior, innovation, H, R, gain)
+    theirs = joseph_update(prior, innovation, H, np.array([linalg.block_diag(*each) for each in R]), gain)
     np.testing.assert_allclose(ours.posterior.mean, theirs.posterior.mean, rtol=1e-9, atol=1e-9)
     scale = np.abs(theirs.posterior.covariance).max()
     np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, atol=1e-9 * scale)

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aolink.estimation import ExposureModel, path_from_coefficients
+from aolink.estimation import path_from_coefficients
+from aolink.estimation.model.dense import DenseModel
 from aolink.rig import load_rig
 
 
@@ -24,14 +25,14 @@ def noise_maps(plant, n_steps):
 
 
 def test_first_columns_of_the_basis_are_the_free_response(mimo):
-    basis = ExposureModel(mimo, 30).basis
+    basis = DenseModel(mimo, 30).basis
     for i in range(30):
         np.testing.assert_allclose(basis[:, i, :3], mimo.C @ np.linalg.matrix_power(mimo.A, i), atol=1e-12)
 
 
 @pytest.mark.parametrize("n_steps", [1, 7, 24])
 def test_noise_columns_make_nearly_all_of_the_path_covariance(mimo, n_steps):
-    model = ExposureModel(mimo, n_steps)
+    model = DenseModel(mimo, n_steps)
     G, _ = noise_maps(mimo, n_steps)
     noise = model.basis[..., 3:]
     exact, ours = np.einsum("oij,oij->", G, G), np.einsum("oij,oij->", noise, noise)
@@ -41,7 +42,7 @@ def test_noise_columns_make_nearly_all_of_the_path_covariance(mimo, n_steps):
 
 def test_noise_columns_of_the_papers_plant_leave_two_percent():
     plant = load_rig("section-vi").plant
-    model = ExposureModel(plant, 200)
+    model = DenseModel(plant, 200)
     G, _ = noise_maps(plant, 200)
     exact = np.einsum("oij,okj->oik", G, G)[0]
     ours = model.basis[0, :, 2:] @ model.basis[0, :, 2:].T
@@ -50,7 +51,7 @@ def test_noise_columns_of_the_papers_plant_leave_two_percent():
 
 
 def test_what_the_noise_columns_leave_is_added_to_the_end(mimo):
-    model = ExposureModel(mimo, 25)
+    model = DenseModel(mimo, 25)
     _, G_N = noise_maps(mimo, 25)
     reached = model.end_rows[:, 3:]
     np.testing.assert_allclose(reached @ reached.T + model.end_remainder, G_N @ G_N.T, atol=1e-10)
@@ -58,7 +59,7 @@ def test_what_the_noise_columns_leave_is_added_to_the_end(mimo):
 
 def test_path_and_end_are_jointly_as_the_noise_maps_say():
     plant = load_rig("section-vi").plant
-    model = ExposureModel(plant, 200)
+    model = DenseModel(plant, 200)
     G, G_N = noise_maps(plant, 200)
     exact = G[0] @ G_N.T
     ours = model.basis[0, :, 2:] @ model.end_rows[:, 2:].T
@@ -67,7 +68,7 @@ def test_path_and_end_are_jointly_as_the_noise_maps_say():
 
 def test_input_response_sums_are_those_over_the_steps(mimo, with_axes):
     plant = with_axes(mimo, 3)
-    model = ExposureModel(plant, 50)
+    model = DenseModel(plant, 50)
     inputs = np.random.default_rng(1).standard_normal((50, 6))
     response = model.response(inputs)
     for axis in range(3):
@@ -88,7 +89,7 @@ def test_input_response_sums_are_those_over_the_steps(mimo, with_axes):
 @pytest.mark.parametrize("count", [3, None])
 def test_path_and_its_sd_from_coefficients(mimo, with_axes, count):
     plant = with_axes(mimo, 2)
-    model = ExposureModel(plant, 300)
+    model = DenseModel(plant, 300)
     count = count or model.n_coefficients
     rng = np.random.default_rng(2)
     z, root = rng.standard_normal((2, count)), rng.standard_normal((2, count, count))
@@ -103,17 +104,17 @@ def test_path_and_its_sd_from_coefficients(mimo, with_axes, count):
 
 
 def test_an_exposure_of_another_length_has_its_own_model(mimo):
-    model, inputs = ExposureModel(mimo, 30), np.ones((45, 2))
+    model, inputs = DenseModel(mimo, 30), np.ones((45, 2))
     path, _ = path_from_coefficients(model, np.ones((1, 3)), np.eye(3)[None], inputs)
-    expected, _ = path_from_coefficients(ExposureModel(mimo, 45), np.ones((1, 3)), np.eye(3)[None], inputs)
+    expected, _ = path_from_coefficients(DenseModel(mimo, 45), np.ones((1, 3)), np.eye(3)[None], inputs)
     np.testing.assert_array_equal(path, expected)
 
 
 @pytest.mark.parametrize("axes", [1, 7])
 def test_paths_do_not_depend_on_the_axes_beside_them(mimo, with_axes, axes):
     rng = np.random.default_rng(4)
-    many = ExposureModel(with_axes(mimo, 64), 200)
-    few = ExposureModel(with_axes(mimo, axes), 200)
+    many = DenseModel(with_axes(mimo, 64), 200)
+    few = DenseModel(with_axes(mimo, axes), 200)
     count = many.n_coefficients
     z, root = rng.standard_normal((64, count)), rng.standard_normal((64, count, count))
     P, inputs = root @ root.swapaxes(1, 2), rng.standard_normal((200, 128))
@@ -125,14 +126,14 @@ def test_paths_do_not_depend_on_the_axes_beside_them(mimo, with_axes, axes):
 
 def test_a_plant_without_noise_has_no_noise_columns(mimo):
     still = dataclasses.replace(mimo, process_noise=np.zeros((2, 2)))
-    assert ExposureModel(still, 20).n_coefficients == 3
+    assert DenseModel(still, 20).n_coefficients == 3
 
 
 def test_many_outputs_of_few_states_are_what_each_of_them_is_alone(mimo):
     """Their paths are made of the states' paths."""
     rng = np.random.default_rng(6)
     plant = dataclasses.replace(mimo, C=rng.standard_normal((5, 3)))
-    model, u = ExposureModel(plant, 40), rng.standard_normal((40, mimo.axes * mimo.n_inputs))
+    model, u = DenseModel(plant, 40), rng.standard_normal((40, mimo.axes * mimo.n_inputs))
     assert model.factors[0] is plant.C
     count = model.n_coefficients
     root = rng.standard_normal((mimo.axes, count, count))
@@ -144,7 +145,7 @@ def test_many_outputs_of_few_states_are_what_each_of_them_is_alone(mimo):
     variance = np.einsum("oij,ajk,oik->aoi", model.basis, covariance, model.basis)
     np.testing.assert_allclose(sd, np.sqrt(variance).reshape(sd.shape), rtol=1e-9)
     for o in range(5):
-        alone = ExposureModel(dataclasses.replace(plant, C=plant.C[o : o + 1]), 40)
+        alone = DenseModel(dataclasses.replace(plant, C=plant.C[o : o + 1]), 40)
         columns = min(count, alone.n_coefficients)
         np.testing.assert_allclose(model.basis[o, :, :columns], alone.basis[0, :, :columns], atol=1e-11)
         np.testing.assert_allclose(response.slope[:, o], alone.response(u).slope[:, 0], atol=1e-11)

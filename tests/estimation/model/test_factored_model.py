@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aolink import plant as plants
-from aolink.estimation.model.exposure_model import ExposureModel, exposure_model
+from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.model.dense import DenseModel
+from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.model.factored import NOISE_LEFT_OUT, FactoredModel
+from aolink.plant import lifting
 from aolink.plant.alike import alike_systems
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
@@ -31,7 +33,7 @@ def model(plant) -> FactoredModel:
 
 @pytest.fixture(scope="module")
 def dense(plant) -> ExposureModel:
-    return ExposureModel(plant, N)
+    return DenseModel(plant, N)
 
 
 def noise_of_steps(plant: Plant) -> np.ndarray:
@@ -88,7 +90,7 @@ def test_drift_states_are_found_as_well(plant, monkeypatch):
     u = np.random.default_rng(0).standard_normal((1, N, m))
     path, end = input_response(drift, u)
     with monkeypatch.context() as patch:
-        patch.setattr(plants, "alike_systems", lambda plant: None)
+        patch.setattr(lifting, "alike_systems", lambda plant: None)
         expected, expected_end = input_response(drift, u)
     np.testing.assert_allclose(path, expected, atol=1e-12)
     np.testing.assert_allclose(end, expected_end, atol=1e-12)
@@ -106,7 +108,7 @@ def test_responses_and_moments_are_those_of_the_dense_model(plant, model, dense,
     np.testing.assert_allclose(ours.times_quadratic(x), theirs.times_quadratic(x), atol=1e-12)
     found = ours.response(u)
     with monkeypatch.context() as patch:
-        patch.setattr(plants, "alike_systems", lambda plant: None)
+        patch.setattr(lifting, "alike_systems", lambda plant: None)
         expected = theirs.response(u)
     for name in ("path", "end", "mean", "slope", "square"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-13, err_msg=name)

@@ -8,11 +8,12 @@ import pytest
 from scipy import linalg
 
 from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.quadrature import blocks, nodes_of
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.quadrature import blocks, quadrature_paths
 from aolink.estimation.moments import windowed
-from aolink.estimation.moments.spots import SpotWindows, WindowedSpots
+from aolink.estimation.moments.spots import WindowedSpots
 from aolink.optics.camera import pixel_noise_variance
 from aolink.optics.plane import exposure_density_2d, pixel_mass_2d
 from aolink.optics.sensor import Kernel, SpotSensor
@@ -84,11 +85,11 @@ def spread_prior(rig, share=0.3):
     n = rig.plant.n_states
     covariance[:n, :n] = rig.plant.initial_covariance * share
     mean[0, :n] = np.linalg.cholesky(rig.plant.initial_covariance) @ np.random.default_rng(0).normal(0, 0.7, n)
-    return model, Belief(mean, covariance[None])
+    return model, Gaussian(mean, covariance[None])
 
 
 def at_prior(rig, observation, prior, model):
-    nodes = nodes_of(model, model.response(np.zeros((200, 1))), blocks(200, observation.most_nodes))
+    nodes = quadrature_paths(model, model.response(np.zeros((200, 1))), blocks(200, observation.most_nodes))
     spots, (height, width) = observation.spots, rig.sensor.window
     whole = SpotWindows(
         density=np.zeros((1, spots, height, width)), mask=np.ones((1, spots, height, width), dtype=bool)
@@ -237,7 +238,7 @@ def test_o1_of_a_membrane_is_the_dense_least_squares_solution():
     exposures = simulate(rig, count, seed=3, inputs=np.zeros((200 * count, 1)))
     found = [estimator.step(e) for e in exposures]
     model, n = exposure_model(rig.plant, 200), rig.plant.n_states
-    measured = [measure(rig, e, estimator._observation, estimator.options)[0] for e in exposures]
+    measured = [measure(rig, e, estimator.filter.needs)[0] for e in exposures]
     # States from x(0) and the noise that each exposure adds: x = F e.
     F = np.zeros(((count + 1) * n, (count + 1) * n))
     for j in range(count + 1):
@@ -256,7 +257,7 @@ def test_o1_of_a_membrane_is_the_dense_least_squares_solution():
 
 def path_error(rig, exposures, crosses):
     estimator = make_estimator(rig, "moments")
-    estimator._filter.observation = WindowedSpots(rig.sensor, 1, crosses=crosses)
+    estimator.filter.observation = WindowedSpots(rig.sensor, 1, crosses=crosses)
     return score(exposures, [estimator.step(e) for e in exposures], 10).path_rmse
 
 
@@ -345,9 +346,7 @@ def test_a_copy_does_not_depend_on_those_beside_it():
 def test_windows_come_with_their_pixels():
     rig = membrane()
     (exposure,) = simulate(rig, 1)
-    measured, remark = measure(
-        rig, exposure, make_estimator(rig, "moments")._observation, make_estimator(rig, "o1").options
-    )
+    measured, remark = measure(rig, exposure, make_estimator(rig, "moments").filter.needs)
     assert remark == ""
     assert isinstance(measured, SpotWindows)
     assert measured.density.shape == (1, 4, 16, 16)

@@ -10,11 +10,12 @@ import pytest
 
 from aolink.errors import RigError
 from aolink.estimation import Estimate, Status, exposure_model, make_estimator, run, score
-from aolink.estimation.model.exposure_model import ExposureModel
+from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
-from aolink.estimation.model.quadrature import blocks, nodes_of
+from aolink.estimation.model.quadrature import blocks, quadrature_paths
 from aolink.exposure import Exposure
-from aolink.rig import Plant, Rig, UnmodelledSlopes, load_rig, parse_rig
+from aolink.rig import Plant, Rig, load_rig, parse_rig
+from aolink.rig.parts import UnmodelledSlopes
 from aolink.simulation.model import simulate
 
 SH, TILT = load_rig("sh-8x8"), load_rig("tip-tilt")
@@ -54,7 +55,7 @@ def test_they_are_one_coefficient_of_each_output_that_lasts_the_whole_exposure(r
     np.testing.assert_allclose(model.end_rows[:, :n], without.end_rows[:, :n])
     np.testing.assert_allclose(model.process_noise, without.process_noise)
     # They last to the end of an exposure that ends between two steps, too.
-    held = nodes_of(model, model.response(np.zeros((N_STEPS, rig.n_inputs))), blocks(N_STEPS, 5))
+    held = quadrature_paths(model, model.response(np.zeros((N_STEPS, rig.n_inputs))), blocks(N_STEPS, 5))
     np.testing.assert_allclose(np.tensordot(held.weights, held.basis[:, :, n : n + m], axes=(0, 1)), sd * np.eye(m))
 
 
@@ -62,7 +63,7 @@ def test_they_are_one_coefficient_of_each_output_that_lasts_the_whole_exposure(r
 def test_a_path_that_nothing_is_known_of_has_their_whole_variance(rig: Rig) -> None:
     plant = dataclasses.replace(rig.plant, unmodelled=SLOPES)
     variances = []
-    for model in (exposure_model(plant, N_STEPS), ExposureModel(_without(plant), N_STEPS)):
+    for model in (exposure_model(plant, N_STEPS), DenseModel(_without(plant), N_STEPS)):
         covariance = np.eye(model.n_coefficients)[None].copy()
         covariance[:, : plant.n_states, : plant.n_states] = plant.initial_covariance
         variances.append(model.path_sd(covariance)[0] ** 2)

@@ -8,11 +8,12 @@ from scipy import linalg
 
 from aolink.errors import EstimatorError
 from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.model.quadrature import blocks, nodes_of
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.quadrature import blocks, quadrature_paths
 from aolink.estimation.moments import windowed
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.optics.camera import pixel_noise_variance, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import load_rig
@@ -62,14 +63,16 @@ def spread_prior(axes=2):
     covariance[:2, :2] = RIG.plant.initial_covariance / 4
     mean = np.zeros((axes, count))
     mean[:, 0] = np.linspace(0.2, -0.3, axes)
-    return model, Belief(mean, np.tile(covariance, (axes, 1, 1)))
+    return model, Gaussian(mean, np.tile(covariance, (axes, 1, 1)))
 
 
 @pytest.mark.parametrize("basis", BASES)
 def test_regression_is_that_of_samples(basis):
     model, prior = spread_prior()
     observation = WindowedMoments(SENSOR, (0, 1, 2, 3), basis=basis)
-    nodes = nodes_of(model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100))
+    nodes = quadrature_paths(
+        model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
+    )
     rows, weights = nodes.basis[0], nodes.weights
     mean = prior.mean @ rows.T
     spread = rows @ prior.covariance @ rows.T
@@ -94,7 +97,9 @@ def test_regression_is_that_of_samples(basis):
 def test_slope_is_the_derivative_of_what_is_expected():
     model, prior = spread_prior(1)
     observation = WindowedMoments(SENSOR)
-    nodes = nodes_of(model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100))
+    nodes = quadrature_paths(
+        model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
+    )
     rows, weights = nodes.basis[0], nodes.weights
     spread = rows @ prior.covariance @ rows.T
     W = observation.window_weights(prior.mean @ rows.T, np.einsum("akk->ak", spread), np.ones((1, 40), bool))
@@ -142,7 +147,9 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
 
 def test_blocks_of_steps_keep_the_mean_of_the_path():
     model = exposure_model(RIG.plant, 1037)
-    nodes = nodes_of(model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100))
+    nodes = quadrature_paths(
+        model, model.response(np.zeros((model.n_steps, model.plant.axes))), blocks(model.n_steps, 100)
+    )
     rows, weights = nodes.basis[0], nodes.weights
     assert len(weights) <= 100
     np.testing.assert_allclose(weights @ rows, model.basis[0].mean(axis=0), atol=1e-14)

@@ -10,11 +10,11 @@ import pytest
 
 from aolink.estimation import exposure_model, make_estimator
 from aolink.estimation.compiled import forget_stale, small
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.moments.windowed import Profile
+from aolink.estimation.frames.frame_data import Profile
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels import likelihood, modes
-from aolink.estimation.pixels.filter import HypothesisFilter
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, log_determinant, single
+from aolink.estimation.pixels.filter import MixtureFilter
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_determinant, single
 from aolink.estimation.pixels.importance import importance_corrected
 from aolink.estimation.pixels.modes import (
     Modes,
@@ -83,7 +83,7 @@ def looked_at(kind):
     mean[0, 0] += 30.0
     in_numpy = view.part(slice(None))
     in_numpy.compiled = False
-    return view, in_numpy, Belief(mean, np.tile(P, (AXES, 1, 1)))
+    return view, in_numpy, Gaussian(mean, np.tile(P, (AXES, 1, 1)))
 
 
 @pytest.fixture(scope="module", params=KINDS)
@@ -165,7 +165,7 @@ def test_all_modes_together(pair):
     """With searches that end next to a mode that is known: the same modes that matter."""
     view, in_numpy, state = pair
     prior, some = view.reduced.prior(state), slice(1, None)  # not the one beyond the sensor
-    prior = Belief(prior.mean[some], prior.covariance[some])
+    prior = Gaussian(prior.mean[some], prior.covariance[some])
     wide = broad(in_numpy.part(some), prior)
     ours, theirs = (without_repeats(modes_of(each.part(some), prior, wide)) for each in (view, in_numpy))
     found = 0
@@ -239,7 +239,7 @@ def test_innovation(pair):
 def test_importance_sampling_with_the_same_points(pair):
     view, in_numpy, state = pair
     some = slice(1, 7)  # not the one beyond the sensor, where no point counts
-    prior = single(Belief(state.mean[some], state.covariance[some]))
+    prior = single(Gaussian(state.mean[some], state.covariance[some]))
     _, proposal = explored(view.part(some), prior)
     proposal = proposal.ordered()
     (ours, points), (theirs, their_points) = (
@@ -259,7 +259,7 @@ def test_maps_of_mixtures():
     weight = rng.uniform(0.1, 1, (5, 4))
     weight[1, 2] = 0.0
     with np.errstate(divide="ignore"):
-        m = Hypotheses(
+        m = GaussianMixture(
             np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((5, 4, 3)), root @ root.swapaxes(-1, -2)
         )
     own, seen = m.belief, m.mapped(rows, np.diag([0.5, 2.0]))
@@ -299,7 +299,7 @@ def merged_once(m):
     def kept(values):
         return values[keep].reshape(axes, count - 1, *values.shape[2:])
 
-    return Hypotheses(kept(log_weight), kept(mean), kept(covariance))
+    return GaussianMixture(kept(log_weight), kept(mean), kept(covariance))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -307,7 +307,7 @@ def test_mergers(seed):
     rng = np.random.default_rng(seed)
     root = rng.standard_normal((9, 8, 3, 3)) * 0.5
     weight = rng.uniform(0.1, 1, (9, 8))
-    m = Hypotheses(
+    m = GaussianMixture(
         np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((9, 8, 3)),
         root @ root.swapaxes(-1, -2) + 0.1 * np.eye(3),
     )  # fmt: skip
@@ -320,7 +320,7 @@ def test_mergers(seed):
     np.testing.assert_allclose(fast.mean, slow.mean[rows, order], rtol=1e-7, atol=1e-9)
     np.testing.assert_allclose(fast.covariance, slow.covariance[rows, order], rtol=1e-7, atol=1e-9)
     # What costs nothing to merge is merged, however few there are.
-    twice = Hypotheses(
+    twice = GaussianMixture(
         *(np.concatenate([each, each], axis=1) for each in (m.log_weight - np.log(2), m.mean, m.covariance))
     )
     assert twice.reduced(16, 1e-6).mean.shape[1] == 8
@@ -414,7 +414,7 @@ def test_machine_code_is_not_older_than_any_source(tmp_path):
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
 def test_a_plant_without_process_noise(updates):
     plant = dataclasses.replace(LIVELY.plant, process_noise=0.0 * LIVELY.plant.process_noise)
-    HypothesisFilter(plant, LIVELY.sensor, updates).warm_up(updates)
+    MixtureFilter(plant, LIVELY.sensor, updates).warm_up(updates)
     rig = dataclasses.replace(LIVELY, plant=plant)
     name = "profile" if updates is PROFILE else "mixture"
     estimator = make_estimator(rig, name)

@@ -6,15 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import special, stats
 
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, joined, log_sum, single
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, joined, log_sum, single
 
 
 def mixture(seed, axes=3, components=5, n=3):
     rng = np.random.default_rng(seed)
     roots = rng.standard_normal((axes, components, n, n))
     logs = rng.standard_normal((axes, components)) * 2
-    return Hypotheses(
+    return GaussianMixture(
         logs - special.logsumexp(logs, axis=1, keepdims=True),
         rng.standard_normal((axes, components, n)) * 2,
         roots @ roots.swapaxes(-1, -2) + 0.01 * np.eye(n),
@@ -49,7 +49,7 @@ def test_merging_keeps_weight_mean_and_covariance(seed, most, gone):
     m = mixture(seed)
     if gone:
         m.log_weight[:, 2] = -np.inf
-        m = Hypotheses(m.log_weight - log_sum(m.log_weight, axis=1)[:, None], m.mean, m.covariance)
+        m = GaussianMixture(m.log_weight - log_sum(m.log_weight, axis=1)[:, None], m.mean, m.covariance)
     less = m.reduced(most)
     assert less.mean.shape == (3, min(most, 5 - gone), 3)
     np.testing.assert_allclose(np.exp(less.log_weight).sum(axis=1), 1.0)
@@ -60,7 +60,7 @@ def test_merging_keeps_weight_mean_and_covariance(seed, most, gone):
 
 def test_twins_are_merged_first():
     m = mixture(5, axes=1, components=3)
-    twins = joined(m, Hypotheses(m.log_weight[:, 1:2], m.mean[:, 1:2] + 1e-6, m.covariance[:, 1:2]))
+    twins = joined(m, GaussianMixture(m.log_weight[:, 1:2], m.mean[:, 1:2] + 1e-6, m.covariance[:, 1:2]))
     less = twins.reduced(3)
     weights = np.exp(m.log_weight[0]) * [1, 2, 1]
     order = np.argsort(-weights)  # the heaviest comes first
@@ -72,7 +72,7 @@ def test_what_is_known_for_certain_has_a_root():
     P = np.array([[[1.0, 0.0], [0.0, 0.0]]])
     root = cholesky(P)
     np.testing.assert_allclose(root @ root.swapaxes(-1, -2), P, atol=1e-9)
-    one = single(Belief(np.zeros((1, 2)), P))
+    one = single(Gaussian(np.zeros((1, 2)), P))
     assert one.log_density(np.array([[[0.5, 0.0]]])) > one.log_density(np.array([[[0.5, 1e-3]]]))
 
 

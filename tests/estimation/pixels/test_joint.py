@@ -13,12 +13,13 @@ from aolink.errors import EstimatorError
 from aolink.estimation import Status, exposure_model, make_estimator, run, score, smooth
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman import filter as filters
-from aolink.estimation.kalman import information, observation
+from aolink.estimation.kalman import information_form, path_moments, predict
 from aolink.estimation.kalman.filter import BlurFilter
-from aolink.estimation.kalman.observation import Belief, PathMoments, steady_gain
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.kalman.path_moments import PathMoments
+from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model import joint_paths
-from aolink.estimation.model.exposure_model import ExposureModel
+from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths
 from aolink.estimation.model.quadrature import Resolution
@@ -26,7 +27,6 @@ from aolink.estimation.moments import windowed
 from aolink.estimation.moments.joint_moments import JointMoments
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import Regression
-from aolink.estimation.options import Options
 from aolink.estimation.pixels import joint_pixels
 from aolink.estimation.pixels.joint_pixels import JointPixels, find_mode
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
@@ -57,7 +57,7 @@ class Frame:
     model: FactoredModel
     exposure: Exposure
     windows: object
-    prior: Belief
+    prior: Gaussian
     """Of the state, (1, n_states)."""
 
     @property
@@ -71,9 +71,9 @@ def frame(rig) -> Frame:
     exposures = simulate(rig, 3, seed=4)
     for each in exposures[:2]:
         estimate = estimator.step(each)
-    windows, _ = measure(rig, exposures[2], estimator._observation, estimator.options)
+    windows, _ = measure(rig, exposures[2], estimator.filter.needs)
     model = exposure_model(rig.plant, 200, exposures[2].start_offset)
-    return Frame(model, exposures[2], windows, Belief(estimate.end_state, estimate.end_covariance))
+    return Frame(model, exposures[2], windows, Gaussian(estimate.end_state, estimate.end_covariance))
 
 
 def dense_view(rig: Rig, frame: Frame, paths: JointPaths) -> PixelView:
@@ -98,11 +98,11 @@ def joint_view(rig: Rig, frame: Frame, paths: JointPaths) -> JointPixels:
     )
 
 
-def whole_prior(frame: Frame, size: int) -> Belief:
+def whole_prior(frame: Frame, size: int) -> Gaussian:
     n = frame.model.plant.n_states
     mean, covariance = np.zeros((1, size)), np.eye(size)[None].copy()
     mean[:, :n], covariance[:, :n, :n] = frame.prior.mean, frame.prior.covariance
-    return Belief(mean, covariance)
+    return Gaussian(mean, covariance)
 
 
 # The pixels
@@ -179,11 +179,12 @@ def test_o3_is_the_dense_filter_in_every_step(small_membrane, monkeypatch):
     rig = small_membrane
     exposures = simulate(rig, 6)
     estimates = run(rig, exposures, ["o3"])["o3"]
-    moments = PathMoments(rig.plant.n_outputs, (1, 2))
-    measured = [measure(rig, exposure, moments, Options())[0] for exposure in exposures]
-    for module in (observation, filters):
+    needs = make_estimator(rig, "o3").filter.needs
+    measured = [measure(rig, exposure, needs)[0] for exposure in exposures]
+    for module in (path_moments, predict):
         monkeypatch.setattr(module, "MANY_STATES", 10_000)
-    model = ExposureModel(rig.plant, 200)
+    moments = PathMoments(rig.plant, (1, 2))
+    model = DenseModel(rig.plant, 200)
     dense = BlurFilter(rig.plant, moments)
     for exposure, found, seen in zip(exposures, estimates, measured, strict=True):
         step = dense.step(model, exposure_model(rig.plant, 200).response(exposure.inputs), seen)
@@ -216,8 +217,8 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
 
     monkeypatch.setattr(theirs, "regression", lambda *arguments: of_each_spot(theirs, *arguments))
     before = whole_prior(frame, paths.size)
-    expected = theirs.correct(frame.model, frame.response, before, frame.windows)
-    found = JointMoments(rig.sensor, rig.plant.n_outputs, flux=flux).correct(
+    expected = theirs.update(frame.model, frame.response, before, frame.windows)
+    found = JointMoments(rig.sensor, rig.plant.n_outputs, flux=flux).update(
         frame.model, frame.response, before, frame.windows
     )
     joint_paths.joint_paths.cache_clear()
@@ -241,7 +242,7 @@ def test_the_gain_of_o1_solves_the_riccati_equation(small_membrane):
     # A plant that keeps what it is never shown: two actuators in the place of each, of which only sums are seen.
     A = np.kron(np.eye(80), [[1.0]])
     assert (
-        information.steady_gain(A, np.kron(np.eye(40), [[1.0, 1.0]]), np.eye(80), np.tile(np.eye(2), (20, 1, 1)))
+        information_form.steady_gain(A, np.kron(np.eye(40), [[1.0, 1.0]]), np.eye(80), np.tile(np.eye(2), (20, 1, 1)))
         is None
     )
 

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aolink.estimation import exposure_model, make_estimator
+from aolink.estimation import exposure_model
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
@@ -43,7 +43,7 @@ def view_of(rig, *, photoelectrons=0.0, seed=1, **how):
     (exposure,) = simulate(rig, 1, seed=seed)
     spots = rig.plant.n_outputs // 2
     looks = WindowedSpots(rig.sensor, spots) if spots else WindowedMoments(rig.sensor)
-    measured, _ = measure(rig, exposure, looks, make_estimator(rig, "moments").options)
+    measured, _ = measure(rig, exposure, looks.needs)
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor, **how)
     return likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced), model
@@ -121,7 +121,7 @@ def test_what_the_reduction_leaves_out_is_small_and_accounted_for(kind):
     assert np.sqrt(rest.mean()) <= 0.1 * np.sqrt(least)
     assert reduced.widening == pytest.approx(rest.mean(axis=1).sum() / model.plant.n_outputs)
     # Coefficients and end state without a measurement are the prior's.
-    state = Belief(rig.plant.initial_mean[None], rig.plant.initial_covariance[None])
+    state = Gaussian(rig.plant.initial_mean[None], rig.plant.initial_covariance[None])
     t = reduced.prior(state)
     after = reduced.coefficients(t)
     expected = np.eye(model.n_coefficients)

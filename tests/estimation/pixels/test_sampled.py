@@ -7,19 +7,21 @@ import pytest
 from scipy import stats
 
 from aolink.estimation import exposure_model, make_estimator
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief, corrected
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.kalman.update import joseph_update
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.gaussian_mixture import single
-from aolink.estimation.pixels.sampled import SampledUpdates
+from aolink.estimation.pixels.sampled import TemperedUpdater
 from aolink.estimation.pixels.tempering import fitted
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 RIG = load_rig("section-vi-lively")
 MODEL = exposure_model(RIG.plant, 200)
-PRIOR = Belief(np.array([[0.05, -0.2]]), RIG.plant.initial_covariance[None] / 20)
+PRIOR = Gaussian(np.array([[0.05, -0.2]]), RIG.plant.initial_covariance[None] / 20)
 
 
 class LinearView:
@@ -42,8 +44,8 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
     before = reduced.prior(PRIOR)
     truth = before.mean[0] + np.linalg.cholesky(before.covariance[0]) @ rng.standard_normal(reduced.size)
     view = LinearView(H, (H @ truth + 0.3 * rng.standard_normal(4))[None], 0.3, reduced)
-    t = SampledUpdates(particles=4000).sample(view, single(PRIOR), 0)[0]
-    kalman = corrected(before, view.y - before.mean @ H.T, H[None], 0.09 * np.eye(4)[None]).posterior
+    t = TemperedUpdater(particles=4000).sample(view, single(PRIOR), 0)[0]
+    kalman = joseph_update(before, view.y - before.mean @ H.T, H[None], 0.09 * np.eye(4)[None]).posterior
     sd = np.sqrt(np.diag(kalman.covariance[0]))
     np.testing.assert_allclose((t.mean(axis=0) - kalman.mean[0]) / sd, 0, atol=0.1)
     white = np.linalg.solve(np.linalg.cholesky(kalman.covariance[0]), (t - kalman.mean[0]).T)
@@ -51,8 +53,8 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
 
 
 def seen(rig, exposure):
-    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor), make_estimator(rig, "moments").options)
-    updates = SampledUpdates()
+    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor).needs)
+    updates = TemperedUpdater()
     reduced = updates.reduction(MODEL, rig.sensor)
     return likelihood.PixelView(rig.sensor, MODEL, MODEL.response(exposure.inputs), measured, reduced)
 
@@ -61,15 +63,15 @@ def test_other_particles_and_twice_as_many_say_the_same():
     rig = dataclasses.replace(RIG, sensor=dataclasses.replace(RIG.sensor, noise_density=0.001))
     (exposure,) = simulate(rig, 1, seed=3)
     view = seen(rig, exposure)
-    prior = single(Belief(exposure.truth.start_state + np.array([0.01, 0.1]), RIG.plant.initial_covariance[None] / 9))
+    prior = single(Gaussian(exposure.truth.start_state + np.array([0.01, 0.1]), RIG.plant.initial_covariance[None] / 9))
     one, other, more = (
-        SampledUpdates(count, seed).sample(view, prior, 0)[0] for count, seed in ((600, 0), (600, 1), (1200, 2))
+        TemperedUpdater(count, seed).sample(view, prior, 0)[0] for count, seed in ((600, 0), (600, 1), (1200, 2))
     )
     sd = more.std(axis=0)
     for each in (one, other):
         assert np.sqrt(np.mean(((each.mean(axis=0) - more.mean(axis=0)) / sd) ** 2)) < 0.2
         np.testing.assert_allclose(each.std(axis=0) / sd, 1, atol=0.15)
-    again = SampledUpdates(600, 0).sample(view, prior, 0)[0]
+    again = TemperedUpdater(600, 0).sample(view, prior, 0)[0]
     assert again.tobytes() == one.tobytes()
 
 
@@ -91,7 +93,7 @@ def ranks(count, particles, seed=5):
         dark = Profile(density=np.zeros((1, 40)), mask=np.ones((1, 40), bool))
         view = likelihood.PixelView(rig.sensor, MODEL, MODEL.response(np.zeros((200, 1))), dark, reduced)
         view.y = view.predicted(t)[:, 0] + np.sqrt(view.read_noise) * rng.standard_normal((1, 40))
-        drawn = SampledUpdates(particles).sample(view, single(PRIOR), number)[0]
+        drawn = TemperedUpdater(particles).sample(view, single(PRIOR), number)[0]
 
         thin = drawn[rng.permutation(particles)[:99]]
         found.append((functions(view, thin) < functions(view, t[0])).sum(axis=1))

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_lyapunov
 
-from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation import Status, exposure_model, run, score
+from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.frames.measure import measure
-from aolink.estimation.kalman.observation import Belief
-from aolink.estimation.moments.windowed import Profile, WindowedMoments
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
-from aolink.estimation.pixels.filter import HypothesisFilter
-from aolink.estimation.pixels.gaussian_mixture import Hypotheses, cholesky, single
+from aolink.estimation.pixels.filter import MixtureFilter
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, single
 from aolink.estimation.pixels.importance import importance_corrected
 from aolink.estimation.pixels.modes import broad, find_modes, whitened
 from aolink.estimation.pixels.updates import MIXTURE, PROFILE, explored
@@ -33,13 +34,13 @@ def quiet(rig, V):
 def seen(rig=RIG, *, width=1.0, seed=3):
     """One exposure, with a prior of its start state so many times as wide as the plant's own, about the truth."""
     (exposure,) = simulate(rig, 1, seed=seed)
-    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor), make_estimator(rig, "moments").options)
+    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor).needs)
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor)
     view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
     P = rig.plant.initial_covariance * width**2
     offset = np.linalg.cholesky(P) @ np.random.default_rng(seed).standard_normal(len(P))
-    return view, Belief(exposure.truth.start_state + offset, P[None])
+    return view, Gaussian(exposure.truth.start_state + offset, P[None])
 
 
 def by_importance(view, state, count=60_000, seed=1):
@@ -153,7 +154,7 @@ def test_evidence_of_a_mode_has_the_weight_of_its_prior():
     apart = state.mean[:, None] + np.array([[0.0, 0.0], [0.1, 3.0]])
     both = np.repeat(state.covariance[:, None], 2, axis=1) / 4
     weights = np.log([[0.5, 0.5], [0.9, 0.1]])
-    each = [explored(view, Hypotheses(log_weight[None], apart, both))[0] for log_weight in weights]
+    each = [explored(view, GaussianMixture(log_weight[None], apart, both))[0] for log_weight in weights]
     assert len({modes.mean.shape for modes in each}) == 1
     # Whose prior led to a mode: those are told apart by what the other weight made of it.
     change = np.sort(each[1].log_evidence[0] - each[0].log_evidence[0])
@@ -183,7 +184,7 @@ def test_a_path_and_its_reversal_are_two_readings():
     measured = Profile(density=density[None], mask=np.ones((1, 40), bool))
     view = likelihood.PixelView(rig.sensor, model, model.response(np.zeros((200, 1))), measured, reduced)
     P = np.diag([0.04, 25.0])
-    state = Belief(np.zeros((1, 2)), P[None])
+    state = Gaussian(np.zeros((1, 2)), P[None])
     update = PROFILE.update(view, single(state), state, 0)
     assert update.several[0]
     modes, _ = explored(view, single(state))
@@ -279,7 +280,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(40))))
-        own = HypothesisFilter(plant, RIG.sensor, UPDATES[name])
+        own = MixtureFilter(plant, RIG.sensor, UPDATES[name])
         model = exposure_model(plant, 200)
         response = model.response(np.zeros((200, plant.axes)))
         return [own.step(model, response, Profile(density=d[rows], mask=np.ones(d[rows].shape, bool))) for d in density]
@@ -302,7 +303,7 @@ def test_nor_do_its_nodes(name):
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(3))))
-        own, model = HypothesisFilter(plant, RIG.sensor, UPDATES[name]), exposure_model(plant, 200)
+        own, model = MixtureFilter(plant, RIG.sensor, UPDATES[name]), exposure_model(plant, 200)
         measured = Profile(density=density[rows], mask=np.ones(density[rows].shape, bool))
         return own.step(model, model.response(jump[:, rows]), measured)
 
@@ -340,15 +341,15 @@ def test_what_commands_left_in_the_state_is_foreseen(name):
 def test_a_lost_mode_is_found_again(name):
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
     rig = load_rig("jitter")
-    how, found = WindowedMoments(rig.sensor), []
+    how, found = WindowedMoments(rig.sensor).needs, []
     for seed in range(1, 7):
-        filter_, errors = HypothesisFilter(rig.plant, rig.sensor, UPDATES[name]), []
+        filter_, errors = MixtureFilter(rig.plant, rig.sensor, UPDATES[name]), []
         for k, exposure in enumerate(simulate(rig, 9, seed=seed)):
             if k == 5:
                 h = filter_.belief
-                filter_.belief = Hypotheses(h.log_weight, -h.mean, 0.3 * h.covariance)
+                filter_.belief = GaussianMixture(h.log_weight, -h.mean, 0.3 * h.covariance)
             model = exposure_model(rig.plant, exposure.n_steps)
-            measured, _ = measure(rig, exposure, how, make_estimator(rig, "moments").options)
+            measured, _ = measure(rig, exposure, how)
             response = model.response(exposure.inputs)
             posterior = filter_.step(model, response, measured)
             path = model.path(posterior.coefficients.mean, response.path)
@@ -358,7 +359,7 @@ def test_a_lost_mode_is_found_again(name):
 
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-def test_where_few_points_count_others_are_annealed(updates, monkeypatch):
+def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=11)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 200
@@ -366,13 +367,13 @@ def test_where_few_points_count_others_are_annealed(updates, monkeypatch):
     done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
     assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
     assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
-    end = view.reduced.end(Belief(mean[None], covariance[None]))
+    end = view.reduced.end(Gaussian(mean[None], covariance[None]))
     np.testing.assert_allclose(done.end.belief.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
 
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-@pytest.mark.parametrize("anneal", [False, True])
-def test_a_single_coefficient(updates, anneal, monkeypatch):
+@pytest.mark.parametrize("temper", [False, True])
+def test_a_single_coefficient(updates, temper, monkeypatch):
     """Of one state without process noise the posterior is an integral over a line."""
     noise = 0.0 * RIG.plant.process_noise
     one = np.ones((1, 1))
@@ -382,10 +383,10 @@ def test_a_single_coefficient(updates, anneal, monkeypatch):
     )  # fmt: skip
     view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
     assert view.reduced.size == 1
-    if anneal:
+    if temper:
         monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
     else:
-        monkeypatch.delattr("aolink.estimation.pixels.importance.annealed")
+        monkeypatch.delattr("aolink.estimation.pixels.importance.tempered_points")
     t = np.linspace(-3, 3, 60_001)
     log = view.log_likelihoods(t[None, :, None])[0] - 0.5 * t**2 / state.covariance[0, 0, 0]
     w = np.exp(log - log.max())
@@ -408,7 +409,7 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
     model = exposure_model(plant, 200)
     density = exposure_density(rig.sensor.kernel, rig.sensor.edges, np.zeros((1, 200)))
     centred = Profile(density=density, mask=np.ones_like(density, dtype=bool))
-    filter_ = HypothesisFilter(plant, rig.sensor, UPDATES[name])
+    filter_ = MixtureFilter(plant, rig.sensor, UPDATES[name])
     for _ in range(150):
         filter_.step(model, model.response(np.zeros((200, 1))), centred)
     assert np.isfinite(filter_.belief.mean).all()
@@ -418,12 +419,12 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
 
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
-def test_a_frame_that_cannot_be_believed_is_not_annealed(updates, monkeypatch):
+def test_a_frame_that_cannot_be_believed_is_not_tempered(updates, monkeypatch):
     view, state = seen(quiet(RIG, 0.001), width=0.3)
     lie = view.part(slice(None))
     lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
     monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
-    monkeypatch.delattr("aolink.estimation.pixels.importance.annealed")
+    monkeypatch.delattr("aolink.estimation.pixels.importance.tempered_points")
     assert not updates.update(lie, single(state), state, 0).innovation.believed[0]
     with pytest.raises(NameError):
         updates.update(view, single(state), state, 0)

@@ -1,4 +1,4 @@
-"""Corrections of a plant with hundreds of states, in information form: posterior = (P^-1 + H' R^-1 H)^-1.
+"""Updates of a plant with hundreds of states, in information form: posterior = (P^-1 + H' R^-1 H)^-1.
 
 The information that frames add is a sum over spots, of which each knows its own noise; nothing is as large as
 measurements times measurements. All products are those of `aolink.numerics.single_thread`.
@@ -10,44 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.numerics import single_thread
+from aolink.numerics.information import information, inverse_root
 
 FloatArray = NDArray[np.float64]
 
-# Relative to each variance; what a prior knows for certain stays certain to this.
-_JITTER = 1e-10
 # Exposures in which a gain has settled, or there is none; and the relative change of a covariance that is rounding.
 _MOST_EXPOSURES = 1000
 _SETTLED = 1e-11
 
 
-def information(covariance: FloatArray) -> FloatArray:
-    """Inverse of a covariance that may be singular, (n, n)."""
-    sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    sd = np.where(sd > 0, sd, 1.0)
-    scaled = covariance / sd / sd[:, None]
-    np.fill_diagonal(scaled, np.diagonal(scaled) + _JITTER)
-    return np.asarray(single_thread.inverse(scaled) / sd / sd[:, None])
-
-
-def inverse_root(precision: FloatArray) -> FloatArray:
-    """W with W' W the covariance of an information matrix, (n, n); it is scaled to a diagonal of one before."""
-    scale = 1 / np.sqrt(np.diagonal(precision))
-    return np.asarray(single_thread.inverse_root(precision * scale * scale[:, None]) * scale)
-
-
-def covariance(precision: FloatArray) -> FloatArray:
-    """Inverse of an information matrix, scaled as in `inverse_root`."""
-    scale = 1 / np.sqrt(np.diagonal(precision))
-    return np.asarray(single_thread.inverse(precision * scale * scale[:, None]) * scale * scale[:, None])
-
-
-def solve(precision: FloatArray, score: FloatArray) -> FloatArray:
-    """precision^-1 score, scaled as in `inverse_root`."""
-    scale = 1 / np.sqrt(np.diagonal(precision))
-    return single_thread.solve(precision * scale * scale[:, None], score * scale) * scale
-
-
-def corrected(
+def update(
     mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """One step of a Kalman filter for one axis, y the innovation, with the optimal gain or another one.

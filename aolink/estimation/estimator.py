@@ -1,0 +1,171 @@
+"""One estimator on one rig: what comes between exposures is bridged, what the filter says of each is an `Estimate`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.batch import Batch
+from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.frames.measure import Measured, Measurements
+from aolink.estimation.kalman.filter import Filter, Posterior
+from aolink.estimation.kalman.two_states import Run
+from aolink.exposure import Exposure
+from aolink.rig import Rig
+
+
+class Estimator:
+    """One estimator on one rig: exposures in, estimates out, in the order in which they come.
+
+    It has no clock and does no input or output: the same exposures give the same estimates, bit for bit.
+    """
+
+    def __init__(self, rig: Rig, name: str, filter: Filter) -> None:
+        self.rig, self.name, self.filter = rig, name, filter
+        self.several: NDArray[np.bool_] | None = None
+        """Which axes of the last exposure have a blur of more than one reading; None of estimators that do not look."""
+        self._next_step: int | None = None
+        self._last_input = np.zeros(rig.n_inputs)
+
+    def step(self, exposure: Exposure) -> Estimate:
+        """The estimate of an exposure, from it and from all that came before."""
+        (estimate,) = self.steps(Batch(self.rig, [exposure]))
+        return estimate
+
+    def steps(self, batch: Batch) -> Iterator[Estimate]:
+        """The estimates of exposures one after the other, to the same bits."""
+        measured = Measurements(self.rig, batch.exposures, self.filter.needs)
+        k = 0
+        while k < len(batch.exposures):
+            done = self._run(batch, measured, k)
+            if done is None:
+                yield self._stepped(batch, k, measured[k])
+                k += 1
+                continue
+            count = len(done.nis)
+            last = batch.exposures[k + count - 1]
+            self._next_step, self._last_input = last.first_step + last.n_steps, last.inputs[-1]
+            yield from self._believed(batch, k, done)
+            k += count
+
+    def _run(self, batch: Batch, measured: Measurements, first: int) -> Run | None:
+        """What the filter makes of exposures from ``first`` on between which there is no gap, and that have no flaw."""
+        row, moments = measured.rows[first], measured.moments
+        if batch.model is None or moments is None or row < 0:
+            return None
+        end, next_step = first, self._next_step
+        for exposure in batch.exposures[first:]:
+            follows = next_step in (None, exposure.first_step) and not len(exposure.lead_inputs)
+            if not (follows and batch.finite[end] and measured.rows[end] == row + end - first):
+                break
+            end, next_step = end + 1, exposure.first_step + exposure.n_steps
+        if end == first:
+            return None
+        axes = self.rig.plant.axes
+        responses = batch.responses.of(slice(first * axes, end * axes))
+        return self.filter.run(batch.model, responses, measured.some(row, row + end - first))
+
+    def _believed(self, batch: Batch, first: int, done: Run) -> Iterator[Estimate]:
+        """Estimates of a run of exposures."""
+        assert batch.model is not None
+        exposures = batch.exposures[first : first + len(done.nis)]
+        for exposure, state, covariance, end, end_covariance, innovation, S, nis in zip(
+            exposures, done.coefficients, done.covariance, done.end, done.end_covariance, done.innovation,
+            done.innovation_covariance, done.nis, strict=True,
+        ):  # fmt: skip
+            yield Estimate(
+                estimator=self.name,
+                frame_id=exposure.frame_id,
+                first_step=exposure.first_step,
+                n_steps=exposure.n_steps,
+                status=Status.OK,
+                reason="",
+                start_state=state,
+                start_covariance=covariance,
+                end_state=end,
+                end_covariance=end_covariance,
+                coefficients=state,
+                coefficient_covariance=covariance,
+                inputs=exposure.inputs,
+                model=batch.model,
+                innovation=innovation,
+                innovation_covariance=S,
+                nis=nis,
+            )
+
+    def _stepped(self, batch: Batch, k: int, measured: Measured) -> Estimate:
+        """The estimate of exposure k, whatever it is like."""
+        exposure, model = batch.exposures[k], batch.model_of(k)
+        reasons = self._bridge(exposure)
+        taken, remark = measured
+        posterior = self.filter.step(model, batch.response_to(k), taken)
+        self.several = posterior.several
+        reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
+        coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
+        return Estimate(
+            estimator=self.name,
+            frame_id=exposure.frame_id,
+            first_step=exposure.first_step,
+            n_steps=exposure.n_steps,
+            status=_worst(posterior.status),
+            reason="; ".join(reasons),
+            start_state=posterior.start.mean,
+            start_covariance=posterior.start.covariance,
+            end_state=posterior.end.mean,
+            end_covariance=posterior.end.covariance,
+            coefficients=coefficients,
+            coefficient_covariance=covariance,
+            inputs=exposure.inputs,
+            model=model,
+            innovation=posterior.innovation,
+            innovation_covariance=posterior.innovation_covariance,
+            nis=posterior.nis,
+        )
+
+    def _bridge(self, exposure: Exposure) -> list[str]:
+        """Predict to the start of an exposure; what there is to say about it."""
+        lead, reasons = exposure.lead_inputs, []
+        gap = len(lead) if self._next_step is None else exposure.first_step - self._next_step
+        if gap < 0:
+            reasons.append(f"it starts at step {exposure.first_step}, before {self._next_step}: taken as the next")
+            gap = 0
+        elif gap > len(lead):
+            reasons.append(f"inputs of {gap - len(lead)} of the {gap} steps before it are not known: held")
+            lead = np.concatenate([np.tile(self._last_input, (gap - len(lead), 1)), lead])
+        self.filter.bridge(lead[len(lead) - gap :])
+        if not (np.isfinite(exposure.inputs).all() and np.isfinite(lead).all()):
+            reasons.append("an input is not a number: taken as zero")
+        self._next_step = exposure.first_step + exposure.n_steps
+        self._last_input = exposure.inputs[-1]
+        return reasons
+
+
+# From good to bad; the worst of all axes is the estimate's status.
+_BY_GRAVITY = (Status.PREDICTED, Status.OK, Status.REINITIALISED, Status.GATED, Status.DIVERGED, Status.INPUT_INVALID)
+
+
+def _worst(status: NDArray[np.int64]) -> Status:
+    counts = np.bincount(status)
+    return max((Status(int(s)) for s in np.flatnonzero(counts)), key=_BY_GRAVITY.index)
+
+
+def _told(posterior: Posterior) -> list[str]:
+    """What the statuses of the axes say, in words."""
+    words = {
+        Status.GATED: "too far from the prediction, not used",
+        Status.DIVERGED: "too far from the prediction several times in a row: it starts again",
+        Status.REINITIALISED: "started again from the plant's prior",
+    }
+    counts = np.bincount(posterior.status, minlength=len(Status))
+    axes = len(posterior.status)
+    told = []
+    for status, text in words.items():
+        if counts[status]:
+            nis = f"NIS {posterior.nis[posterior.status == status].max():.3g}"
+            told.append(f"{nis}, {text}" if axes == 1 else f"{counts[status]} of {axes} axes: {nis}, {text}")
+    if posterior.several is not None and posterior.several.any():
+        of = "" if axes == 1 else f"{int(posterior.several.sum())} of {axes} axes: "
+        told.append(f"{of}the blur has more than one reading")
+    return told

@@ -1,0 +1,98 @@
+"""What can be taken of a frame, and how an estimator says which of it it needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Flux = Literal["known", "measured"]
+
+HALF = 0.5
+"""Share of a spot's pixels that estimators of windows and of pixels can do with; and share of the spots, where
+hundreds of states hang together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Needs:
+    """What an estimator takes of each frame, and how much of the frame must be usable."""
+
+    what: Literal["moments", "profile", "windows"]
+    """"moments": a `Measurement`; "profile": a `Profile`; "windows": `SpotWindows`, which there are where one copy of
+    the plant moves whole spots."""
+    orders: tuple[int, ...] = ()
+    """Which moments, from 1."""
+    flux: Flux = "known"
+    """Whether the light of a frame is known to sum to one, or moments are divided by what it sums to."""
+    least_usable: float = 1.0
+    """Share of a spot's pixels that must be usable. Moments need all of them: whole spots."""
+    least_spots: float = 1.0
+    """Share of the spots of one copy of the plant that must be usable; the other spots are masked."""
+
+    def __post_init__(self) -> None:
+        if self.what == "moments" and (self.least_usable < 1 or self.least_spots < 1):
+            raise ValueError("moments need whole spots: least_usable and least_spots must be 1")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """What was measured in one exposure, with Gaussian noise."""
+
+    value: FloatArray
+    """(axes, n_measurements)"""
+    covariance: FloatArray
+    """(axes, n_measurements, n_measurements), or blocks along its diagonal, (axes, blocks, size, size)."""
+    usable: BoolArray | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Profile:
+    """Densities of one row of pixels for each axis; for each output of each axis, where an axis has several."""
+
+    density: FloatArray
+    """One over slope units, (axes, pixels)."""
+    mask: BoolArray
+    """True where the pixel can be used, (axes, pixels)."""
+    light: FloatArray | None = None
+    """Light of each spot, of a whole one, which densities are divided by, (axes,); one where None."""
+    usable: BoolArray | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
+
+    def part(self, axes: slice) -> Profile:
+        """The part of these axes."""
+        light = None if self.light is None else self.light[axes]
+        return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SpotWindows:
+    """Densities of the pixels about each spot of each copy of the plant."""
+
+    density: FloatArray
+    """One over slope units squared, zero where the mask is, (axes, spots, rows, columns)."""
+    mask: BoolArray
+    """True where the pixel can be used, (axes, spots, rows, columns)."""
+    light: FloatArray | None = None
+    """Light of each spot, of a whole one, which densities are divided by, (axes, spots); one where None."""
+    usable: BoolArray | None = None
+    """False for axes of which nothing was measured, (axes,); None if there are none."""
+
+    def per_light(self, light: FloatArray | None) -> SpotWindows:
+        """The same with densities divided by the light of each spot in the rig's order, (axes * spots,)."""
+        if light is None:
+            return self
+        light = light.reshape(self.density.shape[:2])
+        return SpotWindows(density=self.density / light[..., None, None], mask=self.mask, light=light)
+
+    def part(self, axes: slice) -> SpotWindows:
+        """The part of these axes."""
+        light = None if self.light is None else self.light[axes]
+        return SpotWindows(density=self.density[axes], mask=self.mask[axes], light=light)
+
+
+FrameData = Measurement | Profile | SpotWindows

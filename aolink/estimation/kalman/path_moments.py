@@ -1,0 +1,196 @@
+"""What an exposure shows of its coefficients: the observations of a Kalman filter, and those of the paper."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
+from aolink.estimation.kalman.gaussian import Gaussian, Update
+from aolink.estimation.kalman.update import (
+    blocked_update,
+    information_update,
+    joseph_update,
+    small_update,
+    two_state_update,
+)
+from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.numerics import batched, entrywise
+from aolink.numerics.entrywise import Entry
+from aolink.plant.alike import MANY_STATES
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+Form = Callable[[ExposureModel, InputResponse, Gaussian, Measurement], Update]
+
+
+Data = TypeVar("Data", contravariant=True)
+
+
+class Observation(Protocol[Data]):
+    """A way to look at an exposure."""
+
+    needs: Needs
+    models_noise: bool
+    """Whether the coefficients go on after the start state, to the process noise inside the exposure."""
+    n_measurements: int
+
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
+        """The exposure's coefficients with what was measured."""
+
+
+class PathMoments:
+    """Moments of the path, as the paper's filters take them: no process noise inside the exposure.
+
+    Parameters
+    ----------
+    plant:
+        Its size chooses the form in which updates are computed.
+    orders:
+        Moments, of 1 and 2.
+    gain:
+        A constant gain (n_states, n_measurements) instead of the optimal one.
+    crosses:
+        Whether the cross moments of each two outputs follow, y_11 of a lenslet's x and y.
+    flux:
+        As of `Needs`.
+    """
+
+    models_noise = False
+
+    def __init__(
+        self, plant: Plant, orders: Sequence[int], gain: FloatArray | None = None, *, crosses: bool = False,
+        flux: Flux = "known",
+    ) -> None:  # fmt: skip
+        self.orders, self.gain, self.crosses = tuple(orders), gain, crosses
+        self.needs = Needs(what="moments", orders=self.orders, flux=flux)
+        self.n_measurements = plant.n_outputs * len(self.orders) + crosses * math.comb(plant.n_outputs, 2)
+        self._form = self._chosen_form(plant)
+
+    def _chosen_form(self, plant: Plant) -> Form:
+        """The form of the update by numbers of states and measurements."""
+        if plant.n_outputs > 2 and not self.crosses:  # many spots, of which each has noise of its own
+            return self._many if plant.n_states > MANY_STATES else self._blocked
+        if max(self.n_measurements, plant.n_states) > entrywise.MOST_ROWS:
+            return self._in_matrices
+        if self.gain is None and self.n_measurements == plant.n_states == 2:
+            return self._two_states
+        return self._small
+
+    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
+        """One step of the (extended) Kalman filter."""
+        return self._form(model, response, prior, measured)
+
+    def _many(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
+        expected, slope = many_moments(model, response, prior.mean, self.orders)
+        return information_update(prior, measured.value - expected, slope, measured.covariance, self.gain)
+
+    def _blocked(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
+        expected, slope = many_moments(model, response, prior.mean, self.orders)
+        return blocked_update(prior, measured.value - expected, slope, measured.covariance, self.gain)
+
+    def _in_matrices(
+        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
+    ) -> Update:
+        h, H = predicted_moments(model, response, prior.mean, self.orders, crosses=self.crosses)
+        return joseph_update(prior, measured.value - h, H, self._noise(measured), self.gain)
+
+    def _small(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
+        innovation, H = self._entries(model, response, prior, measured)
+        return small_update(prior, innovation, H, self._noise(measured), self.gain)
+
+    def _two_states(
+        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
+    ) -> Update:
+        innovation, H = self._entries(model, response, prior, measured)
+        return two_state_update(prior, innovation, H, self._noise(measured))
+
+    def _entries(
+        self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
+    ) -> tuple[list[Entry], entrywise.Matrix]:
+        h, H = _moment_entries(model, response, prior.mean, self.orders, crosses=self.crosses)
+        return [y - expected for y, expected in zip(entrywise.columns(measured.value), h, strict=True)], H
+
+    def _noise(self, measured: Measurement) -> FloatArray:
+        """Whole, (axes, n_measurements, n_measurements): that of one spot may come as its only block."""
+        R = measured.covariance
+        return R[:, 0] if R.ndim == 4 else R
+
+
+def predicted_moments(
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int], *, crosses: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Moments of the path without process noise, and their Jacobian by the start state.
+
+    h_1 = C-bar x + mean(c), h_2 = x'Mx + 2 b'x + s for each output; H_1 = C-bar, H_2 = 2 (Mx + b)'.
+    Mishra & Wen (12), (13) and (15), with the inputs inside the exposure that they leave out.
+
+    Parameters
+    ----------
+    state:
+        (axes, n_states)
+    orders:
+        A subset of 1 and 2, in order.
+
+    Returns
+    -------
+    h (axes, m) and H (axes, m, n_states); an output's orders are together, cross moments come last.
+    """
+    h, H = _moment_entries(model, response, state, orders, crosses=crosses)
+    return entrywise.pack_vector(h, len(state)), entrywise.pack(H, len(state))
+
+
+def _moment_entries(
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int], *, crosses: bool = False
+) -> tuple[list[Entry], entrywise.Matrix]:
+    """`predicted_moments`, entry by entry."""
+    x = entrywise.columns(state)
+    moments: list[Entry] = []
+    slopes: entrywise.Matrix = []
+    for o in range(model.plant.n_outputs):
+        if 1 in orders:
+            mean_row = model.mean_row[o].tolist()
+            moments.append(entrywise.dot(mean_row, x) + entrywise.columns(response.mean)[o])
+            slopes.append(mean_row)
+        if 2 in orders:
+            slope = entrywise.columns(response.slope[:, o])
+            half = entrywise.add(_times_state(model.quadratic[o], state), slope)
+            moments.append(entrywise.dot(x, entrywise.add(half, slope)) + entrywise.columns(response.square)[o])
+            slopes.append([2 * each for each in half])
+    for o, p in itertools.combinations(range(model.plant.n_outputs), 2) if crosses else ():
+        # mean (a'x + c)(b'x + d) = x'M_ab x + (b_ad + b_bc)'x + s_cd
+        mixed = _times_state(model.cross_quadratic(o, p), state)
+        both, square = model.cross_response(response, o, p)
+        slope = entrywise.columns(both)
+        moments.append(entrywise.dot(x, entrywise.add(mixed, slope)) + square)
+        slopes.append([2 * a + b for a, b in zip(mixed, slope, strict=True)])
+    return moments, slopes
+
+
+def many_moments(
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
+) -> tuple[FloatArray, FloatArray]:
+    """`predicted_moments` of a plant with many outputs, all of them at once."""
+    axes, n = state.shape
+    rows = model.mean_row
+    moments, slopes = [], []
+    if 1 in orders:
+        moments.append(state @ rows.T + response.mean)
+        slopes.append(np.broadcast_to(rows, (axes, *rows.shape)))
+    if 2 in orders:
+        half = model.times_quadratic(state) + response.slope
+        moments.append(np.matmul(half + response.slope, state[:, :, None])[..., 0] + response.square)
+        slopes.append(2 * half)
+    return np.stack(moments, axis=2).reshape(axes, -1), np.stack(slopes, axis=2).reshape(axes, -1, n)
+
+
+def _times_state(matrix: FloatArray, state: FloatArray) -> list[Entry]:
+    """A matrix (n, n) times states (axes, n)."""
+    if len(matrix) > entrywise.MOST_ROWS:
+        return entrywise.columns(batched.matvec(matrix, state))
+    return entrywise.times_vector(entrywise.unpack(matrix), entrywise.columns(state))

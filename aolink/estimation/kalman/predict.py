@@ -1,0 +1,43 @@
+"""The prediction of a Kalman filter: x -> A x + d, P -> A P A' + Q, in the form that suits its size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.base import ExposureModel
+from aolink.numerics import batched, entrywise, single_thread
+from aolink.plant.alike import MANY_STATES
+
+FloatArray = NDArray[np.float64]
+Noise = Literal["lifted", "printed"]
+Predict = Callable[[Gaussian, FloatArray, FloatArray, FloatArray], Gaussian]
+
+
+def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
+    """What the process noise of one exposure adds to the state's covariance, (n_states, n_states)."""
+    plant = model.plant
+    return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
+
+
+def predict(belief: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
+    """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
+    mean = predicted_mean(belief.mean, transition, kick)
+    if max(transition.shape) > entrywise.MOST_ROWS:
+        spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence
+        return Gaussian(mean, batched.symmetric(spread(transition, belief.covariance) + noise))
+    P, Q = entrywise.unpack(belief.covariance), entrywise.unpack(noise)
+    covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
+    return Gaussian(mean, entrywise.pack(covariance, len(belief.covariance)))
+
+
+def predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:
+    """x -> A x + d"""
+    if max(transition.shape) > entrywise.MOST_ROWS:
+        return batched.matvec(transition, mean) + kick
+    moved = entrywise.times_vector(entrywise.unpack(transition), entrywise.columns(mean))
+    return entrywise.pack_vector(entrywise.add(moved, entrywise.columns(kick)), len(mean))

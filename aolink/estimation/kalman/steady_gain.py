@@ -1,0 +1,52 @@
+"""The gain that the centroid filter o1 settles at: the Riccati equation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from aolink.estimation.kalman import information_form
+from aolink.estimation.model.base import ExposureModel
+from aolink.plant.alike import MANY_STATES
+
+FloatArray = NDArray[np.float64]
+
+
+def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
+    """Steady-state gain of the centroid filter on the lifted plant (A^N, C-bar), (n_states, n_outputs).
+
+    It corrects the state at the start of the exposure with that exposure's centroid. None where the
+    Riccati equation has no stabilising solution: the centroid loses a mode that does not die out.
+
+    Parameters
+    ----------
+    R:
+        Covariance of the centroids as blocks along its diagonal, (blocks, size, size), or whole.
+    """
+    H = model.mean_row
+    if R.ndim == 3 and H.shape[1] > MANY_STATES:
+        return information_form.steady_gain(model.transition, H, Q, R)
+    if R.ndim == 3 and len(H) > H.shape[1]:
+        return _compressed_gain(model, Q, R)
+    R = linalg.block_diag(*R) if R.ndim == 3 else R
+    try:
+        P = linalg.solve_discrete_are(model.transition.T, H.T, Q, R)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return np.asarray(P @ H.T @ np.linalg.inv(H @ P @ H.T + R))
+
+
+def _compressed_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:
+    """`steady_gain` for more outputs than states: of whitened ones, no more than there are states tell anything."""
+    root = np.linalg.cholesky(R)
+    blocks, size, _ = R.shape
+    white = np.linalg.solve(root, model.mean_row.reshape(blocks, size, -1)).reshape(blocks * size, -1)
+    rotation, H = np.linalg.qr(white)
+    try:
+        P = linalg.solve_discrete_are(model.transition.T, H.T, Q, np.eye(len(H)))
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(len(H)))
+    told = np.linalg.solve(root.swapaxes(1, 2), rotation.reshape(blocks, size, -1)).reshape(blocks * size, -1)
+    return np.asarray(gain @ told.T)

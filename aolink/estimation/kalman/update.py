@@ -1,0 +1,126 @@
+"""The update of a Kalman filter, in the forms that it is computed in. They are one update, to rounding.
+
+`aolink.estimation.kalman.path_moments` chooses between them when an observation is made.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.kalman import information_form, two_states
+from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
+from aolink.numerics import batched, entrywise
+from aolink.numerics.entrywise import Entry
+
+FloatArray = NDArray[np.float64]
+
+
+def joseph_update(
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
+) -> Update:
+    """The update of a Kalman filter in Joseph form.
+
+    Mishra & Wen (18) to (20), with the innovation y - h(x). ``gain`` (n_states, n_measurements) stands in
+    for the optimal one; Joseph's form gives the covariance that it really has.
+    """
+    R = batched.batch_last(R)
+    PH = batched.matmul(prior.covariance, batched.transpose(H))
+    S = batched.matmul(H, PH) + R
+    S_inverse = batched.inverse(S)
+    K = batched.matmul(PH, S_inverse) if gain is None else gain
+    mean = prior.mean + batched.matvec(K, innovation)
+    keep = np.eye(prior.mean.shape[1]) - batched.matmul(K, H)
+    covariance = batched.symmetric(batched.congruence(keep, prior.covariance) + batched.congruence(K, R))
+    nis = batched.dot(innovation, batched.matvec(S_inverse, innovation))
+    return Update(Gaussian(mean, covariance), innovation, S, nis)
+
+
+def blocked_update(
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
+) -> Update:
+    """`joseph_update` for few states and many measurements, whose noise is shared within blocks only.
+
+    With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing
+    has more rows than there are states, and P may be singular. Of S there is the diagonal where it is large.
+
+    Parameters
+    ----------
+    R:
+        (axes, blocks, size, size)
+    """
+    axes, blocks, size, _ = R.shape
+    n = prior.mean.shape[1]
+    H, y = H.reshape(axes, blocks, size, n), innovation.reshape(axes, blocks, size, 1)
+    P, transposed = prior.covariance, batched.transpose(H)
+    weighted = np.linalg.solve(R, np.concatenate([H, y], axis=3))
+    # Sums over blocks of products as small as these do not depend on threads.
+    G = batched.symmetric((transposed @ weighted[..., :n]).sum(axis=1))
+    M = batched.symmetric(np.asarray(np.linalg.solve(np.eye(n) + P @ G, P)))
+    optimal = (M @ (transposed @ weighted[..., n:]).sum(axis=1))[..., 0]
+    if gain is None:
+        moved, keep, from_noise = optimal, np.eye(n) - M @ G, batched.congruence(M, G)
+    else:
+        K = np.moveaxis(gain.reshape(-1, n, blocks, size), 2, 1)  # (1 or axes, blocks, n, size)
+        moved = (K @ y).sum(axis=1)[..., 0]
+        keep = np.eye(n) - (K @ H).sum(axis=1)
+        from_noise = (K @ R @ batched.transpose(K)).sum(axis=1)
+    covariance = batched.symmetric(batched.congruence(keep, P) + from_noise)
+    left = y - H @ optimal[:, None, :, None]
+    nis = (weighted[..., n:] * left).sum(axis=(1, 2, 3))
+    m = blocks * size
+    flat = H.reshape(axes, m, n)
+    if m > MOST_COVARIANCES:
+        S = (flat @ P * flat).sum(axis=2) + np.einsum("abss->abs", R).reshape(axes, m)
+    else:
+        S = flat @ P @ batched.transpose(flat)
+        for k in range(blocks):
+            some = slice(k * size, (k + 1) * size)
+            S[:, some, some] += R[:, k]
+    return Update(Gaussian(prior.mean + moved, covariance), innovation, S, nis)
+
+
+def information_update(
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
+) -> Update:
+    """`blocked_update` for many states, in information form; of the innovation covariance there is the diagonal."""
+    axes = len(innovation)
+    gains = [None] * axes if gain is None else np.broadcast_to(gain, (axes, *gain.shape[-2:]))
+    every = zip(prior.mean, prior.covariance, innovation, H, R, gains, strict=True)
+    mean, covariance, S, nis = (
+        np.stack(each) for each in zip(*(information_form.update(*one) for one in every), strict=True)
+    )
+    return Update(Gaussian(mean, covariance), innovation, S, nis)
+
+
+def small_update(
+    prior: Gaussian, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray, gain: FloatArray | None
+) -> Update:
+    """`joseph_update` for one or two states and measurements, entry by entry."""
+    axes, P, noise = len(prior.mean), entrywise.unpack(prior.covariance), entrywise.unpack(R)
+    HP = entrywise.times_transposed(H, P)
+    S = entrywise.symmetric_times_transposed(HP, H, noise)
+    S_inverse = entrywise.inverse(S)
+    K = entrywise.unpack(gain) if gain is not None else entrywise.times_transposed(entrywise.transpose(HP), S_inverse)
+    mean = entrywise.add(entrywise.columns(prior.mean), entrywise.times_vector(K, innovation))
+    keep = entrywise.one_minus(entrywise.times_transposed(K, entrywise.transpose(H)))
+    from_noise = entrywise.symmetric_times_transposed(entrywise.times_transposed(K, noise), K)
+    covariance = entrywise.congruence(keep, P, from_noise)
+    nis = entrywise.dot(innovation, entrywise.times_vector(S_inverse, innovation))
+    after = Gaussian(entrywise.pack_vector(mean, axes), entrywise.pack(covariance, axes))
+    return Update(
+        after, entrywise.pack_vector(innovation, axes), entrywise.pack(S, axes), entrywise.pack_one(nis, axes)
+    )
+
+
+def two_state_update(prior: Gaussian, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray) -> Update:
+    """`joseph_update` for two states and two measurements, with the optimal gain."""
+    axes = len(prior.mean)
+    (p, q), (_, r) = entrywise.unpack(prior.covariance)
+    (first, shared), (_, rest) = entrywise.unpack(R)
+    x, v, p, q, r, s, both, t, nis = two_states.update(
+        entrywise.columns(prior.mean), (p, q, r), innovation, H, (first, shared, rest), together=bool(np.any(shared))
+    )
+    after = Gaussian(entrywise.pack_vector([x, v], axes), entrywise.pack([[p, q], [q, r]], axes))
+    S = entrywise.pack([[s, both], [both, t]], axes)
+    return Update(after, entrywise.pack_vector(innovation, axes), S, entrywise.pack_one(nis, axes))

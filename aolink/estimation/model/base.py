@@ -1,0 +1,211 @@
+"""One exposure: start state, end state and path as one joint Gaussian.
+
+With z = (x(k0), xi), xi ~ N(0, I) the coefficients of the process noise inside the exposure,
+
+    path = basis z + c(u),     x(k0 + N) = end_rows z + d(u) + remainder.
+
+Every estimator is an update of z; they differ in what they observe, and in whether they model xi.
+
+Where the plant says so (`UnmodelledSlopes`), xi begins with one coefficient for each output: the mean over the exposure
+of the slopes v that the plant does not make, in their standard deviations. It moves the output for the whole exposure
+and leaves the end state alone. What v does about its mean has no coefficient; it widens spots by its variance, and the
+standard deviation of a path contains it.
+
+The spot rests where theta(k) has it for the whole of a fast step, as the sum in Mishra & Wen (3) takes it. An exposure
+that starts a part f of a step late loses as much of its first step and gains as much of the one after its last:
+a mean over it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end state and path stay those
+of whole steps.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.numerics import batched
+from aolink.plant.lifting import lift
+from aolink.rig import Plant
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class InputResponse:
+    """What the inputs of one exposure do, and what the moments need of it."""
+
+    path: FloatArray
+    """c, response of the outputs, (axes, n_outputs, n_steps)."""
+    end: FloatArray
+    """d, response of the end state, (axes, n_states)."""
+    mean: FloatArray
+    """Mean of c over the exposure, (axes, n_outputs)."""
+    slope: FloatArray
+    """b, mean of C A^i weighted with c_i, (axes, n_outputs, n_states)."""
+    square: FloatArray
+    """s, mean of c squared, (axes, n_outputs)."""
+
+    def of(self, some: slice) -> InputResponse:
+        """That of some of the axes."""
+        return InputResponse(
+            path=self.path[some], end=self.end[some], mean=self.mean[some], slope=self.slope[some],
+            square=self.square[some],
+        )  # fmt: skip
+
+
+class ExposureModel(ABC):
+    """The joint Gaussian of one exposure of a plant, precomputed; it holds no state.
+
+    `exposure_model` makes one: dense, or factored where the plant is many alike systems.
+    """
+
+    def __init__(self, plant: Plant, n_steps: int, mean_row: FloatArray) -> None:
+        self.plant, self.n_steps = plant, n_steps
+        self.transition, self.process_noise = lift(plant, n_steps)
+        self.mean_row = mean_row
+        """C-bar, (n_outputs, n_states)."""
+        self.moved = 0.0
+        """f/N: the share of the exposure that is in the step after its last, and not in its first."""
+        unmodelled = plant.unmodelled
+        mean, rest = unmodelled.variances(n_steps) if unmodelled else (0.0, 0.0)
+        self.n_unmodelled = plant.n_outputs if unmodelled else 0
+        """Coefficients of `UnmodelledSlopes`, which come after the start state; the process noise comes after them."""
+        self.unmodelled_sd = float(np.sqrt(mean))
+        """Standard deviation of their means over the exposure, slope units."""
+        self.unmodelled_rest = rest
+        """Mean variance of them about these means, slope units squared."""
+
+    @property
+    @abstractmethod
+    def state_rows(self) -> FloatArray:
+        """C A^i, (n_outputs, n_steps, n_states)."""
+
+    @property
+    @abstractmethod
+    def basis(self) -> FloatArray:
+        """Paths of the coefficients, (n_outputs, n_steps, n_coefficients); the first n_states are C A^i."""
+
+    @property
+    @abstractmethod
+    def factors(self) -> tuple[FloatArray | None, FloatArray]:
+        """The basis as recordings keep it: a matrix that mixes outputs, where there is one, and what it mixes."""
+
+    @property
+    @abstractmethod
+    def end_rows(self) -> FloatArray:
+        """End states of the coefficients, (n_states, n_coefficients)."""
+
+    @property
+    @abstractmethod
+    def end_remainder(self) -> FloatArray:
+        """Covariance of what the noise coefficients leave out of the end state, (n_states, n_states)."""
+
+    @abstractmethod
+    def mixed_rows(self, weights: FloatArray, count: int) -> FloatArray:
+        """Sums of the outputs as the first ``count`` coefficients make them, weights (k, n_outputs).
+
+        (k, n_steps, count)
+        """
+
+    @abstractmethod
+    def responses(self, inputs: FloatArray) -> InputResponse:
+        """`response` of many exposures, (exposures, n_steps, axes * n_inputs), the axes of one after those of another.
+
+        Each is to the same bits as alone, for a fraction of the calls.
+        """
+
+    @abstractmethod
+    def times_quadratic(self, state: FloatArray) -> FloatArray:
+        """M x for each output, states (axes, n_states) -> (axes, n_outputs, n_states)."""
+
+    @abstractmethod
+    def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
+        """basis @ coefficients + c; coefficients (axes, any first ones), c and result (axes, n_outputs, n_steps)."""
+
+    @abstractmethod
+    def path_sd(self, covariance: FloatArray) -> FloatArray:
+        """Standard deviation of the path, (axes, n_outputs, n_steps), from (axes, n_coefficients, n_coefficients)."""
+
+    def starting(self, offset: float) -> Self:
+        """The same for exposures that start so far into their first fast step, in fast steps, 0 <= offset < 1."""
+        if not 0 <= offset < 1:
+            raise ValueError(f"an exposure starts from 0 to 1 fast step into its first one, not {offset:g}")
+        _ = self.factors, self.end_rows  # made once, for all offsets
+        model = copy(self)
+        model.moved = offset / self.n_steps
+        first, last = self.plant.C, self.last_rows
+        model.mean_row = self.mean_row + model.moved * (last - first)
+        model.__dict__.pop("quadratic", None)  # it is another
+        return model
+
+    @cached_property
+    def quadratic(self) -> FloatArray:
+        """M = mean_i (C A^i)'(C A^i) for each output, (n_outputs, n_states, n_states)."""
+        mean = np.einsum("oij,oik->ojk", self.state_rows, self.state_rows) / self.n_steps
+        if not self.moved:
+            return np.asarray(mean)
+        first, last = self.plant.C, self.last_rows
+        squares = last[:, :, None] * last[:, None, :] - first[:, :, None] * first[:, None, :]
+        return np.asarray(mean + self.moved * squares)
+
+    @cached_property
+    def last_rows(self) -> FloatArray:
+        """C A^N, outputs in the step after the last, (n_outputs, n_states)."""
+        return np.asarray(self.plant.C @ self.transition)
+
+    @property
+    def rows_after(self) -> FloatArray:
+        """What the coefficients make of the outputs in the step after the last, (n_outputs, n_coefficients)."""
+        rows = np.asarray(self.plant.C @ self.end_rows)
+        n = self.plant.n_states
+        rows[:, n : n + self.n_unmodelled] = self.unmodelled_sd * np.eye(len(rows), self.n_unmodelled)
+        return rows
+
+    @property
+    def n_coefficients(self) -> int:
+        """States, unmodelled slopes and noise coefficients together."""
+        return int(self.end_rows.shape[1])
+
+    def response(self, inputs: FloatArray) -> InputResponse:
+        """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
+        return self.responses(inputs[None])
+
+    def last_response(self, end: FloatArray) -> FloatArray:
+        """c_N, response of the outputs in the step after the last to that of the end state, (axes, n_outputs)."""
+        return batched.matvec(self.plant.C, end)
+
+    def cross_quadratic(self, first: int, second: int) -> FloatArray:
+        """Symmetric M with mean(theta_1 theta_2) = x'Mx for two outputs without inputs, (n_states, n_states)."""
+        product = self.state_rows[first].T @ self.state_rows[second] / self.n_steps
+        if self.moved:
+            C, last = self.plant.C, self.last_rows
+            product = product + self.moved * (np.outer(last[first], last[second]) - np.outer(C[first], C[second]))
+        return np.asarray((product + product.T) / 2)
+
+    def cross_response(self, response: InputResponse, first: int, second: int) -> tuple[FloatArray, FloatArray]:
+        """What inputs add to the mean product of two outputs: slope (axes, n_states) and constant (axes,)."""
+        c, rows = response.path, self.state_rows
+        both = c[:, first, None] * rows[second].T + c[:, second, None] * rows[first].T
+        slope, product = batched.mean_over_path(both), batched.mean_over_path(c[:, first] * c[:, second])
+        if self.moved:
+            late, last = self.last_response(response.end), self.last_rows
+            mixed = late[:, first, None] * last[second] + late[:, second, None] * last[first]
+            slope, product = slope + self.moved * mixed, product + self.moved * late[:, first] * late[:, second]
+        return slope, product
+
+
+def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:
+    """Inputs of the rig as each copy of the plant has them, (k, axes * n_inputs) -> (axes, k, n_inputs).
+
+    Inputs of several exposures are split alike, (exposures, k, axes * n_inputs) -> (exposures * axes, k, n_inputs).
+    What is not a number is taken as zero: it must not poison every estimate that follows.
+    """
+    known = np.isfinite(inputs)
+    finite = inputs if known.all() else np.where(known, inputs, 0.0)
+    split = finite.reshape(-1, inputs.shape[-2], plant.axes, plant.n_inputs).transpose(0, 2, 1, 3)
+    return split.reshape(-1, inputs.shape[-2], plant.n_inputs)
