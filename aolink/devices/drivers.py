@@ -5,10 +5,11 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from typing import Any, Literal
 
 from aolink.errors import AolinkError, DeviceError, RigError
+from aolink.extensions import installed, loaded
 from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
 
@@ -53,20 +54,14 @@ def calling(kind: str, when: str) -> Iterator[None]:
 
 
 def _load(kind: Kind, name: str) -> Callable[..., Any]:
-    there = ", ".join(driver_names(kind))
     point = _others(kind).get(name)
     if point is None:
         raise DeviceError(
-            f"there is no {kind} driver {name}, there is {there}: install the package that brings it, or mend"
-            f" devices.{kind}.driver in the rig file"
+            f"there is no {kind} driver {name}, there is {', '.join(driver_names(kind))}: install the package that"
+            f" brings it, or mend devices.{kind}.driver in the rig file"
         )
-    try:
-        return point.load()  # type: ignore[no-any-return]
-    except Exception as error:
-        raise DeviceError(
-            f"the {kind} driver {name} ({point.value}) cannot be loaded: {error!r}; there is {there}"
-        ) from error
+    return loaded(point, f"{kind} driver", DeviceError)  # type: ignore[no-any-return]
 
 
 def _others(kind: Kind) -> dict[str, EntryPoint]:
-    return {point.name: point for point in entry_points(group=f"aolink.{kind}s") if point.name != NATIVE}
+    return {name: point for name, point in installed(f"aolink.{kind}s").items() if name != NATIVE}

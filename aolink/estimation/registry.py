@@ -13,8 +13,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
-from importlib.metadata import EntryPoint, entry_points
+from functools import lru_cache
+from importlib.metadata import EntryPoint
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,7 @@ from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Engine, Options, checked_options
 from aolink.estimation.pixels.joint_pixels import JointProfile
+from aolink.extensions import described, installed, loaded
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.plant.alike import MANY_STATES, alike_systems
 from aolink.rig import Rig
@@ -87,23 +88,15 @@ def estimator_rows() -> tuple[EstimatorRow, ...]:
     return tuple(sorted(rows, key=lambda row: (row.rank, row.name)))
 
 
-@cache
 def _others() -> dict[str, EntryPoint]:
     """Estimators of other packages, by name; the names that are ours stay ours."""
-    return {point.name: point for point in entry_points(group=GROUP) if point.name not in _OURS}
+    return {name: point for name, point in installed(GROUP).items() if name not in _OURS}
 
 
-@cache
 def _loaded(point: EntryPoint) -> EstimatorRow:
-    package = point.dist.name if point.dist else "an unknown package"
-    try:
-        row = point.load()
-    except Exception as error:  # it is somebody else's code
-        raise EstimatorError(f"the estimator {point.name!r} of {package} cannot be loaded: {error!r}") from error
+    row = loaded(point, "estimator", EstimatorError)
     if not isinstance(row, EstimatorRow) or row.name != point.name:
-        raise EstimatorError(
-            f"the estimator {point.name!r} of {package}: {point.value} is not an EstimatorRow of this name"
-        )
+        raise EstimatorError(f"{described(point, 'estimator')} is not an EstimatorRow of this name")
     return row
 
 
