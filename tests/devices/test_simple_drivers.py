@@ -184,7 +184,10 @@ def camera(bench: CameraBench) -> AdaptedCamera:
     camera.query_clock(bench.host_ns)
     camera.poll()
     assert camera.start(100, 0)
-    assert bench.started_ns == CAMERA_ZERO_NS + 100 * STEP_NS
+    assert bench.started_ns is not None
+    assert (
+        0 < bench.started_ns - (CAMERA_ZERO_NS + 100 * STEP_NS) < STEP_NS // 5
+    )  # by what one clock sample leaves open
     bench.host_ns += 10**10
     return camera
 
@@ -199,6 +202,7 @@ def frame(since_zero_ns: int, **changes: object) -> SimpleFrame:
 
 def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench: CameraBench) -> None:
     bench.taken = [
+        frame(-70 * PERIOD_NS),  # the camera had kept it from before: it is none of this session, and makes no loss
         frame(100 * STEP_NS - 3000),  # as the clocks are compared: no step earlier
         frame(100 * STEP_NS + PERIOD_NS + STEP_NS // 4),
         frame(100 * STEP_NS + 4 * PERIOD_NS),
