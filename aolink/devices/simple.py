@@ -341,10 +341,10 @@ class AdaptedMirror(_Adapted):
         self._awaited, self._deadline_ns = end_step, now_ns + _PATIENCE_NS
         return []
 
-    def next_timeout_ns(self) -> int | None:
+    def next_due_ns(self) -> int | None:
         return self._deadline_ns if self._next is not None and self._next < self._awaited else None
 
-    def retransmit(self, now_ns: int) -> list[Event]:
+    def serve(self, now_ns: int) -> list[Event]:
         return self._give_up(self._awaited)
 
     def park(self) -> int:

@@ -109,12 +109,12 @@ def test_a_gap_between_reports_is_said_not_to_be_reported() -> None:
     mirror.send_block(0, np.full((8, 1), 0.01), 0, 0)
     bench.reports = [(0, held(2)), (5, held(3)), (5, held(3))]
     assert ends(mirror) == [(1, 0, 2, 0), (0, 2, 3, pb.Applied.NOT_REPORTED), (1, 5, 3, 0)]
-    assert mirror.next_timeout_ns() is None
+    assert mirror.next_due_ns() is None
     assert mirror.await_reports(12, 50) == []
-    assert mirror.next_timeout_ns() == 1_000_000_050
-    (given_up,) = mirror.retransmit(1_000_000_050)
+    assert mirror.next_due_ns() == 1_000_000_050
+    (given_up,) = mirror.serve(1_000_000_050)
     assert given_up == pb.Applied(first_step=8, n_steps=4, source=pb.Applied.NOT_REPORTED)
-    assert mirror.next_timeout_ns() is None
+    assert mirror.next_due_ns() is None
 
 
 def test_what_a_driver_raises_refuses_the_command_in_words() -> None:
@@ -160,8 +160,8 @@ def test_each_commanded_step_ends_once(
     bench.host_ns = EPOCH_NS + parked * STEP_NS
     step = mirror.park()
     mirror.await_reports(min(first, step), bench.host_ns)
-    while (due_ns := mirror.next_timeout_ns()) is not None:
-        take(mirror.retransmit(due_ns))
+    while (due_ns := mirror.next_due_ns()) is not None:
+        take(mirror.serve(due_ns))
         take(mirror.poll())
     take(mirror.poll())
     account.parked_from(step)
