@@ -89,12 +89,13 @@ def test_a_camera_of_another_package_beside_a_native_mirror(
         done = aolink("record", "--mirror", mirror, *arguments, "--json", env=installed)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert (report["ended"], report["frames_received"], report["steps_commanded"]) == ("complete", 4, 800)
+    assert (report["ended"], report["frames_received"]) == ("complete", 4)
+    assert report["steps_commanded"] >= 800  # more where the mirror had to be re-armed
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["camera"] == "example camera"
     assert report["steps_applied"] > 0
-    first_steps = [exposure.first_step for exposure in recording.exposures()]
-    assert np.diff(first_steps).tolist() == [200] * 3
+    starts = [exposure.first_step + exposure.start_offset for exposure in recording.exposures()]
+    assert np.abs(np.diff(starts) - 200).max() < 1  # as well as the clocks can be compared on a busy machine
     with simulated_rig(rig) as (camera, mirror):
         refused = aolink("record", "--mirror", mirror, *arguments, "--overwrite", env=installed)
         assert refused.returncode == 4
