@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint
 from typing import Any, Literal
 
@@ -35,7 +35,8 @@ def open_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Any:
     """
     make = _load(kind, table.driver)
     try:
-        inspect.signature(make).bind(rig, **table.options)
+        with suppress(ValueError):  # one that is not written in Python may have no signature
+            inspect.signature(make).bind(rig, **table.options)
     except TypeError as error:
         raise RigError(f"devices.{kind}: the driver {table.driver} cannot take these keys: {error}") from None
     with calling(kind, "when it was opened"):

@@ -125,11 +125,11 @@ class Mirror(Device, Protocol):
         Raises DeviceError for an input beyond the limits: it is refused, never clamped.
         """
 
-    def next_timeout_ns(self) -> int | None:
-        """When `retransmit` has something to do, host clock; None if nothing is waited for."""
+    def next_due_ns(self) -> int | None:
+        """When it wants to be served next, host clock; None while nothing is waited for."""
 
-    def retransmit(self, now_ns: int) -> list[Event]:
-        """Send again what has timed out, ask for missing reports; gives ``NOT_REPORTED`` for those that are given up.
+    def serve(self, now_ns: int) -> list[Event]:
+        """Do what is due: send again what has timed out, ask for missing reports, and give up those that never came.
 
         Raises DeviceError when a command has not been answered for twice the mirror's watchdog.
         """

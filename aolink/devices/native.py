@@ -251,14 +251,14 @@ class NativeMirror(_NativeDevice):
         flight.last_ns = now_ns
         flight.tries[self.link.send(flight.block)] = now_ns
 
-    def next_timeout_ns(self) -> int | None:
+    def next_due_ns(self) -> int | None:
         timeout_ns = self._timeout_ns()
         due_ns = [flight.due_ns(timeout_ns) for flight in self._flights.values()]
         if (report_ns := self._reports.next_due_ns(timeout_ns)) is not None:
             due_ns.append(report_ns)
         return min(due_ns, default=None)
 
-    def retransmit(self, now_ns: int) -> list[Event]:
+    def serve(self, now_ns: int) -> list[Event]:
         timeout_ns = self._timeout_ns()
         for flight in self._flights.values():
             if flight.due_ns(timeout_ns) > now_ns:

@@ -13,7 +13,7 @@ from aolink.devices.host import Host
 from aolink.devices.identity import check_against_rig, check_kind, identify
 from aolink.devices.interfaces import Camera, Mirror, Opened
 from aolink.devices.native import NativeCamera, NativeMirror
-from aolink.devices.simple import AdaptedCamera, AdaptedMirror
+from aolink.devices.simple import AdaptedCamera, AdaptedMirror, SimpleCamera, SimpleMirror
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
@@ -61,14 +61,14 @@ def open_devices(
         )
         mirror: Mirror
         if native_mirror is None:
-            driver = _open_simple("mirror", tables["mirror"], rig, stack)
+            driver = _open_simple("mirror", tables["mirror"], rig, SimpleMirror, stack)
             mirror = adapted_mirror = AdaptedMirror(rig, driver, host.now_ns)
             host.polled.append(adapted_mirror)
         else:
             mirror = native_mirror
         camera: Camera
         if native_camera is None:
-            driver = _open_simple("camera", tables["camera"], rig, stack)
+            driver = _open_simple("camera", tables["camera"], rig, SimpleCamera, stack)
             camera = adapted_camera = AdaptedCamera(rig, driver, mirror, host.now_ns)
             host.polled.append(adapted_camera)
         else:
@@ -128,9 +128,15 @@ def _open_native(
     return camera, mirror, warnings
 
 
-def _open_simple(kind: Kind, table: DeviceTable, rig: Rig, stack: ExitStack) -> Any:
-    """A simple driver, which is closed with the others."""
+def _open_simple(kind: Kind, table: DeviceTable, rig: Rig, protocol: type, stack: ExitStack) -> Any:
+    """A simple driver, which is closed with the others. Raises DeviceError where it has not all of ``protocol``."""
     driver = open_driver(kind, table, rig)
+    asked = [name for name in (*protocol.__annotations__, *vars(protocol)) if not name.startswith("_")]
+    if lacking := [name for name in asked if not hasattr(driver, name)]:
+        raise DeviceError(
+            f"the {kind} driver {table.driver} lacks {', '.join(lacking)}: see {protocol.__name__} in"
+            " aolink.devices.simple"
+        )
 
     def close() -> None:
         with calling(kind, "when it was closed"):

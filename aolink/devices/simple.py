@@ -29,6 +29,8 @@ from aolink.wire.truth import truth_message
 
 _OFFSETS = 16
 """An exposure's start is rounded to this part of a fast step: estimators keep a model for each that occurs."""
+_START_SIGMA = 3.0
+"""A camera is told to start so many standard deviations of the clocks' comparison later than the fast step begins."""
 _PATIENCE_NS = 1_000_000_000
 """How long the end of a session waits for reports."""
 _FUTURE_NS = 1_000_000_000
@@ -142,6 +144,7 @@ class AdaptedCamera(_Adapted):
         self._rig, self._driver, self._mirror = rig, driver, mirror
         self._step_ns = rig.timing.fast_step_ns
         self._running = False
+        self._first_step = 0
         self._last: tuple[int, int] | None = None
         """The id of the frame before, and its start on the camera's clock."""
 
@@ -150,9 +153,12 @@ class AdaptedCamera(_Adapted):
         ahead_ns = first_step * self._step_ns - self._mirror.since_zero_ns(now_ns)
         if ahead_ns < 0:
             return False
+        start_ns, sigma_ns = self.clock.device_ns(now_ns + ahead_ns)
+        # An exposure that seems to begin before its session is none of it: rather a little later than too early.
+        margin_ns = _START_SIGMA * math.hypot(sigma_ns, self._mirror.clock.device_ns(now_ns)[1])
         with calling(self.name, "when it was told to start"):
-            self._driver.start(self.clock.device_ns(now_ns + ahead_ns)[0], exposures)
-        self._running = True
+            self._driver.start(start_ns + round(min(margin_ns, self._step_ns)), exposures)
+        self._first_step, self._running = first_step, True
         return True
 
     def stop(self) -> None:
@@ -198,6 +204,8 @@ class AdaptedCamera(_Adapted):
         # To the nearest part of a step, so that a camera in step with the mirror is not now before it, now after it.
         parts = round(self._mirror.since_zero_ns(host_start_ns) * _OFFSETS / self._step_ns)
         first_step, part = divmod(parts, _OFFSETS)
+        if first_step < self._first_step:  # what the camera had still kept from before
+            return []
         frame_id, lost = 1, 0
         if self._last is not None:
             before_id, before_ns = self._last
@@ -333,10 +341,10 @@ class AdaptedMirror(_Adapted):
         self._awaited, self._deadline_ns = end_step, now_ns + _PATIENCE_NS
         return []
 
-    def next_timeout_ns(self) -> int | None:
+    def next_due_ns(self) -> int | None:
         return self._deadline_ns if self._next is not None and self._next < self._awaited else None
 
-    def retransmit(self, now_ns: int) -> list[Event]:
+    def serve(self, now_ns: int) -> list[Event]:
         return self._give_up(self._awaited)
 
     def park(self) -> int:

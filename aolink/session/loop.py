@@ -223,12 +223,12 @@ class SessionLoop:
         time = self._time
         if self._mirror.latched:
             self._rearm("in this session")
-        now, timeout_ns = time.now_ns(), self._mirror.next_timeout_ns()
-        if timeout_ns is not None and time.virtual:  # the rig has dealt with everything, so this one was lost
-            time.elapse_until(timeout_ns)
+        now, due_ns = time.now_ns(), self._mirror.next_due_ns()
+        if due_ns is not None and time.virtual:  # the rig has dealt with everything, so this one was lost
+            time.elapse_until(due_ns)
             now = time.now_ns()
-        if timeout_ns is not None and timeout_ns <= now:
-            self._take(self._mirror, self._mirror.retransmit(now), now)
+        if due_ns is not None and due_ns <= now:
+            self._take(self._mirror, self._mirror.serve(now), now)
         if now >= self._next_query_ns():
             self._query_next_clock(now)
         if not time.virtual and now >= self._keep_alive_ns():
@@ -244,8 +244,8 @@ class SessionLoop:
         if self._end_step is None or self._queued_until < self._end_step:
             ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
             due.append((max(ahead, 0) + 1) * self._step_ns)
-        if (timeout_ns := self._mirror.next_timeout_ns()) is not None:
-            due.append(timeout_ns - now)
+        if (due_ns := self._mirror.next_due_ns()) is not None:
+            due.append(due_ns - now)
         return max(0, min(due)) / 1e9
 
     def _keep_alive_ns(self) -> int:
@@ -320,11 +320,11 @@ class SessionLoop:
         end, now = self._queued_until, self._time.now_ns()
         end = end if self._parked_from is None else min(end, self._parked_from)
         self._take(self._mirror, self._mirror.await_reports(end, now), now)
-        while (due_ns := self._mirror.next_timeout_ns()) is not None:
+        while (due_ns := self._mirror.next_due_ns()) is not None:
             self._time.elapse_until(due_ns)
             now = self._time.now_ns()
             if due_ns <= now:
-                self._take(self._mirror, self._mirror.retransmit(now), now)
+                self._take(self._mirror, self._mirror.serve(now), now)
             self._receive(max(0, due_ns - now) / 1e9)
 
     def _take(self, device: Device, events: Sequence[Event], receive_ns: int) -> None:

@@ -23,7 +23,7 @@ from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.recording import convert
 from aolink.rig import load_rig
-from aolink.simulation.devices import SimulatedDevices
+from aolink.simulation.devices import Line, SimulatedDevices
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Received
@@ -44,9 +44,12 @@ class Host:
         self.now = hub.now_ns()
         device = SimulatedDevices(RIG, virtual_time=False, step_zero_ns=self.now)
         identities = []
-        for line in ("camera", "mirror"):
+        lines: tuple[Line, Line] = ("camera", "mirror")
+        for line in lines:
             device.handle(line, pb.Identify(nonce=1), 0)
-            identities.append(device.outbox.pop().message)
+            identity = device.outbox.pop().message
+            assert isinstance(identity, pb.Identity)
+            identities.append(identity)
         gate = Gate(RIG, hub, identities, self.now)
         self.camera = NativeCamera(hub, self.camera_link, identities[0], gate)
         self.mirror = NativeMirror(hub, self.mirror_link, identities[1], gate)
@@ -122,7 +125,7 @@ def values(field: FieldDescriptor) -> st.SearchStrategy[object]:
 
 
 @st.composite
-def messages(draw: Callable[..., object]) -> Message:
+def messages(draw: st.DrawFn) -> Message:
     """A message that is sound, with some of its fields changed to anything."""
     frame, step = draw(st.integers(0, 3)), draw(st.sampled_from([0, 50, 200]))
     sound: dict[type[Message], Message] = {
@@ -143,7 +146,7 @@ def messages(draw: Callable[..., object]) -> Message:
             getattr(message, field.name).extend(draw(st.lists(values(field), max_size=60)))
         else:
             setattr(message, field.name, draw(values(field)))
-    return message
+    return message  # type: ignore[no-any-return] # one of KINDS, which mypy takes for types of any kind
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None)

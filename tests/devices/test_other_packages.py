@@ -34,7 +34,9 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     broken = folder / "broken-1.0.dist-info"
     broken.mkdir()
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (broken / "entry_points.txt").write_text("[aolink.cameras]\nbroken = no_such_module:Camera\n")
+    (broken / "entry_points.txt").write_text(
+        "[aolink.cameras]\nbroken = no_such_module:Camera\nbare = contextlib:nullcontext\n"
+    )
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]), "COLUMNS": "200"}
 
 
@@ -87,12 +89,13 @@ def test_a_camera_of_another_package_beside_a_native_mirror(
         done = aolink("record", "--mirror", mirror, *arguments, "--json", env=installed)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert (report["ended"], report["frames_received"], report["steps_commanded"]) == ("complete", 4, 800)
+    assert (report["ended"], report["frames_received"]) == ("complete", 4)
+    assert report["steps_commanded"] >= 800  # more where the mirror had to be re-armed
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["camera"] == "example camera"
     assert report["steps_applied"] > 0
-    first_steps = [exposure.first_step for exposure in recording.exposures()]
-    assert np.diff(first_steps).tolist() == [200] * 3
+    starts = [exposure.first_step + exposure.start_offset for exposure in recording.exposures()]
+    assert np.abs(np.diff(starts) - 200).max() < 1  # as well as the clocks can be compared on a busy machine
     with simulated_rig(rig) as (camera, mirror):
         refused = aolink("record", "--mirror", mirror, *arguments, "--overwrite", env=installed)
         assert refused.returncode == 4
@@ -154,8 +157,13 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(tmp_path: Path, monk
             2,
             "nothing says what drives the camera: give --camera PORT, or [devices.camera] in the rig file with one",
         ),
-        ('driver = "exmaple"', 4, "there is no camera driver exmaple, there is native, broken, example: install"),
+        ('driver = "exmaple"', 4, "there is no camera driver exmaple, there is native, bare, broken, example: install"),
         ('driver = "broken"', 4, "the camera driver broken (no_such_module:Camera) cannot be loaded: ModuleNotFound"),
+        (
+            'driver = "bare"',
+            4,
+            "the camera driver bare lacks description, time_ns, start, frames, stop, close: see SimpleCamera",
+        ),
         ('driver = "example"\nclock = 3', 2, "devices.camera: the driver example cannot take these keys: got an unexp"),
         (
             'driver = "example"\nclock_offset_s = "x"',
@@ -179,7 +187,7 @@ def test_a_driver_that_is_not_there_is_one_line(
 
 def test_the_drivers_that_there_are_are_listed(aolink: Run, installed: dict[str, str]) -> None:
     listed = aolink("devices", env=installed).stdout
-    assert "camera drivers: native, broken, example\nmirror drivers: native, example" in listed
+    assert "camera drivers: native, bare, broken, example\nmirror drivers: native, example" in listed
 
 
 def test_native_devices_may_stand_in_the_rig_file(aolink: Run, tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_what_comes_behind_a_virtual_time_came_at_that_time(peer: Peer, link: Li
     link.virtual = True
     peer.say(encode_message(pb.VirtualTime(host_ns=1000), 0) + event("a", 1))
     peer.say(encode_message(pb.VirtualTime(host_ns=2000), 2) + event("b", 3))
-    times = []
+    times: list[int] = []
     while len(times) < 2:
         wait_readable([link.transport], 5.0)
         times += [received.receive_ns for received in link.receive()]

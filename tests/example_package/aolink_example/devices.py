@@ -68,7 +68,8 @@ class Camera:
         return time.monotonic_ns() + self._offset_ns
 
     def start(self, start_ns, exposures):
-        self._start_ns = start_ns
+        ahead_ns = start_ns - self._offset_ns - light.zero_ns
+        self._start_ns = start_ns + -ahead_ns % self._rig.timing.fast_step_ns  # it is triggered by the mirror's steps
 
     def frames(self):
         timing = self._rig.timing
