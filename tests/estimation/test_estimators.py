@@ -376,5 +376,5 @@ def test_the_loop_over_numbers_is_the_filter_in_arrays():
     assert first_difference(ours, theirs) is None
     assert {each.status for each in ours} >= {Status.OK, Status.GATED}
     np.testing.assert_array_equal(
-        written.estimators[0].filter.belief.covariance, arrays.estimators[0].filter.belief.covariance
+        written.estimators[0].filter.prior.covariance, arrays.estimators[0].filter.prior.covariance
     )

@@ -105,7 +105,8 @@ class BlurFilter(Filter):
         prior = Gaussian(
             batched.tile(plant.initial_mean, plant.axes), batched.tile(plant.initial_covariance, plant.axes)
         )
-        self.belief = prior
+        self.prior = prior
+        """The state after the last exposure or bridge: the next exposure starts there."""
         # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
         self._unseen = Gaussian(prior.mean, prior.covariance[:1])
         # The transition that no longer changes it.
@@ -122,13 +123,13 @@ class BlurFilter(Filter):
         if len(inputs):
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
-            self.belief = self._predict(self.belief, transition, noise, kick)
+            self.prior = self._predict(self.prior, transition, noise, kick)
             self._predict_unseen(transition, noise, kick)
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
         axes, looks = self.plant.axes, self.observation
         lost = self._missed >= _PATIENCE
-        prior = _where(lost, self._unseen, self.belief)
+        prior = _where(lost, self._unseen, self.prior)
         with_noise = looks is None or looks.models_noise
         if with_noise:
             prior = _with_noise(prior, model.n_coefficients)
@@ -141,14 +142,14 @@ class BlurFilter(Filter):
             done = _without(done, measured.usable)
             coefficients, status = self._trusted(prior, done, lost, measured.usable)
         if with_noise:
-            self.belief = predict(coefficients, model.end_rows, model.end_remainder, response.end)
+            self.prior = predict(coefficients, model.end_rows, model.end_remainder, response.end)
         else:
             noise = added_noise(model, self._process_noise)
-            self.belief = self._predict(coefficients, model.transition, noise, response.end)
+            self.prior = self._predict(coefficients, model.transition, noise, response.end)
         self._predict_unseen(model.transition, model.process_noise, response.end)
         return Posterior(
             coefficients=coefficients,
-            end=self.belief,
+            end=self.prior,
             status=status,
             innovation=_numbers(done.innovation),
             innovation_covariance=_numbers(_kept(done.innovation_covariance)),
@@ -209,15 +210,15 @@ class TwoStateFilter(BlurFilter):
         """
         if self._missed[0]:
             return None
-        noise, belief = added_noise(model, self._process_noise), self.belief
-        state, covariance = belief.mean[0], belief.covariance[0]
+        noise, prior = added_noise(model, self._process_noise), self.prior
+        state, covariance = prior.mean[0], prior.covariance[0]
         done = two_states.run(
             model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
         )
         count = len(done.nis)
         if not count:
             return None
-        self.belief = Gaussian(done.end[-1], done.end_covariance[-1])
+        self.prior = Gaussian(done.end[-1], done.end_covariance[-1])
         settled = None if self._settled_under is model.transition else _SETTLED
         before = self._unseen
         mean, covariance, is_settled = two_states.unseen(
@@ -263,7 +264,7 @@ def _has_finite_sum(values: FloatArray) -> bool:
 
 
 def _where(chosen: NDArray[np.bool_], first: Gaussian, second: Gaussian) -> Gaussian:
-    """Axis by axis, the first belief where chosen."""
+    """Axis by axis, the first Gaussian where chosen."""
     which = np.flatnonzero(chosen)
     if not len(which):
         return second

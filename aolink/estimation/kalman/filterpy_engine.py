@@ -58,13 +58,13 @@ class FilterpyMoments(PathMoments):
         kf.P = keep @ P @ keep.T + self.gain @ R @ self.gain.T
         kf.S = H @ P @ H.T + R
 
-    def predict(self, belief: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
+    def predict(self, state: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
         """KalmanFilter.predict, the response to the inputs as its input."""
         from filterpy.kalman import KalmanFilter
 
         n = len(transition)
         kf = KalmanFilter(dim_x=n, dim_z=1, dim_u=n)
-        kf.x, kf.P = belief.mean[0][:, None].copy(), belief.covariance[0].copy()
+        kf.x, kf.P = state.mean[0][:, None].copy(), state.covariance[0].copy()
         kf.F, kf.Q, kf.B = transition, noise, np.eye(n)
         kf.predict(u=kick[0][:, None])
         return Gaussian(kf.x.T, kf.P[None])

@@ -26,7 +26,7 @@ class Gaussian:
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What a measurement made of a belief."""
+    """What a measurement made of a prior."""
 
     posterior: Gaussian
     innovation: FloatArray

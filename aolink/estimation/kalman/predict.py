@@ -24,15 +24,15 @@ def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
     return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
 
 
-def predict(belief: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
+def predict(state: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
     """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
-    mean = predicted_mean(belief.mean, transition, kick)
+    mean = predicted_mean(state.mean, transition, kick)
     if max(transition.shape) > entrywise.MOST_ROWS:
         spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence
-        return Gaussian(mean, batched.symmetric(spread(transition, belief.covariance) + noise))
-    P, Q = entrywise.unpack(belief.covariance), entrywise.unpack(noise)
+        return Gaussian(mean, batched.symmetric(spread(transition, state.covariance) + noise))
+    P, Q = entrywise.unpack(state.covariance), entrywise.unpack(noise)
     covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
-    return Gaussian(mean, entrywise.pack(covariance, len(belief.covariance)))
+    return Gaussian(mean, entrywise.pack(covariance, len(state.covariance)))
 
 
 def predicted_mean(mean: FloatArray, transition: FloatArray, kick: FloatArray) -> FloatArray:

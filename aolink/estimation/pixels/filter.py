@@ -95,21 +95,21 @@ class MixtureFilter(Filter):
     def __init__(self, plant: Plant, sensor: BaseSensor, updater: MixtureUpdater, *, gate: bool = True) -> None:
         self.plant, self.sensor, self._updater, self._gate = plant, sensor, updater, gate
         n, axes = plant.n_states, plant.axes
-        self.belief = single(
+        self.prior = single(
             Gaussian(
                 np.broadcast_to(plant.initial_mean, (axes, n)).copy(),
                 np.broadcast_to(plant.initial_covariance, (axes, n, n)).copy(),
             )
         )
         # The same without what the camera said.
-        self._unseen = self.belief.belief
+        self._unseen = self.prior.gaussian
         self._missed = np.zeros(axes, dtype=np.int64)
         self._number = 0
 
     def warm_up(self, updater: MixtureUpdater) -> None:
         """Have an exposure of one axis updated by these: what they compile, a session need not wait for."""
         one = slice(0, 1)
-        twice = joined(self.belief.part(one), self.belief.part(one))
+        twice = joined(self.prior.part(one), self.prior.part(one))
         n = self.plant.n_states
         twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1)
         drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
@@ -119,7 +119,7 @@ class MixtureFilter(Filter):
         dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
-        updater.update(view.part(one), self.belief.part(one), _part(self._unseen, one), 0)
+        updater.update(view.part(one), self.prior.part(one), _part(self._unseen, one), 0)
         view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
 
     @property
@@ -130,7 +130,7 @@ class MixtureFilter(Filter):
         if len(inputs):
             transition, noise = lift(self.plant, len(inputs))
             _, kick = input_response(self.plant, by_axis(self.plant, inputs))
-            self.belief = _moved(self.belief, transition, noise, kick)
+            self.prior = _moved(self.prior, transition, noise, kick)
             self._unseen = self._unwatched(transition, noise, kick)
 
     def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
@@ -147,7 +147,7 @@ class MixtureFilter(Filter):
         axes = self.plant.axes
         reduced = self._updater.reduction(model, self.sensor)
         lost = self._missed >= _PATIENCE
-        prior = _chosen(lost, single(self._unseen), self.belief)
+        prior = _chosen(lost, single(self._unseen), self.prior)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
         new = Innovation(np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes), np.ones(axes, dtype=bool))
         several = np.zeros(axes, dtype=bool)
@@ -156,7 +156,7 @@ class MixtureFilter(Filter):
         if measured is not None:
             usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
             # Each axis is looked at as finely as its own path asks for, whatever is beside it.
-            level = reduced.resolution.of(model.path(prior.belief.mean, response.path))
+            level = reduced.resolution.of(model.path(prior.gaussian.mean, response.path))
             views, parts = {}, []
             for k in np.unique(level[usable]).tolist():
                 views[k] = PixelView(self.sensor, model, response, measured, reduced, k)
@@ -179,7 +179,7 @@ class MixtureFilter(Filter):
             status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
             status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
         if not np.array_equal(took, np.arange(axes)):
-            coefficients = reduced.coefficients(reduced.prior(prior.belief))
+            coefficients = reduced.coefficients(reduced.prior(prior.gaussian))
             end = _moved(prior, model.transition, model.process_noise, response.end)
         if len(took):
             most = max(each.end.mean.shape[1] for each in done)
@@ -193,17 +193,17 @@ class MixtureFilter(Filter):
             else:
                 coefficients.mean[took], coefficients.covariance[took] = after[3], after[4]
                 end = end.replaced(took, kicked)
-        self.belief = end
+        self.prior = end
         self._unseen = self._unwatched(model.transition, model.process_noise, response.end)
         self._number += 1
         return Posterior(
-            coefficients=coefficients, end=end.belief, status=status, innovation=new.value,
+            coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several,
         )  # fmt: skip
 
 
-def _part(belief: Gaussian, axes: slice | NDArray[np.intp]) -> Gaussian:
-    return Gaussian(belief.mean[axes], belief.covariance[axes])
+def _part(gaussian: Gaussian, axes: slice | NDArray[np.intp]) -> Gaussian:
+    return Gaussian(gaussian.mean[axes], gaussian.covariance[axes])
 
 
 def _arrays(done: MixtureUpdate, components: int) -> tuple[NDArray[Any], ...]:

@@ -36,7 +36,7 @@ class GaussianMixture:
         return GaussianMixture(self.log_weight[axes], self.mean[axes], self.covariance[axes])
 
     @property
-    def belief(self) -> Gaussian:
+    def gaussian(self) -> Gaussian:
         """Mean and covariance of the mixture."""
         axes, _, n = self.mean.shape
         out = Gaussian(np.empty((axes, n)), np.empty((axes, n, n)))
@@ -116,9 +116,9 @@ class GaussianMixture:
         return GaussianMixture(kept[:, :count], self.mean[rows, order], self.covariance[rows, order])
 
 
-def single(belief: Gaussian) -> GaussianMixture:
+def single(gaussian: Gaussian) -> GaussianMixture:
     """A mixture of one component."""
-    return GaussianMixture(np.zeros((len(belief.mean), 1)), belief.mean[:, None], belief.covariance[:, None])
+    return GaussianMixture(np.zeros((len(gaussian.mean), 1)), gaussian.mean[:, None], gaussian.covariance[:, None])
 
 
 def joined(*mixtures: GaussianMixture) -> GaussianMixture:

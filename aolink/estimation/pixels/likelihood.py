@@ -216,7 +216,7 @@ class PixelView:
         return np.asarray((self.rows * np.tile(self._weights, self.outputs)[:, None]).T @ self.rows)
 
     def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
-        """Windowed moments about a belief of t, their noise and regression, as `Windowed.look`; of all axes."""
+        """Windowed moments about a Gaussian of t, their noise and regression, as `Windowed.look`; of all axes."""
         at = QuadraturePaths(basis=self._basis, weights=self._weights, inputs=self._inputs)
         return self._windowed.look(at, about, self._measured)
 

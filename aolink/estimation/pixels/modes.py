@@ -210,7 +210,7 @@ def broad(view: PixelView, prior: Gaussian) -> Gaussian:
 
 
 def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[FloatArray, FloatArray]:
-    """The mean of a wide belief and points on both sides of it along the path's most uncertain directions.
+    """The mean of a wide Gaussian and points on both sides of it along the path's most uncertain directions.
 
     Returns
     -------

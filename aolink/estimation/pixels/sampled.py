@@ -42,7 +42,7 @@ class TemperedUpdater:
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
         """The posterior of axes with a prior of their start states."""
         t = self.sample(view, prior, number)
-        reduced, before = view.reduced, view.reduced.prior(prior.belief)
+        reduced, before = view.reduced, view.reduced.prior(prior.gaussian)
         mean = t.mean(axis=1)
         away = t - mean[:, None]
         after = Gaussian(mean, batched.matmul(batched.transpose(away), away) / (t.shape[1] - 1))

@@ -56,7 +56,7 @@ class ImportanceUpdater:
         """The posterior of axes with a prior of their start states."""
         reduced = view.reduced
         modes, proposal = explored(view, prior)
-        new = innovation(view, reduced.prior(prior.belief), modes)
+        new = innovation(view, reduced.prior(prior.gaussian), modes)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
         if len(doubted):
             _, more = explored(view.part(doubted), single(Gaussian(unseen.mean[doubted], unseen.covariance[doubted])))
@@ -68,7 +68,7 @@ class ImportanceUpdater:
         several = has_several(modes, _LEAST_DOUBTED_SHARE)
         after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
-        return MixtureUpdate(after.belief, carried, new, has_several(modes))
+        return MixtureUpdate(after.gaussian, carried, new, has_several(modes))
 
 
 PROFILE = ImportanceUpdater(carried=3, free=0.1, share=0.25)

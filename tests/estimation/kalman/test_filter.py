@@ -236,7 +236,7 @@ def test_one_wild_moment_is_gated_and_many_start_the_filter_again():
 def test_a_filter_that_was_lost_starts_again_from_the_plant_and_finds_the_spot():
     u, moments, states = scenario(30)
     lost = BlurFilter(PLANT, PathMoments(PLANT, (1, 2)))
-    lost.belief = dataclasses.replace(lost.belief, mean=np.array([[9.0, 0.0]]), covariance=np.eye(2)[None] * 1e-6)
+    lost.prior = dataclasses.replace(lost.prior, mean=np.array([[9.0, 0.0]]), covariance=np.eye(2)[None] * 1e-6)
     model = exposure_model(PLANT, N)
     statuses = []
     for inputs, y in zip(u, moments, strict=True):
@@ -253,9 +253,9 @@ def test_nothing_makes_it_nan_or_its_covariance_indefinite():
     for orders in ORDERS.values():
         for step in our_steps(PLANT, orders, u, moments, gate=False):
             assert np.isfinite(step.nis).all()
-            for belief in (step.start, step.end):
-                assert np.isfinite(belief.mean).all()
-                assert np.linalg.eigvalsh(belief.covariance[0]).min() >= -1e-12
+            for gaussian in (step.start, step.end):
+                assert np.isfinite(gaussian.mean).all()
+                assert np.linalg.eigvalsh(gaussian.covariance[0]).min() >= -1e-12
 
 
 def test_a_gap_is_bridged_as_the_steps_one_by_one_would():
@@ -264,8 +264,8 @@ def test_a_gap_is_bridged_as_the_steps_one_by_one_would():
     once.bridge(u)
     for k in range(77):
         stepwise.bridge(u[k : k + 1])
-    np.testing.assert_allclose(once.belief.mean, stepwise.belief.mean, atol=1e-12)
-    np.testing.assert_allclose(once.belief.covariance, stepwise.belief.covariance, atol=1e-12)
+    np.testing.assert_allclose(once.prior.mean, stepwise.prior.mean, atol=1e-12)
+    np.testing.assert_allclose(once.prior.covariance, stepwise.prior.covariance, atol=1e-12)
 
 
 def test_innovations_of_a_linear_world_are_consistent():

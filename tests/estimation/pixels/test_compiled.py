@@ -248,9 +248,9 @@ def test_importance_sampling_with_the_same_points(pair):
     np.testing.assert_allclose(points, their_points, rtol=0.02)
     weights = (np.exp(each.ordered().log_weight) for each in (ours, theirs))
     np.testing.assert_allclose(*weights, atol=2e-3)
-    sd = np.sqrt(np.einsum("aii->ai", theirs.belief.covariance))
-    np.testing.assert_allclose(ours.belief.mean / sd, theirs.belief.mean / sd, atol=5e-3)
-    np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.belief.covariance)) / sd, 1.0, atol=5e-3)
+    sd = np.sqrt(np.einsum("aii->ai", theirs.gaussian.covariance))
+    np.testing.assert_allclose(ours.gaussian.mean / sd, theirs.gaussian.mean / sd, atol=5e-3)
+    np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.gaussian.covariance)) / sd, 1.0, atol=5e-3)
 
 
 def test_maps_of_mixtures():
@@ -262,15 +262,15 @@ def test_maps_of_mixtures():
         m = GaussianMixture(
             np.log(weight / weight.sum(axis=1)[:, None]), rng.standard_normal((5, 4, 3)), root @ root.swapaxes(-1, -2)
         )
-    own, seen = m.belief, m.mapped(rows, np.diag([0.5, 2.0]))
+    own, seen = m.gaussian, m.mapped(rows, np.diag([0.5, 2.0]))
     w = np.exp(m.log_weight)
     mean = np.einsum("ac,aci->ai", w, m.mean)
     away = m.mean - mean[:, None]
     np.testing.assert_allclose(own.mean, mean, atol=1e-12)
     spread = np.einsum("ac,acij->aij", w, m.covariance) + np.einsum("ac,aci,acj->aij", w, away, away)
     np.testing.assert_allclose(own.covariance, spread, atol=1e-12)
-    np.testing.assert_allclose(seen.belief.mean, mean @ rows.T, atol=1e-12)
-    np.testing.assert_allclose(seen.belief.covariance, rows @ spread @ rows.T + np.diag([0.5, 2.0]), atol=1e-12)
+    np.testing.assert_allclose(seen.gaussian.mean, mean @ rows.T, atol=1e-12)
+    np.testing.assert_allclose(seen.gaussian.covariance, rows @ spread @ rows.T + np.diag([0.5, 2.0]), atol=1e-12)
 
 
 def merged_once(m):

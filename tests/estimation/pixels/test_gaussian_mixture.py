@@ -39,8 +39,8 @@ def test_moments_are_those_of_samples():
     drawn = m.mean[0, chosen] + np.einsum(
         "kij,kj->ki", np.linalg.cholesky(m.covariance[0])[chosen], rng.standard_normal((len(chosen), 3))
     )
-    np.testing.assert_allclose(m.belief.mean[0], drawn.mean(axis=0), atol=0.03)
-    np.testing.assert_allclose(m.belief.covariance[0], np.cov(drawn.T), rtol=0.05, atol=0.1)
+    np.testing.assert_allclose(m.gaussian.mean[0], drawn.mean(axis=0), atol=0.03)
+    np.testing.assert_allclose(m.gaussian.covariance[0], np.cov(drawn.T), rtol=0.05, atol=0.1)
 
 
 @settings(max_examples=25, deadline=None)
@@ -53,8 +53,8 @@ def test_merging_keeps_weight_mean_and_covariance(seed, most, gone):
     less = m.reduced(most)
     assert less.mean.shape == (3, min(most, 5 - gone), 3)
     np.testing.assert_allclose(np.exp(less.log_weight).sum(axis=1), 1.0)
-    np.testing.assert_allclose(less.belief.mean, m.belief.mean, atol=1e-9)
-    np.testing.assert_allclose(less.belief.covariance, m.belief.covariance, atol=1e-8)
+    np.testing.assert_allclose(less.gaussian.mean, m.gaussian.mean, atol=1e-9)
+    np.testing.assert_allclose(less.gaussian.covariance, m.gaussian.covariance, atol=1e-8)
     assert np.linalg.eigvalsh(less.covariance).min() > 0
 
 

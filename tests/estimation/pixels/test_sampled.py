@@ -113,8 +113,8 @@ def test_a_mixture_is_fitted_to_points():
     rng = np.random.default_rng(2)
     points = np.concatenate([rng.standard_normal((600, 2)) * 0.2 + [2, 0], rng.standard_normal((300, 2)) * 0.4])
     fit = fitted(points, np.eye(2), 4, 0)
-    np.testing.assert_allclose(fit.belief.mean[0], points.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(fit.belief.covariance[0], np.cov(points.T), rtol=0.02, atol=0.01)
+    np.testing.assert_allclose(fit.gaussian.mean[0], points.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(fit.gaussian.covariance[0], np.cov(points.T), rtol=0.02, atol=0.01)
     truth = np.log(
         2 / 3 * stats.multivariate_normal([2, 0], 0.04).pdf(points)
         + 1 / 3 * stats.multivariate_normal([0, 0], 0.16).pdf(points)

@@ -107,7 +107,7 @@ def test_mixture_is_the_posterior_of_importance_sampling_where_it_is_bent(seed):
     _, proposal = explored(view, single(state))
     after, points = importance_corrected(view, single(state), proposal, 1.0, np.array([100.0]))
     assert points[0] > 40
-    assert_near(after.belief, mean, covariance, 0.3, 0.25)
+    assert_near(after.gaussian, mean, covariance, 0.3, 0.25)
 
 
 @pytest.mark.parametrize("seed", [10, 11])
@@ -128,7 +128,7 @@ def test_profile_carries_as_many_gaussians_as_it_takes():
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=10)
     end = PROFILE.update(view, single(state), state, 0).end
     assert 1 < end.mean.shape[1] <= 3
-    whole = single(end.belief)
+    whole = single(end.gaussian)
     points = np.concatenate([end.mean[0], whole.mean[0]])[None]
     assert np.abs(end.log_density(points) - whole.log_density(points)).max() > 0.05
 
@@ -346,8 +346,8 @@ def test_a_lost_mode_is_found_again(name):
         filter_, errors = MixtureFilter(rig.plant, rig.sensor, UPDATES[name]), []
         for k, exposure in enumerate(simulate(rig, 9, seed=seed)):
             if k == 5:
-                h = filter_.belief
-                filter_.belief = GaussianMixture(h.log_weight, -h.mean, 0.3 * h.covariance)
+                h = filter_.prior
+                filter_.prior = GaussianMixture(h.log_weight, -h.mean, 0.3 * h.covariance)
             model = exposure_model(rig.plant, exposure.n_steps)
             measured, _ = measure(rig, exposure, how)
             response = model.response(exposure.inputs)
@@ -368,7 +368,7 @@ def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
     assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
     assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
     end = view.reduced.end(Gaussian(mean[None], covariance[None]))
-    np.testing.assert_allclose(done.end.belief.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
+    np.testing.assert_allclose(done.end.gaussian.mean, end.mean, atol=0.25 * np.sqrt(end.covariance[0].max()))
 
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
@@ -412,7 +412,7 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
     filter_ = MixtureFilter(plant, rig.sensor, UPDATES[name])
     for _ in range(150):
         filter_.step(model, model.response(np.zeros((200, 1))), centred)
-    assert np.isfinite(filter_.belief.mean).all()
+    assert np.isfinite(filter_.prior.mean).all()
     # A posterior mean is trusted however unstable the plant is, and what would be without a camera is a number.
     assert (filter_.step(model, model.response(np.zeros((200, 1))), centred).status == Status.OK).all()
     assert np.isfinite(filter_._unseen.covariance).all()
