@@ -10,8 +10,12 @@ source or in the user's cache, and made when an estimator is made, not in the se
 
 from __future__ import annotations
 
-from contextlib import suppress
+import fcntl
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+
+_FOLDER = Path(__file__).parent
 
 
 def forget_stale(folder: Path) -> None:
@@ -26,4 +30,18 @@ def forget_stale(folder: Path) -> None:
                 kept.unlink(missing_ok=True)
 
 
-forget_stale(Path(__file__).parent)
+forget_stale(_FOLDER)
+
+
+@contextmanager
+def one_process_at_a_time() -> Iterator[None]:
+    """Compile while no other process does, so that the next one loads what this one has made.
+
+    Compiled code has the functions inside it that its process compiled as well, and calls those that it loaded, which
+    may round the last bit otherwise. Processes that compiled at the same time would each have some of the other's.
+    """
+    with ExitStack() as stack:
+        with suppress(OSError):  # nothing is kept where nothing can be written
+            lock = stack.enter_context(open(_FOLDER / "__pycache__" / "compiling.lock", "w"))
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
