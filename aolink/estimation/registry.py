@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
-from aolink.estimation.compiled import one_process_at_a_time
+from aolink.estimation.compiled import make_ready
 from aolink.estimation.estimator import Estimator
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import SpotWindows
@@ -195,16 +195,16 @@ def _moments_refusal(rig: Rig) -> str | None:
 
 
 def _warm_up(rig: Rig) -> None:
-    """Have a dark exposure of many spots estimated: what that compiles, a session need not wait for."""
+    """Have a dark exposure of many spots estimated: what that loads, a session need not wait for."""
     assert isinstance(rig.sensor, SpotSensor)
     steps = rig.timing.exposure_steps
     model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
     shape = (rig.plant.axes, rig.plant.n_outputs // 2, *rig.sensor.window)
     dark = SpotWindows(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
-    with one_process_at_a_time():
-        for each in (JointMoments, JointProfile):
-            blur_filter = BlurFilter(rig.plant, each(rig.sensor, rig.plant.n_outputs))
-            blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
+    make_ready()
+    for each in (JointMoments, JointProfile):
+        blur_filter = BlurFilter(rig.plant, each(rig.sensor, rig.plant.n_outputs))
+        blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
 
 
 def _profile(rig: Rig, options: Options) -> Filter:
@@ -236,8 +236,8 @@ def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
 
     pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
     # What profile compiles when a blur has several readings, mixture does at once.
-    with one_process_at_a_time():
-        pixels.warm_up(MIXTURE)
+    make_ready()
+    pixels.warm_up(MIXTURE)
     updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
     return pixels
 

@@ -11,11 +11,60 @@ source or in the user's cache, and made when an estimator is made, not in the se
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+import hashlib
+import subprocess
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 _FOLDER = Path(__file__).parent
+_COMPILE = f"""
+import sys
+
+sys.path.insert(0, {str(_FOLDER.parents[2])!r})
+
+from aolink.estimation import compiled, make_estimator
+from aolink.rig import load_rig
+
+compiled.compiles_itself = True
+make_estimator(load_rig("section-vi-lively"), "mixture")
+make_estimator(load_rig("membrane-12x12"), "profile")
+"""
+compiles_itself = False
+"""Whether this is the process that compiles for all others."""
+
+
+def make_ready(folder: Path = _FOLDER, program: str = _COMPILE) -> None:
+    """Have the loops compiled by a process of its own, once for this version and processor; all others load them.
+
+    A process that has compiled them itself would compute with other machine code than the next one, which loads what
+    was kept: their last bits may differ, and with them estimates online and offline. Where nothing can be kept, each
+    process compiles for itself.
+    """
+    if compiles_itself:
+        return
+    kept = folder / "__pycache__"
+    with suppress(OSError):
+        changed = max(source.stat().st_mtime for source in folder.glob("*.py"))
+        ready = kept / f"ready-{_machine()}"
+        if ready.exists() and ready.stat().st_mtime >= changed:
+            return
+        kept.mkdir(exist_ok=True)
+        with open(kept / "compiling.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # another process may be at it
+            if ready.exists() and ready.stat().st_mtime >= changed:
+                return
+            if subprocess.run([sys.executable, "-c", program], stdin=subprocess.DEVNULL).returncode == 0:
+                ready.touch()
+
+
+def _machine() -> str:
+    """What compiled code is bound to, as Numba has it: its own version, the processor and what that can do."""
+    import numba
+    from numba.core.registry import cpu_target
+
+    bound_to = (sys.version, numba.__version__, cpu_target.target_context.codegen().magic_tuple())
+    return hashlib.sha256(repr(bound_to).encode()).hexdigest()[:12]
 
 
 def forget_stale(folder: Path) -> None:
@@ -31,17 +80,3 @@ def forget_stale(folder: Path) -> None:
 
 
 forget_stale(_FOLDER)
-
-
-@contextmanager
-def one_process_at_a_time() -> Iterator[None]:
-    """Compile while no other process does, so that the next one loads what this one has made.
-
-    Compiled code has the functions inside it that its process compiled as well, and calls those that it loaded, which
-    may round the last bit otherwise. Processes that compiled at the same time would each have some of the other's.
-    """
-    with ExitStack() as stack:
-        with suppress(OSError):  # nothing is kept where nothing can be written
-            lock = stack.enter_context(open(_FOLDER / "__pycache__" / "compiling.lock", "w"))
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation import exposure_model, make_estimator
-from aolink.estimation.compiled import forget_stale, small
+from aolink.estimation.compiled import forget_stale, make_ready, small
 from aolink.estimation.frames.frame_data import Profile
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels import likelihood, modes
@@ -32,6 +32,21 @@ from aolink.rig import load_rig
 from aolink.simulation.model import simulate
 
 LIVELY = load_rig("section-vi-lively")
+
+
+def test_one_process_compiles_for_all_others_once_for_each_version_of_the_sources(tmp_path):
+    """What a process has compiled itself may differ in the last bit from what the others load."""
+    said, source = tmp_path / "said", tmp_path / "loops.py"
+    source.touch()
+    program = f"open({str(said)!r}, 'a').write('compiled ')"
+    make_ready(tmp_path, program)
+    make_ready(tmp_path, program)
+    assert said.read_text() == "compiled "
+    later = source.stat().st_mtime + 60
+    os.utime(source, (later, later))
+    make_ready(tmp_path, program + "; raise SystemExit(1)")  # it has failed, so that the next one tries again
+    make_ready(tmp_path, program)
+    assert said.read_text() == 3 * "compiled "
 
 
 def changed(rig, **sensor):
