@@ -14,7 +14,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import traceback
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -100,27 +99,16 @@ def serve(fileno: int) -> None:
 
 
 def _become(arguments: Sequence[str], folder: str, environment: Mapping[str, str], streams: Sequence[int]) -> NoReturn:
-    """Be the process of a command."""
-    code = 70
-    try:
-        for stream, fileno in enumerate(streams):
-            os.dup2(fileno, stream)
-        os.environ.clear()
-        os.environ.update(environment)
-        os.chdir(folder)
-        sys.path[0] = folder
-        sys.argv = ["aolink", *arguments]
-        code = 0
-        runpy.run_module("aolink", run_name="__main__", alter_sys=True)
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
-    except BaseException:
-        traceback.print_exc()
-        code = 1
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    """Be the process of a command, and end as that does."""
+    for stream, fileno in enumerate(streams):
+        os.dup2(fileno, stream)
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    sys.path[0] = folder
+    sys.argv = ["aolink", *arguments]
+    runpy.run_module("aolink", run_name="__main__", alter_sys=True)
+    sys.exit()
 
 
 def _received(source: socket.socket, size: int) -> bytes:
