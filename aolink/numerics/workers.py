@@ -125,6 +125,7 @@ def _until_ended(function: Callable[..., Result], *arguments: Any, **options: An
 
 def _end(pool: ProcessPoolExecutor) -> None:
     running = list((pool._processes or {}).values())
+    waiting = getattr(pool, "_call_queue", None)
     for process in running:
         process.terminate()
     pool.shutdown(wait=False, cancel_futures=True)
@@ -133,3 +134,5 @@ def _end(pool: ProcessPoolExecutor) -> None:
         process.join(max(0.0, deadline - time.monotonic()))
         process.kill()
         process.join(_PATIENCE_S)
+    if waiting is not None and not waiting._reader.closed:
+        waiting._reader.close()  # before Python 3.11.5 nobody does, and a call larger than a pipe is written for ever

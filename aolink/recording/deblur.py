@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from aolink.errors import RecordingError
 from aolink.estimation import Estimate, Scorer
 from aolink.exposure import Exposure
-from aolink.files import writing
+from aolink.files import check_target, writing
 from aolink.numerics.workers import processes
 from aolink.optics.scene import scene_motion
 from aolink.recording import convert, schemas_pb2, topics
@@ -67,6 +67,7 @@ def write_deblurred(
     """
     check_has_exposures(recording)
     find_method(method)
+    check_target(path, overwrite=overwrite, sources=[recording.path], error=RecordingError)
     made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
     held = next(made, None)  # whether the estimator can work shows before the file is made
     notes = {

@@ -84,6 +84,19 @@ def test_workers_that_have_nothing_to_do_end_as_well(tmp_path: Path) -> None:
     assert all_end(workers)
 
 
+def test_a_pool_ends_with_calls_waiting_that_are_larger_than_a_pipe(tmp_path: Path) -> None:
+    program = (
+        "from aolink.numerics.workers import processes\n"
+        "if __name__ == '__main__':\n"
+        "    with processes(1) as pool:\n"
+        "        for _ in range(4):\n"
+        "            pool.submit(len, bytes(10_000_000))\n"
+        "        raise SystemExit(7)\n"
+    )
+    (tmp_path / "program.py").write_text(program)
+    assert subprocess.run([sys.executable, "program.py"], cwd=tmp_path, timeout=_PATIENCE_S).returncode == 7
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 def test_what_a_terminal_sends_to_all_is_for_the_parent_alone(
     recorded: Session, tmp_path: Path, number: signal.Signals
