@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from aolink.errors import CalibrationError
-from aolink.optics.kernel import pixel_mass, pixel_mass_slope
+from aolink.optics.kernel import pixel_mass, pixel_masses
 from aolink.optics.sensor import Kernel, Sensor
 
 FloatArray = NDArray[np.float64]
@@ -225,8 +225,7 @@ def check_at_rest(
     kernel = Kernel(shape="gaussian", sigma=spot.sigma)
     position = np.array([spot.positions[number]])
     scale = spot.counts_per_density / sensor.pixel_width
-    profile = scale * pixel_mass(kernel, sensor.edges, position)[0, good]
-    slope = scale * pixel_mass_slope(kernel, sensor.edges, position)[0, good]
+    profile, slope = (scale * each[0, good] for each in pixel_masses(kernel.variance, sensor.edges, position, 1))
     read, gain = spot.noise
     weight = 1 / (read + gain * profile)
     # Independent pixels scatter by their own variances; a motion moves both flanks together, against each other.

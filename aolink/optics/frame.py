@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.optics.kernel import exposure_density, pixel_mass
+from aolink.optics.kernel import exposure_density, pixel_mass, pixel_masses
 from aolink.optics.plane import exposure_density_2d
 from aolink.optics.sensor import BaseSensor, Kernel, Sensor, SpotSensor
 
@@ -117,8 +117,5 @@ def _mass_table(sigma: float, pixel_edges: tuple[float, ...]) -> tuple[FloatArra
     edges = np.array(pixel_edges)
     step = sigma / _POINTS
     positions = edges[0] - _REACH * sigma + step * np.arange(_table_rows(sigma, edges))
-    u = (edges - positions[:, None]) / sigma
-    bell = np.exp(-u * u) / math.sqrt(math.pi)
-    first = -np.diff(bell, axis=1) / _POINTS
-    second = -np.diff(u * bell, axis=1) / _POINTS**2
-    return pixel_mass(Kernel(shape="gaussian", sigma=sigma), edges, positions), first, second
+    mass, first, second = pixel_masses(sigma**2 / 2, edges, positions, 2)
+    return mass, first * step, second * step**2 / 2

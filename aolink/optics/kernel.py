@@ -1,4 +1,7 @@
-"""The image kernel as pixels see it: integrated over them, averaged over an exposure."""
+"""The image kernel as pixels see it: integrated over them, averaged over an exposure.
+
+All integrals of a Gaussian up to an edge or over a pixel come from here; the compiled loops have a twin of their own.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,50 @@ from scipy.special import erf
 from aolink.optics.sensor import Kernel
 
 FloatArray = NDArray[np.float64]
+Integrals = list[FloatArray]
+
+
+def gaussian_below(
+    variance: FloatArray | float, edges: FloatArray, positions: FloatArray, highest: int = 0
+) -> Integrals:
+    """Share of a Gaussian spot that lies below each edge, less one half, and its derivatives by the position.
+
+    Parameters
+    ----------
+    variance:
+        Variance of each spot, slope units squared, (...), or one for all.
+    edges:
+        Slope units, (edges,).
+    positions:
+        Means of the spots, slope units, (...).
+    highest:
+        Highest derivative.
+
+    Returns
+    -------
+    Derivatives 0 to ``highest``, (..., edges) each: erf(u) / 2 and -H_(n-1)(u) exp(-u^2) / (sqrt(pi) width^n) with
+    u = (edge - position) / width, width^2 = 2 variance and H_n Hermite's polynomials.
+    """
+    width = np.sqrt(2 * np.asarray(variance))[..., None]
+    u = (edges - np.asarray(positions)[..., None]) / width
+    out = [erf(u) / 2]
+    if highest:
+        bell = np.exp(-u * u) / (math.sqrt(math.pi) * width)
+        out.append(-bell)
+        # H_n = 2u H_(n-1) - 2(n-1) H_(n-2), here over width^n.
+        before, last = np.zeros_like(u), np.ones_like(u)
+        for n in range(1, highest):
+            before, last = last, 2 * u / width * last - 2 * (n - 1) / width**2 * before
+            out.append(-last * bell)
+    return out
+
+
+def pixel_masses(variance: FloatArray | float, edges: FloatArray, positions: FloatArray, highest: int) -> Integrals:
+    """Share of a Gaussian spot's light that each pixel gets, and its derivatives by the position.
+
+    Parameters as of `gaussian_below`; gives derivatives 0 to ``highest``, (..., pixels) each.
+    """
+    return [np.diff(each, axis=-1) for each in gaussian_below(variance, edges, positions, highest)]
 
 
 def pixel_mass(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> FloatArray:
@@ -31,14 +78,7 @@ def pixel_mass(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> Floa
     ----------
     Mishra & Wen (3), with the kernel's constant corrected to 1/(sigma sqrt(pi)), which makes it of unit mass.
     """
-    below = erf((edges - np.asarray(positions)[..., None]) / kernel.sigma) / 2
-    return np.diff(below, axis=-1)
-
-
-def pixel_mass_slope(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> FloatArray:
-    """Derivative of `pixel_mass` by the position, one over slope units, (..., pixels)."""
-    distance = (edges - np.asarray(positions)[..., None]) / kernel.sigma
-    return -np.diff(np.exp(-(distance**2)), axis=-1) / (kernel.sigma * math.sqrt(math.pi))
+    return pixel_masses(kernel.variance, edges, positions, 0)[0]
 
 
 def exposure_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatArray:

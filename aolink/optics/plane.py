@@ -9,7 +9,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
+
+from aolink.optics.kernel import pixel_masses
 
 FloatArray = NDArray[np.float64]
 
@@ -57,8 +58,7 @@ def pixel_mass_2d(
     across = np.exp(-(away**2) / (2 * xx)) / math.sqrt(2 * math.pi * xx) * half[:, None] * weights
     # Given x, y is Gaussian about a line, with what x does not explain of its variance.
     line = positions[..., 1, None, None] + xy / xx * away
-    sd = math.sqrt(2 * (yy - xy**2 / xx))
-    along = np.diff(erf((y_edges - line[..., None]) / sd) / 2, axis=-1)  # (..., columns, nodes, rows)
+    (along,) = pixel_masses(yy - xy**2 / xx, y_edges, line, 0)  # (..., columns, nodes, rows)
     return np.asarray(np.einsum("...cn,...cnr->...rc", across, along))
 
 

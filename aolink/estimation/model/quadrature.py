@@ -16,11 +16,11 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.kernel import gaussian_below
 from aolink.optics.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
@@ -150,12 +150,12 @@ def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution
     """
     n_steps = paths.shape[1]
     paths = paths - paths.mean(axis=1, keepdims=True)
-    edges = (sensor.edges - sensor.edges.mean()) / math.sqrt(2 * variance)
+    edges = sensor.edges - sensor.edges.mean()
 
     def light(q: QuadratureRule) -> FloatArray:
         left: FloatArray = np.zeros((len(paths), len(edges)))
-        for w, place in zip(q.weights, q.at(paths).T / math.sqrt(2 * variance), strict=True):
-            left += w / 2 * erf(edges - place[:, None])
+        for w, place in zip(q.weights, q.at(paths).T, strict=True):
+            left += w * gaussian_below(variance, edges, place)[0]
         return np.diff(left, axis=1) / sensor.pixel_width
 
     right = light(blocks(n_steps, n_steps))

@@ -28,7 +28,6 @@ from typing import Generic, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
 from aolink.estimation.frames.moments import LEAST_FLUX
@@ -38,6 +37,7 @@ from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.quadrature import QuadraturePaths, blocks, quadrature_paths
 from aolink.numerics import batched
 from aolink.optics.camera import effective_noise_density
+from aolink.optics.kernel import gaussian_below
 from aolink.optics.sensor import BaseSensor, Sensor
 
 FloatArray = NDArray[np.float64]
@@ -317,20 +317,12 @@ def expected_response(
     mean, variance:
         (..., nodes)
     """
-    width = np.sqrt(2 * kernel_variance + 2 * variance)[..., None]
-    u = (edges - mean[..., None]) / width
-    bell = np.exp(-u * u) / (math.sqrt(math.pi) * width)
     # The sum over pixels of W_i times a difference of edges, summed by edges instead.
     padded = np.zeros((*W.shape[:-1], W.shape[-1] + 2))
     padded[..., 1:-1] = W
     steps = batched.transpose(-np.diff(padded, axis=-1))
-    derivatives = [erf(u) / 2, -bell]
-    # Hermite's polynomials: H_n = 2u H_(n-1) - 2(n-1) H_(n-2), here over width^n.
-    before, last = np.zeros_like(u), np.ones_like(u)
-    for n in range(1, highest):
-        before, last = last, 2 * u / width * last - 2 * (n - 1) / width**2 * before
-        derivatives.append(-last * bell)
-    return [batched.matmul(d, steps) for d in derivatives[: highest + 1]]
+    below = gaussian_below(kernel_variance + variance, edges, mean, highest)
+    return [batched.matmul(each, steps) for each in below]
 
 
 def _arrays(correction: Update) -> tuple[FloatArray, ...]:

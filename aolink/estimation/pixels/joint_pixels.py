@@ -30,10 +30,11 @@ from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
 from aolink.estimation.moments.joint_moments import JointMoments, by_spot
-from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, next_damping
-from aolink.estimation.pixels.likelihood import mehler_series, pixel_masses
+from aolink.estimation.pixels.levenberg_marquardt import Indices, Points, minimise
+from aolink.estimation.pixels.likelihood import mehler_series
 from aolink.numerics import information, single_thread
 from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.kernel import pixel_masses
 from aolink.optics.sensor import SpotSensor
 
 FloatArray = NDArray[np.float64]
@@ -136,38 +137,25 @@ def find_mode(
     view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray, passes: int = _PASSES
 ) -> Mode:
     """Where a start leads, for a prior with this mean and information."""
-    paths, damping = view.paths, FIRST_DAMPING
+    paths = view.paths
 
-    def pulled(t: FloatArray, log_likelihood: float) -> tuple[FloatArray, float]:
-        """By the prior, and the objective."""
-        pull = single_thread.matvec(precision, t - mean)
-        return pull, 0.5 * float((t - mean) @ pull) - log_likelihood
+    def at(t: FloatArray, _: Indices) -> Points:
+        near = view.at(t[0])
+        pull = single_thread.matvec(precision, t[0] - mean)
+        objective = 0.5 * float((t[0] - mean) @ pull) - near.log_likelihood
+        kept = np.empty(1, dtype=object)
+        kept[0] = near
+        H = precision + paths.information(near.information)
+        return Points(np.array([objective]), (paths.score(near.score) - pull)[None], H[None], kept)
 
-    t, at, used = start, view.at(start), 1
-    pull, now = pulled(t, at.log_likelihood)
-    H = precision + paths.information(at.information)
-    while used < passes:
-        g = paths.score(at.score) - pull
-        damped = H.copy()
-        np.fill_diagonal(damped, np.diagonal(H) * (1 + damping))
-        step = information.solve(damped, g)
-        free = damping <= FREE_DAMPING
-        # What a step would gain says when it is at a mode, before the pixels are linearised again.
-        if free and 0.5 * step @ g < _CONVERGED:
-            break
-        there = view.at(t + step)
-        used += 1
-        pull_there, value = pulled(t + step, there.log_likelihood)
-        if value < now:
-            gain, now, t, at, pull = now - value, value, t + step, there, pull_there
-            H, damping = precision + paths.information(at.information), float(next_damping(damping, True))
-            if free and gain < _CONVERGED:
-                break
-        else:
-            damping = float(next_damping(damping, False))
-            if damping > LARGEST_DAMPING:
-                break
-    return Mode(t, H, now, used, at)
+    # What a step would gain says when it is at a mode, before the pixels are linearised again.
+    (t,), found, asked = minimise(at, start[None], passes - 1, _CONVERGED, foreseen=_CONVERGED, solve=_solve)
+    assert found.linearised is not None
+    return Mode(t, found.hessian[0], float(found.objective[0]), asked, found.linearised[0])
+
+
+def _solve(a: FloatArray, x: FloatArray) -> FloatArray:
+    return np.stack([information.solve(*each) for each in zip(a, x, strict=True)])
 
 
 class JointProfile:

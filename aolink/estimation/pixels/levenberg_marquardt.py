@@ -1,16 +1,21 @@
-"""The damping of Levenberg and Marquardt's method, for all searches for a mode.
+"""Levenberg and Marquardt's method, for all searches for a mode but the compiled one (`compiled.modes`, its twin).
 
-A step solves (H + damping diag H) step = gradient. The searches differ in what they linearise and in when they are
-done: `modes.find_modes` follows many starts at once, with a compiled twin for line sensors, `joint_pixels.find_mode`
-one start of hundreds of coefficients. Marquardt, J. SIAM 11 (1963) 431.
+A step solves (H + damping diag H) step = g, where g is minus the objective's gradient and H is its Hessian, or Fisher's
+information in the place of that. A step that makes the objective smaller is taken and the damping falls; else the
+damping grows. Marquardt, J. SIAM 11 (1963) 431.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 FIRST_DAMPING = 0.01
 LARGEST_DAMPING = 1e6
@@ -19,6 +24,77 @@ FREE_DAMPING = 0.1
 """Up to this a short step says that a mode is near; with more it is the damping that makes it short."""
 
 
-def next_damping(damping: FloatArray | float, better: NDArray[np.bool_] | bool) -> FloatArray:
-    """An eighth where the step made the objective smaller; eight times as much, and no less than that, where not."""
-    return np.where(better, np.divide(damping, 8), np.maximum(damping, 1e-3) * 8)
+@dataclass(frozen=True, eq=False)
+class Points:
+    """The objective about some points."""
+
+    objective: FloatArray
+    """(points,)"""
+    descent: FloatArray
+    """Minus the gradient, (points, n)."""
+    hessian: FloatArray
+    """Positive definite, (points, n, n)."""
+    linearised: NDArray[Any] | None = None
+    """What the caller wants to keep of each point, (points,)."""
+
+
+def solve(a: FloatArray, x: FloatArray) -> FloatArray:
+    """a^-1 x of small matrices, (points, n, n) and (points, n)."""
+    return np.asarray(np.linalg.solve(a, x[..., None])[..., 0])
+
+
+def minimise(
+    at: Callable[[FloatArray, Indices], Points], starts: FloatArray, passes: int, converged: float, *,
+    foreseen: float = 0.0, solve: Callable[[FloatArray, FloatArray], FloatArray] = solve,
+) -> tuple[FloatArray, Points, int]:  # fmt: skip
+    """Where each of many starts leads; each one's way does not depend on the others.
+
+    Parameters
+    ----------
+    at:
+        The objective about points, one a row, and which of the starts each row comes from.
+    starts:
+        (starts, n)
+    passes:
+        Steps that are tried at most.
+    converged:
+        A start is done when a step changes the objective by less than this.
+    foreseen:
+        Or when a step is foreseen to change it by less than this: such a step is not tried.
+    solve:
+        For systems with positive definite matrices, (points, n, n) and (points, n).
+
+    Returns
+    -------
+    The points (starts, n), what is known about them, and how often ``at`` was asked.
+    """
+    x, active, asked = starts.copy(), np.arange(len(starts)), 1
+    here = at(x, active)
+    damping = np.full(len(x), FIRST_DAMPING)
+    for _ in range(passes):
+        H, g = here.hessian[active], here.descent[active]
+        diagonal = np.einsum("rii->ri", H)
+        before = damping[active]
+        diagonal += before[:, None] * diagonal
+        step = solve(H, g)
+        slope = np.einsum("kn,kn->k", step, g)
+        free = before <= FREE_DAMPING
+        going_on = ~(free & (slope / 2 < foreseen))
+        active, step, slope, free, before = (each[going_on] for each in (active, step, slope, free, before))
+        if not len(active):
+            break
+        there, asked = at(x[active] + step, active), asked + 1
+        gain = here.objective[active] - there.objective
+        better = gain > 0
+        took = active[better]
+        x[took] += step[better]
+        for each in fields(Points):
+            if (old := getattr(here, each.name)) is not None:
+                old[took] = getattr(there, each.name)[better]
+        # An eighth where the step made the objective smaller; eight times as much, and no less than that, where not.
+        damping[active] = np.where(better, before / 8, np.maximum(before, 1e-3) * 8)
+        settled = free & ((better & (gain < converged)) | (slope < converged))
+        active = active[~(settled | (damping[active] > LARGEST_DAMPING))]
+        if not len(active):
+            break
+    return x, here, asked

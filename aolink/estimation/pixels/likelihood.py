@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
@@ -32,6 +31,7 @@ from aolink.estimation.moments.windowed import Regression, Windowed, WindowedMom
 from aolink.numerics import batched
 from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import effective_noise_density, shot_gain
+from aolink.optics.kernel import pixel_masses
 from aolink.optics.sensor import BaseSensor
 
 if TYPE_CHECKING:
@@ -352,20 +352,3 @@ def _light_table(variance: float, pixel: float) -> FloatArray:
     places = (np.arange(points) + 0.5) * pixel / points
     masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, 3)
     return np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)
-
-
-def pixel_masses(variance: float, edges: FloatArray, positions: FloatArray, highest: int) -> list[FloatArray]:
-    """Share of the light of a Gaussian spot that each pixel gets, and its derivatives by the position.
-
-    (..., nodes) -> (..., nodes, pixels), 0 to ``highest``.
-    """
-    width = math.sqrt(2 * variance)
-    u = (edges - positions[..., None]) / width
-    out = [np.diff(erf(u) / 2, axis=-1)]
-    if highest:
-        bell = np.exp(-u * u) / (math.sqrt(math.pi) * width)
-        before, last = np.zeros_like(u), np.ones_like(u)
-        for n in range(1, highest + 1):
-            out.append(-np.diff(last * bell, axis=-1))
-            before, last = last, 2 * u / width * last - 2 * (n - 1) / width**2 * before
-    return out

@@ -25,7 +25,14 @@ from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
 from aolink.estimation.pixels.filter import Innovation
 from aolink.estimation.pixels.gaussian_mixture import cholesky, lower_inverse
-from aolink.estimation.pixels.levenberg_marquardt import FIRST_DAMPING, FREE_DAMPING, LARGEST_DAMPING, next_damping
+from aolink.estimation.pixels.levenberg_marquardt import (
+    FIRST_DAMPING,
+    FREE_DAMPING,
+    LARGEST_DAMPING,
+    Indices,
+    Points,
+    minimise,
+)
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
 
@@ -93,38 +100,19 @@ def find_modes(
         )
     rows = view.part(np.repeat(np.arange(axes), count))
     m, L = prior.mean.reshape(-1, 1, n), cholesky(prior.covariance.reshape(-1, n, n))
-    s = starts.reshape(-1, n)
-    at = _at(rows, m, L, s)
-    damping = np.full(len(s), FIRST_DAMPING)
-    active = np.arange(len(s))
-    for _ in range(passes):
-        if not len(active):
-            break
-        H, g, now = at.H[active], at.g[active], at.objective[active]
-        scale = np.einsum("rii->ri", H)
-        damped = H + (damping[active][:, None] * scale)[..., None] * np.eye(n)
-        step = np.linalg.solve(damped, g[..., None])[..., 0]
-        there = _at(rows.part(active), m[active], L[active], s[active] + step)
-        gain = now - there.objective
-        better = gain > 0
-        took = active[better]
-        s[took] += step[better]
-        for mine, theirs in ((at.H, there.H), (at.g, there.g), (at.objective, there.objective)):
-            mine[took] = theirs[better]
-        before = damping[active]
-        damping[active] = next_damping(damping[active], better)
-        free = before <= FREE_DAMPING
-        settled = (free & better & (gain < converged)) | (free & (batched.dot(step, g) < converged))
-        settled |= damping[active] > LARGEST_DAMPING
-        active = active[~settled]
-    covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(at.H), dtype=np.float64)))
-    _, log_H = np.linalg.slogdet(at.H)
-    evidence = -at.objective - 0.5 * log_H
+
+    def at(s: FloatArray, which: Indices) -> Points:
+        return _at(rows.part(which), m[which], L[which], s)
+
+    s, found, _ = minimise(at, starts.reshape(-1, n), passes, converged)
+    covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(found.hessian), dtype=np.float64)))
+    _, log_H = np.linalg.slogdet(found.hessian)
+    evidence = -found.objective - 0.5 * log_H
     mean = m[:, 0] + batched.matvec(L, s)
     shape = (axes, count)
     return Modes(
         mean.reshape(*shape, n), batched.symmetric(covariance).reshape(*shape, n, n), evidence.reshape(shape),
-        batched.dot(s, s).reshape(shape), at.objective.reshape(shape),
+        batched.dot(s, s).reshape(shape), found.objective.reshape(shape),
     )  # fmt: skip
 
 
@@ -165,21 +153,14 @@ def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
     return with_reversals(view, prior, found)
 
 
-@dataclass(frozen=True, eq=False)
-class _Point:
-    H: FloatArray
-    g: FloatArray
-    objective: FloatArray
-
-
-def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> _Point:
+def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
     """Information, gradient and objective at whitened coordinates, one start a row."""
     f, J = rows.linearised(m + batched.matvec(L, s)[:, None])
     score, information = rows.information(f)
     J = batched.long_matmul(J[:, 0], L)
     H = batched.long_matmul(batched.transpose(J) * information, J) + np.eye(s.shape[1])
     g = batched.matvec(batched.transpose(J), score[:, 0]) - s
-    return _Point(batched.symmetric(H), g, 0.5 * batched.dot(s, s) - rows.log_likelihood(f)[:, 0])
+    return Points(0.5 * batched.dot(s, s) - rows.log_likelihood(f)[:, 0], g, batched.symmetric(H))
 
 
 def without_repeats(modes: Modes) -> Modes:
