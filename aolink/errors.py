@@ -67,3 +67,9 @@ class RestorationError(AolinkError):
     """A picture or a point spread function that cannot be restored with, or not by the method asked for."""
 
     exit_code = 10
+
+
+class ImportingError(AolinkError):
+    """A film or a telemetry file that cannot be read, or that is not what the rig file describes."""
+
+    exit_code = 11

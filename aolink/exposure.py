@@ -20,7 +20,10 @@ from aolink.rig import Rig
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """What really happened in one exposure; only simulated rigs know it, and no estimator reads it."""
+    """What really happened in one exposure: a simulated rig knows it, or single frames of a film. No estimator reads it.
+
+    States that nobody knows are NaN.
+    """
 
     start_state: NDArray[np.float64]
     """State at the exposure's first fast step, (axes, n_states)."""
@@ -28,6 +31,8 @@ class Truth:
     """State one fast step after the exposure's last one, (axes, n_states)."""
     path: NDArray[np.float64]
     """Output at each fast step of the exposure, slope units, (n_outputs, n_steps)."""
+    path_sd: float = 0.0
+    """Standard deviation of an error in ``path``, slope units: zero of a simulated rig, more where it was measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

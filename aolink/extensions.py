@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -27,3 +29,12 @@ def described(point: EntryPoint, kind: str) -> str:
     """An entry point as an error names it."""
     package = f" of {point.dist.name}" if point.dist else ""
     return f"the {kind} {point.name}{package} ({point.value})"
+
+
+@contextmanager
+def needs_extra(extra: str, error: type[AolinkError]) -> Iterator[None]:
+    """Around the import of an optional package: raises ``error``, which says what to install, where it is missing."""
+    try:
+        yield
+    except ImportError as missing:
+        raise error(f"this needs {missing.name}: pip install 'aolink[{extra}]'") from None

@@ -142,12 +142,14 @@ class Scorer:
         truth = exposure.truth
         if truth is None:
             return
-        at_start, at_end = estimate.start_state - truth.start_state, estimate.end_state - truth.end_state
         self._exposures += 1
+        self._path.add(np.mean((estimate.path - truth.path) ** 2, keepdims=True))
+        at_start, at_end = estimate.start_state - truth.start_state, estimate.end_state - truth.end_state
+        if not (np.isfinite(at_start).all() and np.isfinite(at_end).all()):
+            return  # the truth of a film is its path
         self._states += at_start.size
         self._start.add((at_start**2).sum(axis=1))
         self._end.add((at_end**2).sum(axis=1))
-        self._path.add(np.mean((estimate.path - truth.path) ** 2, keepdims=True))
         self._start_nees.add(_normalised(at_start, estimate.start_covariance))
         self._end_nees.add(_normalised(at_end, estimate.end_covariance))
 

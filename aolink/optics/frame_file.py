@@ -1,4 +1,4 @@
-"""A frame from a file: a two-dimensional FITS image, compressed or not, or NumPy's .npy."""
+"""Frames from a file: a FITS image or a cube of them, compressed or not, or NumPy's .npy."""
 
 from __future__ import annotations
 
@@ -43,21 +43,42 @@ def read_frame(path: str | Path) -> NDArray[np.float64]:
 
 
 def parse_fits(data: bytes) -> NDArray[np.float64]:
-    """The primary image of a FITS file with two axes; Pence et al., Astron. Astrophys. 524, A42 (2010).
+    """The primary image of a FITS file with two axes.
 
     Raises
     ------
     FrameError
         It is not such a file.
     """
-    if not data.startswith(b"SIMPLE  ="):
+    _, stored, scale, zero = parse_fits_array(data)
+    if stored.ndim != 2:
+        raise FrameError(
+            f"its primary image has the shape {stored.shape}, expected two axes: take the picture out of it"
+        )
+    return np.asarray(stored * scale + zero)
+
+
+def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[np.generic], float, float]:
+    """The primary array of a FITS file; Pence et al., Astron. Astrophys. 524, A42 (2010).
+
+    Returns
+    -------
+    The header's values as text, by their keys; the array as it is stored, its axes in NumPy's order; and BSCALE and
+    BZERO, so that the values are ``array * BSCALE + BZERO``.
+
+    Raises
+    ------
+    FrameError
+        It is not such a file.
+    """
+    if not data[:9] == b"SIMPLE  =":
         raise FrameError("it is not a FITS file: it does not begin with SIMPLE")
     values, start = {}, 0
-    while (card := data[start : start + _CARD])[:8].rstrip() != b"END":
+    while (card := bytes(data[start : start + _CARD]))[:8].rstrip() != b"END":
         if len(card) < _CARD:
             raise FrameError("its header has no END: the file is cut off")
         if card[8:10] == b"= ":
-            values[card[:8].decode("latin-1").rstrip()] = card[10:].split(b"/")[0].decode("latin-1").strip()
+            values[card[:8].decode("latin-1").rstrip()] = _value(card[10:].decode("latin-1"))
         start += _CARD
     start = (start // _BLOCK + 1) * _BLOCK
     try:
@@ -67,9 +88,17 @@ def parse_fits(data: bytes) -> NDArray[np.float64]:
         scale, zero = (float(values.get(key, default)) for key, default in (("BSCALE", "1"), ("BZERO", "0")))
     except (KeyError, ValueError) as error:
         raise FrameError(f"its header has no usable {error}") from None
-    if len(shape) != 2 or min(shape) < 1:
-        raise FrameError(f"its primary image has the shape {shape}, expected two axes: take the picture out of it")
+    if not shape or min(shape) < 1:
+        raise FrameError(f"its primary array has the shape {shape}: there is no picture in it")
     count = math.prod(shape)
     if len(data) - start < count * np.dtype(kind).itemsize:
-        raise FrameError(f"it is cut off: {shape[0]} x {shape[1]} pixels are announced")
-    return np.frombuffer(data, kind, count, start).reshape(shape) * scale + zero
+        raise FrameError(f"it is cut off: {' x '.join(map(str, shape))} pixels are announced")
+    return values, np.frombuffer(data, kind, count, start).reshape(shape), scale, zero
+
+
+def _value(text: str) -> str:
+    """A header's value without its comment and its quotes."""
+    text = text.strip()
+    if text.startswith("'"):
+        return text[1:].split("'")[0].strip()
+    return text.split("/")[0].strip()

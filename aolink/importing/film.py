@@ -1,0 +1,41 @@
+"""A film: frames of a camera from anywhere, one after the other, and what their file says of their times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Frame = NDArray[np.generic]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Film:
+    """Frames of one size, read when they are asked for, and what is known about them."""
+
+    name: str
+    """What it was made from."""
+    shape: tuple[int, int]
+    """Rows and columns of a frame."""
+    dtype: np.dtype[np.generic]
+    """Type of the pixels, as they are stored."""
+    count: int
+    """Frames."""
+    frames: Callable[[], Iterator[Frame]]
+    """The frames from the first on, (rows, columns) each."""
+    rate_hz: float | None = None
+    """Frames a second, where the file says it."""
+    exposure_s: float | None = None
+    """How long each frame was exposed, where the file says it."""
+    start_ns: int | None = None
+    """When the first exposure began, ns since 1970, where the file says it."""
+    times_ns: NDArray[np.int64] | None = None
+    """When each exposure began, ns from any beginning, where the file says it, (count,)."""
+    inputs: NDArray[np.float64] | None = None
+    """What the mirror held in each fast step, where the file has it, (steps, n_inputs)."""
+    nonlinear: str = ""
+    """Why pixel values may not be proportional to light; empty where nothing speaks against it."""
+    notes: tuple[str, ...] = field(default=())
+    """What a user should know about how it was read."""

@@ -1,0 +1,222 @@
+"""A first rig file for a film: the kernel, noise and plant that its single frames show, each with its uncertainty."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from aolink.errors import ImportingError
+from aolink.importing.exposures import Settings
+from aolink.importing.film import Film
+from aolink.importing.tracking import STRAY, Survey, find_objects, reach, survey
+
+FloatArray = NDArray[np.float64]
+
+_COUNTS = 40_000
+"""Counts of the brightest pixel of a resting spot, above black; there are 65,535."""
+_BLACK = 8000
+_LEAST_WINDOW = 12
+_ANYWHERE = 0.1
+"""Variance of the place of an object in its window before it is seen, slope units squared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A walk or an Ornstein-Uhlenbeck process that fits how objects move from frame to frame.
+
+    x(k+1) = a x(k) + w(k), Var w = q; a frame shows x with an error of variance r. All by maximum likelihood.
+    """
+
+    a: float
+    """One for a random walk."""
+    a_sd: float
+    q: float
+    """Variance of a step, pixels squared."""
+    q_sd: float
+    r: float
+    """Variance of the error of a place, pixels squared."""
+    spread: float
+    """Standard deviation of the places about their mean, pixels."""
+
+
+def fit_motion(places: FloatArray) -> Motion:
+    """Fit series of places along one direction each, (frames, series), pixels; NaN where nothing was seen.
+
+    Of a random walk and an Ornstein-Uhlenbeck process (a < 1) the latter is taken where it explains the series better by
+    more than its parameters account for (Bayesian information criterion).
+
+    Raises
+    ------
+    ImportingError
+        There are too few places.
+    """
+    seen = np.isfinite(places)
+    if seen.sum() < 20 or len(places) < 10:
+        raise ImportingError(f"{int(seen.sum())} places are too few to fit a motion to: 20 or more are needed")
+    steps = np.diff(places, axis=0)
+    start = math.log(max(float(np.nanvar(steps)), 1e-12))
+
+    def cost(values: FloatArray, bound: bool) -> float:
+        q, r = math.exp(values[0]), math.exp(values[1])
+        a = 1 / (1 + math.exp(-values[2])) if bound else 1.0
+        return _negative_log_likelihood(places, a, q, r)
+
+    walk = optimize.minimize(cost, [start, start - 2], args=(False,), method="Nelder-Mead")
+    bound = optimize.minimize(cost, [*walk.x, 3.0], args=(True,), method="Nelder-Mead", options={"maxiter": 600})
+    # The mean of each series is a parameter of the second, too.
+    penalty = (1 + places.shape[1]) * math.log(int(seen.sum())) / 2
+    is_bound = bound.fun + penalty < walk.fun
+    best = bound.x if is_bound else walk.x
+    variances = _inverse_curvature(lambda values: cost(values, is_bound), best)
+    a = 1 / (1 + math.exp(-best[2])) if is_bound else 1.0
+    q = math.exp(best[0])
+    a_sd = a * (1 - a) * math.sqrt(variances[2]) if is_bound else 0.0
+    spread = float(np.sqrt(np.nanmean((places - np.nanmean(places, axis=0)) ** 2)))
+    return Motion(a=a, a_sd=a_sd, q=q, q_sd=q * math.sqrt(variances[0]), r=math.exp(best[1]), spread=spread)
+
+
+def _negative_log_likelihood(places: FloatArray, a: float, q: float, r: float) -> float:
+    """Of a Kalman filter for all series at once; an Ornstein-Uhlenbeck process is about each series' mean."""
+    y = places - np.nanmean(places, axis=0) if a < 1 else places
+    seen = np.isfinite(y)
+    first = np.argmax(seen, axis=0)
+    x = np.where(seen.any(axis=0), y[first, np.arange(y.shape[1])], 0.0) if a == 1 else np.zeros(y.shape[1])
+    P = np.full(y.shape[1], q / (1 - a * a) if a < 1 else r + q)
+    total = 0.0
+    for k, row in enumerate(y):
+        use = seen[k] & (k > first) if a == 1 else seen[k]
+        S = P + r
+        innovation = np.where(use, row - x, 0.0)
+        total += float((np.log(2 * np.pi * S) + innovation**2 / S)[use].sum()) / 2
+        gain = np.where(use, P / S, 0.0)
+        x, P = a * (x + gain * innovation), a * a * P * (1 - gain) + q
+    return total
+
+
+def _inverse_curvature(cost: object, at: FloatArray) -> FloatArray:
+    """Diagonal of the inverse of the Hessian by differences: variances of what maximises a likelihood."""
+    n, h = len(at), 0.05
+    f: object = cost
+
+    def value(x: FloatArray) -> float:
+        return float(f(x))  # type: ignore[operator]
+
+    H = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for a in (1, -1):
+                for b in (1, -1):
+                    x = np.array(at, dtype=np.float64)
+                    x[i] += a * h
+                    x[j] += b * h
+                    total += a * b * value(x)
+            H[i, j] = total / (4 * h * h)
+    return np.clip(np.diagonal(np.linalg.pinv(H)), 0.0, None)
+
+
+def first_rig(film: Film, settings: Settings, name: str) -> str:
+    """The text of a rig file for the objects of a film (``settings.track`` of them), to be imported by the same settings.
+
+    The slope unit is half a window. The plant has a copy for each object and direction; its input is the shift of the
+    window that follows the object.
+
+    Raises
+    ------
+    ImportingError
+        There are not so many objects, or nothing says the frame rate.
+    """
+    objects = find_objects(film, settings)
+    known = survey(film, settings, objects)
+    rate = settings.rate_hz or film.rate_hz
+    if rate is None and film.times_ns is not None and film.count > 1:
+        rate = 1e9 / float(np.median(np.diff(film.times_ns)))
+    if rate is None:
+        raise ImportingError(f"nothing says how many frames a second {film.name} has: give --rate")
+    places = known.places.reshape(len(known.places), -1)
+    motion = fit_motion(places)
+    K = settings.frames_per_exposure
+    # The window moves before its object has strayed too far from the middle.
+    side = max(_LEAST_WINDOW, 2 * math.ceil(reach(known, K) / (1 - 2 * STRAY)))
+    return _text(film, settings, name, known, motion, side, rate)
+
+
+def _text(
+    film: Film, settings: Settings, name: str, known: Survey, motion: Motion, side: int, rate: float
+) -> str:  # fmt: skip
+    unit = side / 2  # pixels
+    n, K = settings.track, settings.frames_per_exposure
+    sigma, sigma_sd = known.sd * math.sqrt(2) / unit, known.sd_sd * math.sqrt(2) / unit
+    area = (2 / side) ** 2
+    read, read_sd, electrons = _noise(known, 2 / side)
+    peak = 1 / (2 * math.pi * (sigma**2 / 2 + area / 12))
+    step_ns = round(1e9 / rate)
+    walk = motion.a == 1
+    if walk:
+        A, B, B_w, C = "[[1.0]]", "[[1.0]]", "[[1.0]]", "[[1.0]]"
+        kind, initial = "random walk", f"[[{_ANYWHERE}]]"
+    else:  # the window's shifts add up in a state of their own
+        A, B, B_w, C = f"[[{motion.a:.8g}, 0.0], [0.0, 1.0]]", "[[0.0], [1.0]]", "[[1.0], [0.0]]", "[[1.0, 1.0]]"
+        variance = motion.q / (1 - motion.a**2) / unit**2
+        kind, initial = "Ornstein-Uhlenbeck process", f"[[{variance:.4g}, 0.0], [0.0, {_ANYWHERE}]]"
+    memory = "" if walk else f"; a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
+    return f"""# Written by `aolink rig --from {film.name}`: what the film's single frames show. +- is one standard deviation.
+name = "{name}"
+summary = "{n} objects of {film.name}, each in a window of {side} pixels that follows it; the slope unit is {unit:g} pixels."
+
+[plant]               # a copy for each object along x and along y: {kind}{memory}
+axes = {2 * n}
+A = {A}
+B = {B}           # the input shifts the window
+B_w = {B_w}
+C = {C}
+process_noise = {motion.q / unit**2:.6g}  # +- {motion.q_sd / unit**2:.2g}: a step of {math.sqrt(motion.q):.4g} pixels rms from frame to frame
+initial_covariance = {initial}
+
+[timing]
+fast_step_s = {step_ns / 1e9!r}  # {rate:.6g} frames/s
+exposure_steps = {K}
+frame_period_steps = {K}
+
+[sensor]
+kind = "spots"
+grid = [1, {n}]
+window = [{side}, {side}]
+field = [-1.0, 1.0]
+noise_density = {read:.6g}  # +- {read_sd:.2g}: what the Gaussian leaves of single frames
+bit_depth = 16
+black_level = {_BLACK}
+counts_per_density = {_COUNTS / peak:.6g}
+photoelectrons = {electrons:.4g}
+
+[sensor.kernel]
+shape = "gaussian"
+sigma = {sigma:.6g}  # +- {sigma_sd:.2g}: {known.sd:.4g} pixels rms in one direction
+
+[mirror]              # the shift of each window, of which the importer makes the inputs
+input_min = -4.0
+input_max = 4.0
+dac_bits = 0
+block_steps = 1
+queue_steps = 16
+"""
+
+
+def _noise(known: Survey, width: float) -> tuple[float, float, float]:
+    """V of a window two slope units wide, its standard deviation, and electrons of a spot (0: many).
+
+    Variances of the residuals of sums over a window's rows and columns, against the light there, by least squares.
+    """
+    square, light = (known.residual / width) ** 2, np.maximum(known.model / width, 0.0)
+    columns = np.column_stack([np.ones(len(light)), light])
+    (read, gain), *_ = np.linalg.lstsq(columns, square, rcond=None)
+    errors = square - columns @ np.array([read, gain])
+    read_sd, gain_sd = np.sqrt(np.diagonal(np.linalg.inv(columns.T @ columns)) * errors.var())
+    density = width / 2  # of V on a line and across it
+    if gain > 3 * gain_sd and read > 0:
+        return float(read * density), float(read_sd * density), float(1 / (gain * width))
+    return float(square.mean() * density), float(square.std() / math.sqrt(len(square)) * density), 0.0

@@ -1,0 +1,91 @@
+"""A film becomes a recording like any other."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
+
+from google.protobuf.message import Message
+
+from aolink.errors import ImportingError, RecordingError
+from aolink.files import check_target, open_unfinished, writing
+from aolink.importing.exposures import Account, ImportedExposure, Settings, imported
+from aolink.importing.film import Film
+from aolink.recording import convert, topics
+from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
+from aolink.recording.writer import begin_recording
+from aolink.rig import Rig
+from aolink.wire.messages_pb2 import Applied, Truth
+
+_AT_ONCE = 65_536
+"""Numbers in one report of inputs."""
+
+
+def import_film(
+    film: Film, rig: Rig, settings: Settings, path: Path, *, overwrite: bool = False,
+    progress: Callable[[int], None] = lambda exposures: None,
+) -> Account:  # fmt: skip
+    """Write the exposures of a film as a recording of a rig. The same film and settings give the same bytes.
+
+    Raises
+    ------
+    ImportingError
+        The film is not what the rig file describes; no file is left then.
+    RecordingError
+        ``path`` exists and not ``overwrite``, or cannot be written.
+    """
+    check_target(path, overwrite=overwrite, error=RecordingError)
+    account = Account()
+    made = imported(film, rig, settings, account)
+    first = next(made, None)  # what is wrong with the whole shows before the file is made
+    if first is None:
+        raise ImportingError(
+            f"{film.name} has {film.count} frames: not enough for an exposure of {settings.frames_per_exposure}"
+        )
+    facts = {
+        "session": hashlib.sha256(f"{film.name} {film.count} {settings} {rig.digest}".encode()).hexdigest()[:16],
+        "aolink_version": version("aolink"),
+        "rig": rig.name,
+        "rig_digest": rig.digest,
+        "camera": f"imported from {film.name}",
+        "mirror": "none" if film.inputs is None else f"imported from {film.name}",
+        "import_settings": str(settings),
+    }
+    with writing(path, overwrite=overwrite, error=RecordingError) as partial:
+        file = McapFile(partial, WriteOptions(), descriptor=open_unfinished(partial))
+        try:
+            begin_recording(file, rig, facts, first.frame.host_start_ns, {})
+            sequence = 0
+            for each in chain([first], made):
+                for topic, message in _messages(each, rig):
+                    sequence += 1
+                    data = message.SerializeToString(deterministic=True)
+                    file.add(topic, schema_of(type(message)), data, each.frame.host_receive_ns, sequence)
+                progress(account.exposures)
+            file.add_metadata(topics.END_METADATA, {"ended": "end of the film", "exposures": str(account.exposures)})
+            file.finish()
+        except BaseException:
+            file.cut_back()
+            raise
+    return account
+
+
+def _messages(each: ImportedExposure, rig: Rig) -> Iterator[tuple[str, Message]]:
+    frame, inputs = each.frame, each.inputs
+    info, image = convert.frame_messages(frame)
+    yield topics.EXPOSURE, info
+    yield topics.IMAGE, image
+    rows = max(1, _AT_ONCE // max(1, inputs.shape[1]))
+    first = frame.last_step + 1 - len(inputs)
+    for k in range(0, len(inputs), rows):
+        some = inputs[k : k + rows]
+        yield topics.APPLIED, Applied(first_step=first + k, n_steps=len(some), u=some.ravel())
+    if each.truth is not None:
+        yield topics.TRUTH, Truth(
+            frame_id=frame.frame_id, axes=rig.plant.axes, n_outputs=rig.n_outputs, path=each.truth.path.ravel(),
+            start_state=each.truth.start_state.ravel(), end_state=each.truth.end_state.ravel(),
+            path_sd=each.truth.path_sd,
+        )  # fmt: skip
