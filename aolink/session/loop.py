@@ -45,7 +45,7 @@ _GRACE_S = 1.5
 _KEEP_ALIVES = 3
 """What a mirror is sent in the time of its watchdog, at least."""
 _OUTAGE_WATCHDOGS = 2.0
-"""A mirror that was out of reach for more than so many times its watchdog is not told to go on."""
+"""A mirror that was out of reach for more than so many times its watchdog time is not re-armed."""
 ESTIMATES_S = 5.0
 """Real time: how long the session's end waits for estimates that are under way."""
 _NOT_YET = 1 << 63
@@ -263,7 +263,7 @@ class SessionLoop:
         step = self._mirror.rearm()
         self.report.rearmed += 1
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
-        self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: told to go on at fast step {step}{out}")
+        self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: re-armed at fast step {step}{out}")
         self._queued_until = min(self._queued_until, step)  # what was queued is dropped
 
     def _send_commands(self, device_step: int) -> None:

@@ -78,7 +78,7 @@ class Report:
     reports_asked: int = 0
     """How often missing reports of the mirror were asked for again."""
     rearmed: int = 0
-    """How often the mirror was parked by its watchdog and told to go on."""
+    """How often the mirror was parked by its watchdog and re-armed."""
     clock_offset_ns: float = float("nan")
     clock_frequency_ppm: float = float("nan")
     clock_sigma_ns: float = float("nan")
