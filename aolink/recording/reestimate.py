@@ -38,8 +38,6 @@ def reestimate(
 
     Raises
     ------
-    RecordingError
-        The recording holds no exposure.
     EstimatorError
         There is no such estimator, or it cannot work on this rig.
     """
