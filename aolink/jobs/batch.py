@@ -102,7 +102,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of a job."""
+    """The result of a job."""
 
     job: Job
     rows: list[dict[str, Any]]

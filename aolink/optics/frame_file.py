@@ -48,7 +48,7 @@ def parse_fits(data: bytes) -> NDArray[np.float64]:
     Raises
     ------
     FrameError
-        It is not such a file.
+        The data are not such a file.
     """
     if not data.startswith(b"SIMPLE  ="):
         raise FrameError("it is not a FITS file: it does not begin with SIMPLE")

@@ -217,7 +217,7 @@ def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench:
     ("wrong", "what"),
     [
         ({"pixels": np.zeros((2, 3), np.uint16)}, r"the camera gives \(2, 3\) pixels from 0 to 0, the rig file says"),
-        ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: mend"),
+        ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: correct"),
         ({"start_ns": CAMERA_ZERO_NS + 10**12}, "a frame whose exposure ends in the future"),
     ],
 )
