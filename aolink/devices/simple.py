@@ -163,7 +163,7 @@ class AdaptedCamera(_Adapted):
 
     def stop(self) -> None:
         try:
-            self._events += self.poll()
+            self._events = self.poll()  # with those that were waiting
         finally:
             self._running = False
             with calling(self.name, "when it was told to stop"):

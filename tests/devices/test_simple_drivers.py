@@ -229,6 +229,12 @@ def test_a_frame_that_is_not_of_this_rig_is_refused(
         camera.poll()
 
 
+def test_a_frame_that_comes_as_the_camera_stops_is_given_once(camera: AdaptedCamera, bench: CameraBench) -> None:
+    bench.taken = [frame(100 * STEP_NS)]
+    camera.stop()
+    assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1]
+
+
 def test_a_step_that_has_gone_by_is_too_late_to_start_at(camera: AdaptedCamera) -> None:
     assert not camera.start(200, 0)
 
