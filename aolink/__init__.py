@@ -28,7 +28,7 @@ __all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate", "sm
 if not TYPE_CHECKING:  # the type checker would believe in any name
 
     def __getattr__(name: str) -> Any:
-        """What needs SciPy, or a search for the version, is loaded when it is used: a command hears signals before."""
+        """Load what needs SciPy, and look up the version, at first use: a command handles signals before that."""
         if name in ("Rig", "load_rig"):
             import aolink.rig
 
@@ -41,12 +41,12 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
 
 
 def read(path: str | Path) -> Recording:
-    """Open a recording: what it gives when iterated over are its exposures, read one after the other.
+    """Open a recording. Iterating over it reads its exposures, one after the other.
 
     Raises
     ------
     RecordingError
-        It cannot be read, or is not a recording of aolink.
+        The file cannot be read, or is not a recording of aolink.
     """
     from aolink.recording.reader import Recording
 
@@ -61,9 +61,9 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
     rig:
         A rig, a rig file, or the name of one that comes with aolink.
     n_exposures:
-        How many.
+        Number of exposures.
     seed:
-        Instead of the rig file's own.
+        Seed of all random numbers; that of the rig file where None.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
 
 
 def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> list[Estimate]:
-    """Estimates of the motion inside each exposure.
+    """Estimates of the motion inside each exposure, in their order.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> l
     Raises
     ------
     EstimatorError
-        There is no such estimator.
+        There is no such estimator, or it cannot work on this rig.
     """
     from aolink.estimation import Driver
     from aolink.exposure import Exposures
@@ -104,14 +104,14 @@ def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> l
 
 
 def smooth(exposures: Exposures | Recording | str | Path, estimates: list[Estimate]) -> list[Estimate]:
-    """Estimates of `estimate` corrected by all that came later: offline, with the same fields.
+    """Rauch-Tung-Striebel smoother: estimates of `estimate`, each corrected by all later exposures. Offline only.
 
     Parameters
     ----------
     exposures:
-        What `estimate` was given.
+        The exposures that `estimate` was given.
     estimates:
-        What it gave.
+        Its result for them.
 
     Raises
     ------

@@ -35,7 +35,7 @@ class Frame:
     """True where the pixel arrived, (rows, columns)."""
     chunks_lost: int
     frames_lost_before: int
-    """Frames between the one before and this that never came."""
+    """Frames between the previous one and this one that never came."""
     device_start_ns: int
     device_end_ns: int
     host_first_byte_ns: int
@@ -46,7 +46,7 @@ class Frame:
     exposure_offset_ns: int = 0
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
     plane: int = 0
-    """Which of the camera's pictures of the exposure: 0 of the spots, 1 of the scene."""
+    """Which of the camera's pictures of the exposure this is: 0 the spots, 1 the scene."""
 
 
 class FrameReassembly:
@@ -140,7 +140,7 @@ class PlanesReassembly:
 
     @property
     def refused(self) -> int:
-        """Chunks that made no sense, those of planes that the camera does not have among them."""
+        """Chunks that made no sense, including those of planes that the camera does not have."""
         return self._unknown + sum(plane.refused for plane in self._planes)
 
     def add(self, chunk: pb.FrameChunk, receive_ns: int) -> list[Frame]:
@@ -181,7 +181,7 @@ _Blocks = list[tuple[int, NDArray[np.float64]]]
 
 
 class _InputHistory:
-    """What the mirror held, and what it was told, for every fast step not yet used."""
+    """Inputs that the mirror applied, and inputs that it was sent, for every fast step not yet used."""
 
     def __init__(self, mirror: MirrorDriver) -> None:
         self._n_inputs, self._quantise = len(mirror.park), mirror.quantise
@@ -193,11 +193,11 @@ class _InputHistory:
         self._reported_until = 0
         """First step that no report covers yet."""
         self._known_until: int | None = None
-        """First step that no command, report or frame is of."""
+        """End of the steps that any command, report or frame is about, exclusive; None before the first."""
 
     def add_applied(self, message: pb.Applied | Run) -> None:
         first, end = message.first_step, message.first_step + message.n_steps
-        # A mirror reports what it has been told to do: a report of steps far beyond that would make everything late.
+        # A mirror reports steps that it was sent: believing a report of steps far beyond them would make all else late.
         if self._known_until is not None and end > self._known_until + _MOST_LEAD_STEPS:
             return
         source = message.source if isinstance(message, pb.Applied) else pb.Applied.COMMAND
@@ -213,7 +213,7 @@ class _InputHistory:
         self.know(end)
 
     def is_known_until(self, end: int) -> bool:
-        """Whether nothing more is to be had of the steps before ``end``."""
+        """Whether no report of a step before ``end`` is still to come."""
         return end <= self._reported_until and all(first >= end for first, _ in self._awaited)
 
     def add_command(self, message: pb.CommandBlock | Run) -> None:
@@ -221,7 +221,7 @@ class _InputHistory:
             self.know(message.first_step + message.n_steps)
 
     def know(self, end: int) -> None:
-        """Something is known of the steps before ``end``."""
+        """Note that a command, report or frame is about the steps before ``end``."""
         self._known_until = end if self._known_until is None else max(self._known_until, end)
 
     def _add(self, blocks: _Blocks, message: pb.Applied | pb.CommandBlock | Run) -> bool:
@@ -276,7 +276,7 @@ class _InputHistory:
 
 
 def _after(end: int, blocks: _Blocks) -> _Blocks:
-    """What of runs of steps is not before ``end``."""
+    """The parts of runs of steps that are not before ``end``."""
     return [(max(start, end), u[max(end - start, 0) :]) for start, u in blocks if start + len(u) > end]
 
 

@@ -42,7 +42,7 @@ class EstimatorError(AolinkError):
 
 
 class ViewerError(AolinkError):
-    """A viewer or a picture of it that this machine cannot give."""
+    """The viewer, or a picture of it, cannot be had on this machine."""
 
     exit_code = 7
 
@@ -64,7 +64,7 @@ class FrameError(AolinkError):
 
 
 class RestorationError(AolinkError):
-    """A picture or a point spread function that cannot be restored with, or not by the method asked for."""
+    """A picture that cannot be restored: not with this point spread function, or not by this method."""
 
     exit_code = 10
 

@@ -69,11 +69,12 @@ class Exposure:
     start_offset: float = 0.0
     """f, how far into its first fast step the exposure starts, in fast steps, 0 <= f < 1.
 
-    It ends as far into the step after its last, and takes 1 - f of the first and f of that one. States and path
-    are those of whole fast steps all the same: the start state at ``first_step``, the end state ``n_steps`` later.
+    It ends equally far into the step after its last: it covers 1 - f of its first step and f of the one after its
+    last. States and path are still those of whole fast steps: the start state at ``first_step``, the end state
+    ``n_steps`` later.
     """
     inputs_assumed: int = 0
-    """Steps of ``inputs`` and ``lead_inputs`` that the device's report is missing for.
+    """Number of steps of ``inputs`` and ``lead_inputs`` for which the mirror's report is missing.
 
     They hold what was commanded, rounded as the mirror's converter would.
     """
@@ -120,7 +121,7 @@ class Exposures(Sequence[Exposure]):
 
 
 def step_shares(n_steps: int, offset: float) -> NDArray[np.float64]:
-    """Share of an exposure in each of its fast steps, (n_steps,); and in the one after them if it starts late.
+    """Share of an exposure in each of its fast steps, (n_steps,), and in the one after them, (n_steps + 1,), if f > 0.
 
     ``offset`` is `Exposure.start_offset`, f: the first step loses as much as the one after the last gains, f / n_steps.
     """

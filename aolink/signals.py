@@ -36,8 +36,8 @@ class Interrupted(BaseException):
 class StopRequest:
     """What Ctrl-C, SIGTERM and SIGHUP do while this is installed.
 
-    With ``at_once`` the first of them raises `Interrupted`, wherever the program is. Without, it only makes the
-    request true, for what ends in good order by itself, as a session does; and the next one raises `Interrupted`.
+    With ``at_once`` the first of them raises `Interrupted`, wherever the program is. Without it, the first only makes
+    the request true, for what ends in good order by itself, as a session does, and the next one raises `Interrupted`.
     """
 
     def __init__(self, *, at_once: bool = False) -> None:

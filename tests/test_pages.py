@@ -209,7 +209,7 @@ def test_every_block_is_of_a_kind_that_is_tried() -> None:
 
 
 def test_the_architecture_names_what_there_is() -> None:
-    """The list of the rooms: each of its names is a module or a folder, and every one of them is in it."""
+    """The list of subpackages: each of its names is a module or a folder, and every one of them is in it."""
     (block,) = [block for block in BLOCKS if block.text.startswith("errors, files, signals")]
     named = {name for line in block.text.splitlines() for name in re.split(r", ", re.split(r" {2,}", line)[0])}
     there = {path.stem for path in (ROOT / "aolink").iterdir() if path.suffix == ".py" or path.is_dir()}

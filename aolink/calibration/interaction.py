@@ -18,7 +18,7 @@ from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]
 
-# A pixel counts if its density exceeds so many sd of noise: what is far from the spot only adds noise.
+# A pixel counts if its density exceeds this many sd of noise: pixels far from the spot only add noise.
 _THRESHOLD_SD = 4.0
 
 
@@ -31,11 +31,11 @@ class Interaction:
     offset: FloatArray
     """Slopes without input, (n_outputs,)."""
     singular_values: FloatArray
-    """Of the matrix, from large to small."""
+    """Singular values of the matrix, from large to small."""
     residual_rms: float
-    """Of the slopes that the matrix does not explain, slope units."""
+    """Rms of the slopes that the matrix does not explain, slope units."""
     exposures: int
-    """How many were used."""
+    """Number of exposures used."""
 
     @property
     def condition(self) -> float:

@@ -1,4 +1,4 @@
-"""What a camera's own frames say about it: black level, noise, gain, scale and image kernel, with standard deviations.
+"""Calibration of a camera from its own frames: black level, noise, gain, scale, image kernel, standard deviations.
 
 Pure: counts in, a `Calibration` out. Dark frames give the black level and the read noise. The photon
 transfer curve (a pixel's variance against its mean, EMVA 1288) of flats and of the resting spot gives the

@@ -32,7 +32,8 @@ stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
 FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
 EstimatorOption = Annotated[
-    list[str] | None, typer.Option("--estimator", "-e", help="Estimator to run; may be given several times.")
+    list[str] | None,
+    typer.Option("--estimator", "-e", help="Estimator to run, such as o3 or moments; may be given several times."),
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -63,10 +64,10 @@ def open_recording(file: Path, *, check: bool = False) -> Recording:
 
 
 def check_measured(file: Path, scores: Mapping[str, Score]) -> None:
-    """Raise EstimatorError if an estimator that looks at the camera could not use a single exposure."""
+    """Raise EstimatorError if an estimator that takes measurements could not use a single exposure."""
     for name, score in scores.items():
         if score.nothing_measured:
-            raise EstimatorError(f"{file}: {name} has predicted only: {score.nothing_measured}")
+            raise EstimatorError(f"{file}: {name} only predicted: {score.nothing_measured}")
 
 
 def program() -> str:
@@ -75,9 +76,11 @@ def program() -> str:
 
 
 def get_ready(rig: Rig, estimators: Sequence[str]) -> None:
-    """Have what estimators compile compiled before anything waits for them, and say so on a terminal."""
+    """Compile the loops of these estimators before anything waits for them, and say so on a terminal."""
     from aolink.estimation import make_estimator
 
-    with stderr.status("getting the estimators ready: what they compile takes some 20 s, the first time"):
+    with stderr.status(
+        "getting the estimators ready; the first time their loops are compiled, which takes a minute or two"
+    ):
         for name in estimators:
             make_estimator(rig, name)

@@ -29,7 +29,7 @@ def view(
     ] = False,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Look at a recording in Rerun, or at a file that was written for it."""
+    """Open a recording in Rerun, or a Rerun file that was saved from one."""
     import tempfile
 
     from aolink import viewing
@@ -62,18 +62,18 @@ def view(
 def slopes(
     frame: Annotated[Path, typer.Argument(metavar="FRAME", help="A Shack-Hartmann frame: .fits, .fits.gz or .npy.")],
     reference: Annotated[Path, typer.Option(metavar="FILE", help="A frame of the same camera with a flat wavefront.")],
-    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="FILE.npz", help="Write all of it.")] = None,
-    rrd: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write a picture of it for Rerun.")] = None,
-    pitch_m: Annotated[
-        float | None, typer.Option(min=1e-9, help="From a lenslet's middle to the next one's, m.")
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE.npz", help="Write all results.")
     ] = None,
+    rrd: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help="Write the results for Rerun.")] = None,
+    pitch_m: Annotated[float | None, typer.Option(min=1e-9, help="Distance between neighbouring lenslets, m.")] = None,
     focal_m: Annotated[float | None, typer.Option(min=1e-9, help="Focal length of a lenslet, m.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the lenslets' spots on a frame and on its reference: slopes, wavefront and Zernike modes between them.
+    """Measure slopes, wavefront and Zernike modes of a Shack-Hartmann frame against its reference.
 
-    The grid is square or hexagonal, turned by any angle; kind, pitch and turn are found, whatever spots are missing.
+    The lenslet grid is found in the frames: square or hexagonal, turned by any angle, with spots missing.
     Without --pitch-m and --focal-m slopes are in pixels.
     """
     from aolink.cli import tables

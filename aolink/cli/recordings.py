@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 class Engine(StrEnum):
-    """What o1 to o3 run on."""
+    """The implementation of o1 to o3."""
 
     AOLINK = "aolink"
     FILTERPY = "filterpy"
@@ -77,34 +77,36 @@ def estimate(
             "--output",
             "-o",
             metavar="FILE|DIR/",
-            help="A copy with the new estimates beside those of other estimators; of many files or models, a folder for"
-            " the copies and their table.",
+            help="Write a copy with the new estimates beside those of other estimators; with many files or models, a"
+            " folder for the copies and their table.",
         ),
     ] = None,
     rig: Annotated[
-        str | None, typer.Option(metavar="RIG.toml", help="Estimate with this rig file, not the recording's own.")
+        str | None, typer.Option(metavar="RIG.toml", help="Estimate with this rig file instead of the recording's own.")
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE,...", help="Change a value of the rig file; each value is a model."),
+        typer.Option("--set", metavar="KEY=VALUE,...", help="Change a key of the rig file; each value makes a model."),
     ] = None,
     engine: Annotated[
-        Engine, typer.Option(help="What the filters run on; filterpy: o1 to o3, a plant of one axis, slowly.")
+        Engine,
+        typer.Option(help="Implementation of the filters; filterpy runs o1 to o3 on a plant of one axis, slowly."),
     ] = Engine.AOLINK,
-    only: Annotated[bool, typer.Option("--only", help="Leave the estimates that were there out of the copy.")] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="How many recordings at once.")] = 1,
+    only: Annotated[bool, typer.Option("--only", help="Leave the recording's own estimates out of the copy.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="How many recordings to estimate at once.")] = 1,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write the table as Parquet, not as CSV.")] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate the motion inside each exposure of recordings, again or for the first time.
 
-    With many files or models, what was done before and has not changed is not done again, and a file that
-    fails does not stop the others (exit code 1 then). Exit code 6 if no exposure gave a measurement.
+    Without -e it runs the estimators that the recording has estimates of, or o3.
+    With many files or models it skips work that was done before and has not changed.
+    A file that fails does not stop the others (exit code 1). Exit code 6 if no exposure gave a measurement.
     """
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
     if only and output is None:
-        raise typer.BadParameter("--only is about the copy that -o writes: give -o too")
+        raise typer.BadParameter("--only is for the copy that -o writes: give -o too")
     from aolink.cli import tables
     from aolink.jobs import batch
     from aolink.rig import load_rig
@@ -197,7 +199,7 @@ def _estimate_one(
     except (ArithmeticError, ValueError) as error:
         if recording.rig_is_recorded:
             raise
-        raise EstimatorError(f"{file} cannot be estimated with this rig: {error!r}; are its numbers meant?") from None
+        raise EstimatorError(f"{file} cannot be estimated with this rig: {error!r}; check its numbers") from None
     if recording.damage != known:
         stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
     if as_json:
@@ -213,7 +215,7 @@ def _estimate_one(
             there = ", ".join(kept_estimators(recording, names, only=only))
             beside = f", beside the estimates of {there} that were there" if there else ""
             if recording.estimators and not recording.rig_is_recorded:
-                beside = "; the estimates that were there are of another rig file, and left out"
+                beside = "; the recording's own estimates were made with another rig file and are left out"
             stdout.print(f"written: {output}{beside}", markup=False)
     check_measured(file, scores)
 
@@ -232,8 +234,8 @@ def compare(
         list[str] | None,
         typer.Option("--topic", "-t", help="Only this topic, or with a / at its end all below it; may be repeated."),
     ] = None,
-    relative: Annotated[float, typer.Option(min=0, help="How much two numbers may differ, relatively ...")] = 1e-9,
-    absolute: Annotated[float, typer.Option(min=0, help="... and in their own units, added.")] = 1e-12,
+    relative: Annotated[float, typer.Option(min=0, help="Relative tolerance of numbers.")] = 1e-9,
+    absolute: Annotated[float, typer.Option(min=0, help="Tolerance in a number's own unit, added.")] = 1e-12,
     accept: Annotated[
         bool, typer.Option("--accept", help="Where they differ, put B (or the new estimates) in A's place.")
     ] = False,
@@ -293,7 +295,7 @@ def recover(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Save what is whole of a damaged or unfinished recording. Exit code 1 if something was lost."""
+    """Save the undamaged part of a damaged or unfinished recording. Exit code 1 if something was lost."""
     from aolink.recording.editing import recover as recover_recording
 
     with progress_bar(stderr, None) as tell:
@@ -330,7 +332,7 @@ def merge(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Join the parts of one session; what is in several of them is written once."""
+    """Join the parts of one session; messages that several of them hold are written once."""
     from aolink.recording.editing import merge as merge_recordings
 
     with progress_bar(stderr, None) as tell:

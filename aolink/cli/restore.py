@@ -18,7 +18,7 @@ from aolink.files import check_target
 
 
 class _NamingMethods(TyperCommand):
-    """Its help names the methods that there are: packages are searched for them when somebody reads it."""
+    """Its help names all methods: installed packages are searched for them when the help is shown."""
 
     def format_help(self, *arguments: Any, **named: Any) -> None:
         from aolink.restoration import METHODS, find_method
@@ -45,17 +45,20 @@ def deblur(
         Path, typer.Option("--out", "-o", metavar="OUT", help="File to write: a recording, or a picture of its type.")
     ],
     file: Annotated[
-        Path | None, typer.Argument(metavar="FILE", help="A recording, of which every exposure is restored.")
+        Path | None, typer.Argument(metavar="FILE", help="A recording, all of whose exposures are restored.")
     ] = None,
     estimator: Annotated[
-        str, typer.Option("--estimator", "-e", help="Whose path; estimated again where the recording has none of it.")
+        str,
+        typer.Option(
+            "--estimator", "-e", help="The estimator whose path is used; it is run if the recording lacks it."
+        ),
     ] = "moments",
     image: Annotated[
         Path | None,
         typer.Option(
             "--image",
             metavar="IN.png",
-            help="A blurred picture: .png, .tif, .jpg, .npy. What is not a number in it is filled in.",
+            help="A blurred picture: .png, .tif, .jpg, .npy. Pixels that are not numbers are filled in.",
         ),
     ] = None,
     psf: Annotated[
@@ -69,18 +72,18 @@ def deblur(
     ] = None,
     method: Annotated[str, typer.Option(help="The restoration method.")] = "tv",
     noise_sd: Annotated[
-        float | None, typer.Option(help="Of --image's noise, in its own counts; found in it if not given.")
+        float | None, typer.Option(help="Noise of --image, in its own counts; estimated from it by default.")
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Take the motion's blur out of every picture of a recording; or a known one's out of a single picture."""
+    """Remove the motion blur from every picture of a recording, or from a single picture with a known PSF."""
     if file is not None and not (image or psf or noise_sd):
         _deblur_recording(file, out, estimator, method, overwrite=overwrite, as_json=as_json)
     elif file is None and image is not None and psf is not None:
         _deblur_picture(image, psf, out, method, noise_sd, overwrite=overwrite, as_json=as_json)
     else:
-        raise typer.BadParameter("give a recording alone, or --image and --psf, which --noise-sd belongs to")
+        raise typer.BadParameter("give a recording alone, or --image and --psf (and --noise-sd with these)")
 
 
 def _deblur_recording(

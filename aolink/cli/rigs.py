@@ -48,7 +48,7 @@ MOST_EXPOSURES = 2**32 - 1
 
 
 class Light(StrEnum):
-    """What a recording for a calibration shows."""
+    """The light in a recording for a calibration."""
 
     DARK = "dark"
     FLAT = "flat"
@@ -58,11 +58,11 @@ class Light(StrEnum):
 @app.command(epilog="Example: aolink rig section-vi --check")
 def rig(
     rig: RigArgument,
-    check: Annotated[bool, typer.Option("--check", help="Check the rig file, say what was found, and end.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="Check the rig file, print the findings, and end.")] = False,
     exposure_scan: Annotated[
-        bool, typer.Option("--exposure-scan", help="Say what o1 would know with other exposure times, and end.")
+        bool, typer.Option("--exposure-scan", help="Print the error of o1 to expect at other exposure times, and end.")
     ] = False,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock, not with the commands.")] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time, not on virtual time.")] = False,
     seed: Annotated[int | None, typer.Option(help="Instead of the rig file's seed.", min=0)] = None,
     listen: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Serve TCP ports of this machine, not terminals.")
@@ -75,10 +75,10 @@ def rig(
         str | None,
         typer.Option(
             metavar="KIND,...",
-            help="What the camera sees, start after start: dark, flat, flat:DENSITY, still, moving; the last stays.",
+            help="What the camera sees, start by start: dark, flat, flat:DENSITY, still, moving; the last stays.",
         ),
     ] = None,
-    tied: Annotated[bool, typer.Option("--tied", help="End when standard input does: for a parent process.")] = False,
+    tied: Annotated[bool, typer.Option("--tied", help="End when standard input ends, for a parent process.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
@@ -148,7 +148,9 @@ def _print_findings(loaded: Rig, as_json: bool) -> None:
 
 @app.command(epilog="Example: aolink devices /dev/ttyACM0 socket://192.168.1.5:5000")
 def devices(
-    ports: Annotated[list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports to ask who is there.")] = None,
+    ports: Annotated[
+        list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports whose devices to identify.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the serial ports and the drivers of this machine, or identify what is behind the given ports."""
@@ -189,26 +191,28 @@ def devices(
     " --estimator o3 --exposures 100 -o session.mcap"
 )
 def record(
-    rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What the devices are: a rig file or the name of one.")],
+    rig: Annotated[
+        str, typer.Option(metavar="RIG.toml", help="A rig file, or the name of a rig that comes with aolink.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
     camera: Annotated[
         str | None,
         typer.Option(
             metavar="PORT",
-            help="Port of the camera: a device path or socket://host:port. Else as [devices] in the rig file says.",
+            help="Port of the camera: a device path or socket://host:port; by default the rig file names the driver.",
         ),
     ] = None,
-    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror driver, likewise.")] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, likewise.")] = None,
     estimator: EstimatorOption = None,
     exposures: Annotated[int | None, typer.Option(min=1, max=MOST_EXPOSURES, help="How many exposures.")] = None,
-    duration: Annotated[float | None, typer.Option(metavar="S", help="How long, in seconds of device time.")] = None,
-    note: Annotated[str, typer.Option(metavar="TEXT", help="Goes into the recording.")] = "",
+    duration: Annotated[float | None, typer.Option(metavar="S", help="How long to record, s of device time.")] = None,
+    note: Annotated[str, typer.Option(metavar="TEXT", help="A text to keep in the recording.")] = "",
     calibration: Annotated[
         Light | None,
-        typer.Option(help="Frames of this for `aolink calibrate`: the mirror stays parked, whatever the rig's drive."),
+        typer.Option(help="Record frames of this light for `aolink calibrate`; the mirror stays parked."),
     ] = None,
     view: Annotated[
-        bool, typer.Option("--view", help="Show it in Rerun as it goes on; the viewer skips what it has no time for.")
+        bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
     ] = False,
     split_mib: Annotated[
         float, typer.Option(min=0, max=2**30, metavar="MIB", help="Begin another file at this size; 0 for one file.")
@@ -217,15 +221,15 @@ def record(
         float, typer.Option(min=0, metavar="S", help="Begin another file after this time; 0 for one file.")
     ] = 0.0,
     compression: Annotated[str, typer.Option(help="lz4, zstd or none.")] = "lz4",
-    chunk_kib: Annotated[int, typer.Option(metavar="KIB", help="A chunk of this size goes to the file.")] = 128,
+    chunk_kib: Annotated[int, typer.Option(metavar="KIB", help="Write a chunk to the file at this size.")] = 128,
     flush_s: Annotated[
-        float, typer.Option(metavar="S", help="A chunk this old goes to the file: a kill loses twice this at most.")
+        float, typer.Option(metavar="S", help="Write a chunk to the file at this age; a kill loses at most twice this.")
     ] = 0.1,
-    fsync_s: Annotated[float, typer.Option(metavar="S", help="How often the file goes to the disk.")] = 1.0,
+    fsync_s: Annotated[float, typer.Option(metavar="S", help="How often the file is synchronised to the disk.")] = 1.0,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Record a session: play the rig's drive, record everything, estimate on the way.
+    """Record a session: play the rig's drive, record everything, estimate online.
 
     In real time an estimator that is slower than the camera skips exposures; the recording has them all.
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
@@ -284,7 +288,7 @@ def _print_session(report: Report, output: Path, as_json: bool) -> None:
 def _live_view(
     rig: Rig, estimators: Sequence[str], *, shown: bool
 ) -> Iterator[Callable[[Exposure, Sequence[Estimate]], None] | None]:
-    """What shows a session's exposures, or nothing."""
+    """A function that shows a session's exposures, or None."""
     if not shown:
         yield None
         return
@@ -306,8 +310,10 @@ def replay(
     ] = 0.0,
     start: Annotated[float, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")] = 0.0,
     end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
-    view: Annotated[bool, typer.Option("--view", help="Show it in Rerun as it goes on.")] = False,
-    to_rig: Annotated[bool, typer.Option("--to-rig", help="Send its commands to a rig, record anew.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun.")] = False,
+    to_rig: Annotated[
+        bool, typer.Option("--to-rig", help="Send its commands to a rig, and record a new session.")
+    ] = False,
     camera: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the camera, with --to-rig.")] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, with --to-rig.")] = None,
     output: Annotated[
@@ -316,9 +322,9 @@ def replay(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Play a recording again: through the estimators as if it were live, or to a rig.
+    """Replay a recording through the estimators as if it were live, or send its commands to a rig.
 
-    What an estimator skipped in the session for want of time, it skips again; `aolink estimate` skips nothing.
+    Exposures that an estimator skipped in the session are skipped again; `aolink estimate` skips none.
     """
     recording = open_recording(file)
     names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
@@ -406,22 +412,29 @@ def _replay_to_rig(
 
 @app.command(epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml")
 def calibrate(
-    rig: Annotated[str, typer.Option(metavar="RIG.toml", help="The rig file to begin with, or the name of one.")],
+    rig: Annotated[
+        str,
+        typer.Option(
+            metavar="RIG.toml", help="The rig file to start from, or the name of a rig that comes with aolink."
+        ),
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The rig file to write.")],
     files: Annotated[
         list[Path] | None,
         typer.Argument(metavar="[FILE]...", help="Recordings made with `aolink record --calibration`."),
     ] = None,
-    camera: Annotated[str | None, typer.Option(metavar="PORT", help="Record from this camera instead.")] = None,
-    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror driver.")] = None,
-    frames: Annotated[int, typer.Option(help="How many of each kind to record.")] = 100,
+    camera: Annotated[
+        str | None, typer.Option(metavar="PORT", help="Port of the camera, to record the frames now.")
+    ] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror.")] = None,
+    frames: Annotated[int, typer.Option(help="How many frames of each light to record.")] = 100,
     keep: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the recordings in this folder.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
 
-    From recordings of dark, flat and still light; or from the devices, asking for each in turn.
+    It takes recordings of dark, flat and still light, or records from the devices, asking for each in turn.
     """
     from shutil import rmtree
     from tempfile import mkdtemp
@@ -465,12 +478,12 @@ def calibrate(
 @app.command(epilog="Example: aolink demo --rig section-vi-lively --out /tmp")
 def demo(
     rig: Annotated[str, typer.Option(help="Rig file or name.")] = "section-vi",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where to make the new dated folder.")] = Path(),
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder in which to make a new, dated one.")] = Path(),
     exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Run with the clock and measure latencies.")] = False,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
 ) -> None:
-    """Do the main job with a simulated rig: record, estimate, estimate again, compare, draw."""
+    """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
     from aolink.cli import tables
     from aolink.jobs.demo import new_folder, possible_estimators, run_demo
     from aolink.recording.reader import Recording

@@ -9,25 +9,25 @@ from dataclasses import dataclass
 import numpy as np
 
 QUERY_PERIOD_S = 0.9839
-"""Between two queries: no multiple of a loop's period, so that queries and loop do not resonate."""
+"""Time between two queries: no multiple of a loop's period, so that queries and loop do not resonate."""
 SUSPICION_PERIOD_S = 0.0419
-"""Between two queries while a clock is suspected of having been set: `_STEP_AFTER` of them settle it."""
+"""Time between two queries while a clock is suspected of having been set: `_STEP_AFTER` of them settle it."""
 WARM_UP_QUERIES = 8
-"""Asked at once at the start: one alone says nothing about its own round trip."""
+"""Queries in a row at the start: one alone says nothing about how long its round trip is by chance."""
 _WINDOW = 64
 _FREQUENCY_PRIOR = 200e-6
 """Standard deviation of a crystal's frequency error before anything is known."""
 _MOST_FREQUENCY = 1e-3
-"""No crystal is off by more; replies that ask for more make no clock."""
+"""No crystal is off by more; replies that would need more are refused."""
 _FREQUENCY_WALK = 1e-6 / math.sqrt(60.0)
 """Random walk of the frequency, 1/sqrt(s): temperature moves a crystal by some 1e-6 in a minute."""
 _RESOLUTION_NS = 1000.0
-"""No sample is taken to be better than this: interrupts and schedulers on both sides."""
+"""Least standard deviation of a sample: interrupts and schedulers on both sides."""
 _SLOW_FACTOR = 4.0
 """A round trip longer than this many times the shortest says too little to be used."""
 _GATE_SIGMA = 6.0
 _STEP_AFTER = 4
-"""So many refused that agree are right: the device's clock was set, or the line has become slower for good."""
+"""This many refused samples that agree are right: the device's clock was set, or the line is slower for good."""
 _REFUSED_KEPT = 16
 _STAMP_NS = 50_000.0
 """How far a device's time stamp may be from the end of a fast step without raising suspicion: interrupt latency."""
@@ -44,7 +44,7 @@ class ClockExchange:
 
     @property
     def round_trip_ns(self) -> int:
-        """Less the time that the device took."""
+        """Time from query to reply on the host, without the time that the device took, ns."""
         return (self.host_receive_ns - self.host_send_ns) - (self.device_send_ns - self.device_receive_ns)
 
     @property
@@ -58,7 +58,7 @@ class ClockExchange:
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """A clock was set, as queries have found."""
+    """A step of a device's clock that queries have found: it was set."""
 
     after_ns: int
     """Host time of the last query before that agreed with the old clock."""
@@ -71,15 +71,15 @@ class ClockStep:
 class ClockRegression:
     """Offset and frequency of a device's clock, with their uncertainty.
 
-    device = host + offset + frequency * (host - reference). A sample is the better the less its round trip was
-    longer than the shortest, and the younger: the frequency is a random walk, so that the offset's variance grows
-    with the cube of the time that has gone by since the newest sample. What no query can see is how the
-    shortest round trip divides into there and back: its half-width, taken as uniform, is in sigma. This error is
-    common to all times between two steps of the clock; it does not average out.
+    device = host + offset + frequency * (host - reference). A sample has the more weight the closer its round trip is
+    to the shortest, and the younger it is: the frequency is a random walk, so that the offset's variance grows with the
+    cube of the time since the newest sample. No query can tell how the shortest round trip divides into the two ways:
+    sigma includes that, as a uniform error of half the round trip to either side. This error is common to all times
+    between two steps of the clock; it does not average out.
 
-    A reply that contradicts the regression makes the clock suspect, and so does whoever calls `suspect`. Until newer
-    queries have settled it, both hypotheses count: the times given are those of the clock before, and sigma reaches to
-    those of the clock after.
+    A reply that contradicts the regression makes the clock suspect, and so does a call of `suspect`. Until newer
+    queries have settled it, both hypotheses count: times are those of the clock before, and sigma reaches to those of
+    the clock after.
     """
 
     def __init__(self) -> None:
@@ -92,12 +92,12 @@ class ClockRegression:
         self._covariance = np.full((2, 2), np.nan)
         self._asymmetry_ns = math.nan
         self._doubt_ns = 0.0
-        """How far the time after a suspected step is from the one before; 0 where there is no suspicion."""
+        """Size of a suspected step, ns; 0 where there is no suspicion."""
         self._doubt_since_ns = 0
         self.step: ClockStep | None = None
         """The newest step of the clock, once it is certain."""
         self.settled = 0
-        """How many suspicions have been settled, one way or the other."""
+        """Number of suspicions that have been settled, one way or the other."""
 
     @property
     def ready(self) -> bool:
@@ -110,7 +110,7 @@ class ClockRegression:
         return self._doubt_ns > 0
 
     def suspect(self, size_ns: float, host_ns: int) -> None:
-        """Something else than a query says, at ``host_ns``, that the clock may have been set by ``size_ns``."""
+        """Suspect a step of ``size_ns``, for another reason than a query's reply, at ``host_ns``."""
         self._doubt_ns = max(self._doubt_ns, size_ns)
         self._doubt_since_ns = host_ns
 
@@ -155,7 +155,7 @@ class ClockRegression:
             dtype=np.float64,
         )
         trips = np.array([s.round_trip_ns for s in self._samples], dtype=np.float64)
-        # All samples may have taken longer than the line does at best; by how much, their spread and number tell.
+        # All samples may have taken longer than the line does at best; their spread and number say by how much.
         shortest = min(self._trips)
         longer = (sum(self._trips) / len(self._trips) - shortest) / math.sqrt(len(self._trips))
         sd = np.maximum((trips - shortest) / 2, max(_RESOLUTION_NS, longer / 2))
@@ -193,7 +193,7 @@ class ClockRegression:
         return device_ns, math.hypot(sigma, self._doubt_at(host_ns))
 
     def _doubt_at(self, host_ns: int) -> float:
-        """What a step adds to sigma: one that is suspected, or one that was found after this time had gone by."""
+        """What a step adds to sigma, ns: a suspected one, or one that was found only after this time."""
         if self._doubt_ns or self.step is None or host_ns >= self.step.before_ns:
             return self._doubt_ns
         return float(abs(self.step.size_ns))
@@ -227,8 +227,8 @@ def _agree(one: ClockExchange, other: ClockExchange) -> bool:
 class StepClock:
     """A device's clock beside its count of fast steps.
 
-    A device stamps its frames and reports with both. Both run from one crystal, so where they part, the clock was set:
-    what it is stamped with shows it at once, up to a second before the next query does.
+    A device stamps its frames and reports with both. Both run from one crystal, so where they disagree, the clock was
+    set: the stamps show that at once, up to a second before the next query does.
     """
 
     def __init__(self, clock: ClockRegression, step_zero_ns: int, fast_step_ns: int) -> None:
@@ -251,7 +251,7 @@ class StepClock:
         device_ns:
             The stamp, on the device's clock.
         since_zero_ns:
-            How long after the beginning of fast step 0 it was made, by the count of fast steps.
+            Time from the beginning of fast step 0 to the stamp, by the count of fast steps.
         now_ns:
             Host time.
         """
@@ -263,7 +263,7 @@ class StepClock:
         elif not self._clock.suspected:
             self._zero_ns = stamped_zero_ns
         host_ns, sigma = self._clock.host_ns(device_ns)
-        if host_ns - now_ns > _GATE_SIGMA * sigma:  # what has come cannot be from later than now
+        if host_ns - now_ns > _GATE_SIGMA * sigma:  # a stamp that has come cannot be from the future
             self._clock.suspect(host_ns - now_ns, now_ns)
             sigma = math.hypot(sigma, host_ns - now_ns)
         return host_ns, sigma

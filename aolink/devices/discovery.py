@@ -1,4 +1,4 @@
-"""Which ports there are, and what is behind them."""
+"""The serial ports of this machine, and the devices behind them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def list_ports() -> list[tuple[str, str]]:
 
 
 def identify_port(port: str) -> Found:
-    """Ask what is behind a port. Raises PortError and DeviceError."""
+    """Ask the device behind a port who it is. Raises PortError and DeviceError."""
     hub = Hub()
     try:
         identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port)), secrets.randbits(48))

@@ -19,7 +19,7 @@ NATIVE = "native"
 
 
 def driver_names(kind: Kind) -> list[str]:
-    """The drivers that there are; those of other packages may turn out to be broken when they are loaded."""
+    """Names of the installed drivers; those of other packages may turn out to be broken when they are loaded."""
     return [NATIVE, *sorted(_others(kind))]
 
 
@@ -29,9 +29,9 @@ def open_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Any:
     Raises
     ------
     DeviceError
-        There is no driver of this name, it cannot be loaded, or it says what its device cannot do.
+        There is no driver of this name, it cannot be loaded, or it fails to open its device.
     RigError
-        It does not take the keys that the table has.
+        The driver does not take the keys that the table has.
     """
     make = _load(kind, table.driver)
     try:
@@ -59,7 +59,7 @@ def _load(kind: Kind, name: str) -> Callable[..., Any]:
     if point is None:
         raise DeviceError(
             f"there is no {kind} driver {name}, there is {', '.join(driver_names(kind))}: install the package that"
-            f" brings it, or mend devices.{kind}.driver in the rig file"
+            f" brings it, or correct devices.{kind}.driver in the rig file"
         )
     return loaded(point, f"{kind} driver", DeviceError)  # type: ignore[no-any-return]
 

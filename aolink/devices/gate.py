@@ -1,10 +1,10 @@
-"""The gate: what a device says is checked here, against the rig file, the host's clock and what it was sent.
+"""The gate: every message of a device is checked here, against the rig file, the host's clock and what was sent.
 
 Nothing that a device says changes any state before it has passed. The packet's checksum lets damage through once in
-2^32 times, so a message that says what cannot be was sent like that: by faulty firmware, or by a device that is not
-what the rig file describes. Numbers of such a device are worth nothing, so the session ends with a `DeviceError`
-that names the field. What an honest device may do as well is no error: repeated, late and unasked answers, clock
-replies that the regression refuses, reports from before the session. Those are dropped or counted.
+2^32 times, so an impossible message was sent like that: by faulty firmware, or by a device that is not what the rig
+file describes. Numbers of such a device are worth nothing, so the session ends with a `DeviceError` that names the
+field. A sound device may also send repeated, late or unasked answers, clock replies that the regression refuses, and
+reports from before the session: these are no error, but dropped or counted.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from aolink.wire.hub import Hub
 from aolink.wire.link import Link
 
 MOST_STEP = 1 << 53
-"""No count of fast steps comes so far."""
+"""No count of fast steps reaches this."""
 MOST_TIME_NS = 3_600_000_000_000_000_000
 """No clock reads a time further from its zero: 114 years. The difference of two such times fits into int64."""
 MOST_RATE_ERROR = 1e-3
@@ -39,11 +39,11 @@ _KINDS: dict[str, tuple[type[Message], ...]] = {
     "camera": (pb.FrameChunk, pb.TruthChunk, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
     "mirror": (pb.Applied, pb.CommandAck, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
 }
-"""What each device has to say."""
+"""The messages that each device may send."""
 
 
 def lie(device: str, field: str, found: object, expected: str) -> DeviceError:
-    """The error for a field that says what cannot be."""
+    """The error for a field with an impossible value."""
     return DeviceError(
         f"the {device} says {field} = {found}, expected {expected}: its firmware is at fault, or the rig file is"
         " another device's; what was recorded before is kept"
@@ -51,12 +51,12 @@ def lie(device: str, field: str, found: object, expected: str) -> DeviceError:
 
 
 def printable(text: str) -> str:
-    """A device's own words, as they may go into a log or onto a terminal."""
+    """A device's text, made safe for a log or a terminal."""
     return "".join(each if each.isprintable() else " " for each in text[:_LONGEST_TEXT])
 
 
 def converter_margin(mirror: MirrorDriver) -> NDArray[np.float64]:
-    """How far what a mirror held may be from what it was sent, (n_inputs,): a step of its converter."""
+    """Largest difference between a reported input and the one that was sent, (n_inputs,): a step of the converter."""
     low, high = mirror.voltage.input_range if mirror.voltage else (mirror.input_min, mirror.input_max)
     converter = (np.asarray(high) - low) / ((1 << mirror.dac_bits) - 1) if mirror.dac_bits else 0.0
     return converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
@@ -78,18 +78,18 @@ def check_command(
 
 
 class Gate:
-    """What the two devices of a session may say.
+    """Checks the messages of the two devices of a session.
 
     Parameters
     ----------
     rig:
-        What they are. Their identities have been compared with it.
+        Their rig; their identities have been compared with it.
     hub:
         The host's clock.
     identities:
-        Of camera and mirror.
+        Identities of camera and mirror.
     asked_ns:
-        Host time before they were asked who they are: they were no further then than they say.
+        Host time before they were asked for these: the fast step was then no later than they say.
     """
 
     def __init__(self, rig: Rig, hub: Hub, identities: Iterable[pb.Identity], asked_ns: int) -> None:
@@ -109,7 +109,7 @@ class Gate:
             planes.append((rig.scene.shape, rig.scene.bit_depth))
         self._planes = planes
         states = 2 * rig.plant.axes * rig.plant.n_states
-        # Twice: a number may have come with its tag, and states of a rig with another plant are no matter.
+        # Twice as much as needed: numbers may be sent with a tag each, and a simulated plant may have other states.
         self._most_truth = 16 * (4 * states + rig.n_outputs * rig.timing.exposure_steps) + 1024
         self._frame_head: tuple[object, ...] = ()
         self._frame_id = -1
@@ -121,7 +121,7 @@ class Gate:
         return sum(2 * height * width for (height, width), _ in self._planes) + self._most_truth
 
     def sent(self, block: pb.CommandBlock) -> None:
-        """Remember a command block: the mirror may say of it that it was applied."""
+        """Remember a command block, which the mirror may then report as applied."""
         end = block.first_step + block.n_steps
         self._sent[block.block_id] = block.first_step, end
         self._last_block, self._sent_end = max(self._last_block, block.block_id), max(self._sent_end, end)
@@ -150,7 +150,7 @@ class Gate:
         return True
 
     def check_step(self, device: str, step: int, now_ns: int) -> None:
-        """Refuse a step that a device is in by its clock and cannot be in. Raises DeviceError."""
+        """Refuse a fast step, found from a device's clock, that it cannot be in. Raises DeviceError."""
         slack = round(_SLACK_S * 1e9) // self._step_ns
         end = self._end(now_ns)
         if not self._first_step - slack <= step <= end:
@@ -186,10 +186,10 @@ class Gate:
                 raise lie(device, f"Truth.{name}", "a number that is not finite", "finite ones")
 
     def check_virtual_time(self, link: Link, handed: pb.VirtualTime) -> None:
-        """Refuse a host time that what was sent does not explain. Raises DeviceError.
+        """Refuse a host time from a simulated rig that is later than it can be. Raises DeviceError.
 
-        On virtual time commands drive time, so the rig cannot be later than the end of what it was told to do, the
-        time-outs that the host let pass, and what packets take on their way.
+        On virtual time commands drive time, so the rig cannot be later than the end of its commands, plus the time-outs
+        that the host let pass and the latency of packets.
         """
         hub, before = self._hub, link.handed
         for each in hub.links:

@@ -1,4 +1,4 @@
-"""The host of a session: its clock, and what both devices say, in order."""
+"""The host of a session: its clock, and the events of both devices in order."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from aolink.devices.simple import AdaptedCamera, AdaptedMirror
 from aolink.wire.hub import Hub
 
 _POLL_S = 0.005
-"""How often simple drivers are asked what has come."""
+"""Interval at which simple drivers are polled."""
 
 
 class Host(Hub):
-    """A hub whose messages its devices explain: the `aolink.devices.interfaces.Time` of a session."""
+    """A hub whose messages are turned into events by its devices: the `aolink.devices.interfaces.Time` of a session."""
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         super().__init__(stop)

@@ -1,4 +1,4 @@
-"""Who is behind a line: devices of the packet protocol say it, and what they say is compared with the rig file."""
+"""The identity that devices of the packet protocol report, and its comparison with the rig file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     Raises
     ------
     DeviceError
-        It does not answer, or speaks another version of the protocol.
+        The device does not answer, or speaks another version of the protocol.
     """
     identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
     if identity is None and link.foreign_version is not None:
@@ -59,7 +59,7 @@ def check_kind(link: Link, identity: pb.Identity, kind: pb.Identity.Kind) -> Non
 
 
 def check_identity(link: Link, identity: pb.Identity) -> None:
-    """Refuse an Identity whose numbers or names cannot be. Raises DeviceError naming the field."""
+    """Refuse an Identity with impossible numbers or names. Raises DeviceError naming the field."""
     if identity.kind not in (pb.Identity.CAMERA, pb.Identity.MIRROR):
         raise lie(link.name, "Identity.kind", identity.kind, "1 (camera) or 2 (mirror)")
     for name in ("model", "serial_number", "firmware", "rig_digest"):
@@ -79,7 +79,7 @@ def check_identity(link: Link, identity: pb.Identity) -> None:
 
 
 def check_against_rig(rig: Rig, identities: dict[str, pb.Identity]) -> list[str]:
-    """Refuse devices that are not what the rig file says; gives what else is doubtful, in words.
+    """Refuse devices that are not those of the rig file; gives warnings about what else is doubtful.
 
     ``identities`` are those of the camera, of the mirror or of both, by these names. Raises DeviceError naming the
     first difference.

@@ -1,6 +1,6 @@
-"""What a session asks of a camera, of a mirror and of the time, whoever made them and whatever they speak.
+"""The interfaces of camera, mirror and time that a session uses, whatever the devices' protocol.
 
-Devices never wait: a session takes what has come since it last asked as events, and says itself when it asks again.
+Devices never wait: a session takes, as events, what has come since it last asked, and decides when it asks again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ClockSampled:
     exchange: ClockExchange
     accepted: bool
     step: ClockStep | None = None
-    """The step of the device's clock that is certain with this answer."""
+    """A step of the device's clock that this answer has confirmed."""
 
     @classmethod
     def add(cls, clock: ClockRegression, exchange: ClockExchange, *, usable: bool = True) -> ClockSampled:
@@ -53,7 +53,7 @@ class Device(Protocol):
     name: str
     """``camera`` or ``mirror``."""
     description: str
-    """What it is, for the recording: model, serial number, firmware."""
+    """Model, serial number and firmware, for the recording."""
     clock: ClockRegression
 
     def query_clock(self, now_ns: int) -> None:
@@ -62,12 +62,12 @@ class Device(Protocol):
     def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:
         """Host time of a stamp that came by ``now_ns``, and its standard deviation, ns.
 
-        ``since_zero_ns`` is how long after the beginning of fast step 0 it was made, by the count of fast steps: where
-        the device counts them, a clock that was set shows by it.
+        ``since_zero_ns`` is the time from the beginning of fast step 0 to the stamp by the count of fast steps: for a
+        device that counts them, it reveals a clock that was set.
         """
 
     def statistics(self) -> dict[str, Any]:
-        """Counts since the session began, by the names of ``LinkStatistics``; none for a device without a line."""
+        """Counts since the session began, by the fields of ``LinkStatistics``; empty for a device without a line."""
 
 
 class Camera(Device, Protocol):
@@ -77,7 +77,7 @@ class Camera(Device, Protocol):
     """Digest of the rig file that a simulated camera was made from; empty for others."""
 
     def start(self, first_step: int, exposures: int) -> bool:
-        """Take ``exposures`` frames (0: until stopped), the first from ``first_step``; False if that has gone by.
+        """Take ``exposures`` frames (0: until stopped), the first from ``first_step``; False if that step has passed.
 
         Raises DeviceError.
         """
@@ -96,8 +96,8 @@ class Camera(Device, Protocol):
 class Mirror(Device, Protocol):
     """Applies inputs at fast steps, which it counts.
 
-    Its events say what the mirror held as `Applied`, each fast step exactly once from the first command on: as a
-    report, or as ``NOT_REPORTED`` where none is to be had. ``AWAITED`` comes before either where it is asked for again.
+    Its `Applied` events say what the mirror held in each fast step, exactly once from the first command on: a report,
+    or ``NOT_REPORTED`` where none can be had. ``AWAITED`` comes before either where a report is asked for again.
     """
 
     @property
@@ -107,17 +107,17 @@ class Mirror(Device, Protocol):
     latched: bool
     """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
     outage_s: float
-    """For how long the mirror had taken no command when it said that it is latched, s; 0 at the start of a session."""
+    """How long the mirror had taken no command when it reported that it is latched, s; 0 at the start of a session."""
 
     @property
     def last_sent_ns(self) -> int:
-        """Host time at which it was sent something last: its watchdog runs from then."""
+        """Host time at which something was last sent to it: its watchdog runs from then."""
 
     def since_zero_ns(self, host_ns: int) -> int:
-        """How long after the beginning of its fast step 0 a host time is, on its own clock, ns."""
+        """Time from the beginning of its fast step 0 to a host time, on the mirror's own clock, ns."""
 
     def start_step(self, now_ns: int) -> int:
-        """The fast step that it is in, or on virtual time waits at. Raises DeviceError where it cannot be there."""
+        """The fast step that it is in, or, on virtual time, waits at. Raises DeviceError for an impossible one."""
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         """Send inputs (n_steps, n_inputs) for the fast steps from ``first_step``; gives the block as sent.
@@ -126,7 +126,7 @@ class Mirror(Device, Protocol):
         """
 
     def next_due_ns(self) -> int | None:
-        """When it wants to be served next, host clock; None while nothing is waited for."""
+        """Host time at which it is to be served next; None while nothing is waited for."""
 
     def serve(self, now_ns: int) -> list[Event]:
         """Do what is due: send again what has timed out, ask for missing reports, and give up those that never came.
@@ -144,11 +144,11 @@ class Mirror(Device, Protocol):
         """
 
     def rearm(self) -> int:
-        """End the latch of the watchdog; gives the first fast step that had not gone by. Otherwise as `park`."""
+        """End the latch of the watchdog; gives the first fast step that had not passed. Otherwise as `park`."""
 
 
 class Happened(NamedTuple):
-    """What a device said at one time."""
+    """Events of a device that came at one time."""
 
     device: Device
     events: Sequence[Event]
@@ -157,19 +157,19 @@ class Happened(NamedTuple):
 
 
 class Time(Protocol):
-    """The time that a session goes by: the host's clock, or, on virtual time, what a simulated rig hands down."""
+    """The time of a session: the host's clock, or, on virtual time, the clock that a simulated rig hands down."""
 
     virtual: bool
     beside: Sequence[Served]
-    """Whom `events` serves as well while it waits in real time."""
+    """What `events` also serves while it waits in real time, such as estimators' processes."""
 
     def now_ns(self) -> int:
         """Host time, ns since 1970."""
 
     def events(self, timeout_s: float) -> Iterator[Happened]:
-        """What the devices say, in order; in real time, waited for up to ``timeout_s``.
+        """The devices' events in order; in real time it waits up to ``timeout_s`` for the first.
 
-        A device looks at what came next only when what came before has been taken. Raises PortError and DeviceError.
+        A message is handled only when the events before it have been taken. Raises PortError and DeviceError.
         """
 
     def elapse_until(self, host_ns: int) -> None:
@@ -186,4 +186,4 @@ class Opened(NamedTuple):
     camera: Camera
     mirror: Mirror
     warnings: list[str]
-    """What is doubtful about them, in words."""
+    """Warnings about what is doubtful."""

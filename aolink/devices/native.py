@@ -24,16 +24,16 @@ from aolink.wire.link import Link, Received
 
 _FIRST_TIMEOUT_S = 0.1
 _MIN_TIMEOUT_S = 0.01
-"""Between two tries of a block, whatever the round trip: a Python host is held up for some ms now and then."""
+"""Least time between two tries of a block: a Python host is held up for some ms now and then."""
 _MAX_TIMEOUT_S = 0.5
 _LATE_TIMEOUTS = 4
-"""A block that is late is sent again every so many time-outs: only its answer is still wanted, for the account."""
+"""A late block is sent again at every fourth time-out only: just its answer is still wanted, for the account."""
 _PATIENCE_WATCHDOGS = 2.0
-"""A mirror that answers nothing for so many times its watchdog has parked itself, and the session ends."""
+"""A mirror that answers nothing for this many times its watchdog has parked itself, and the session ends."""
 _LEAST_TRIES = 5
-"""It is not given up before so many tries: a host that was held up has not read the answers yet."""
+"""Least tries before a mirror is given up: a host that was held up has not read the answers yet."""
 _START_ANSWER_S = 0.05
-"""A camera is told to start at a step that is near: the next try must not wait for long."""
+"""Wait for the answer to a camera's start, which is at a near step: the next try must not be late."""
 _START_TRIES = 60
 _MAX_QUERIES = 32
 
@@ -90,7 +90,7 @@ class _NativeDevice:
             self.link, message, pb.Ack, lambda ack, sequence: ack.sequence == sequence, answer_s, tries
         )
         if ack is None:
-            raise DeviceError(f"the {self.link.name} did not answer when told to {what}: is it still connected?")
+            raise DeviceError(f"the {self.link.name} did not answer when asked to {what}: is it still connected?")
         self._gate.passes(self.link, ack, self._hub.now_ns())
         if ack.code not in codes:
             raise DeviceError(f"the {self.link.name} refused to {what}: {_reason(ack)}")
@@ -156,11 +156,11 @@ class _Flight:
     latest_ns: float
     """A try that is sent later than this may not arrive before the block's first step."""
     over_ns: float
-    """The end of the block's last step: from then on no try can do anything for it."""
+    """End of the block's last step, after which no try can help."""
     heard_ns: int
-    """When the mirror last said something of the block; before that, when it was sent first."""
+    """When the mirror last answered for the block; before that, when it was first sent."""
     last_ns: int = 0
-    """The last try."""
+    """Time of the last try."""
     timeouts: int = 0
     tries: dict[int, int] = field(default_factory=dict)
     """When each try was sent, by the sequence number of its packet."""
@@ -190,7 +190,7 @@ class NativeMirror(_NativeDevice):
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
         self._answered_ns: int | None = None
-        """When the newest block was sent that the mirror has taken."""
+        """When the newest of the blocks that the mirror has taken was sent."""
         self._reports = AppliedReports(identity.fast_step_ns, round(self._watchdog_s * 1e9))
         # Smoothed round trip and its mean deviation, as TCP has them (RFC 6298).
         self.round_trip_s = math.nan
@@ -242,7 +242,7 @@ class NativeMirror(_NativeDevice):
         return block
 
     def _begins_ns(self, step: int) -> float:
-        """Host time at which a fast step begins; on virtual time, where the rig waits for its commands, never."""
+        """Host time at which a fast step begins; infinite on virtual time, where the rig waits for its commands."""
         if self._hub.virtual or not self.clock.ready:
             return math.inf
         return self.clock.host_ns(self.steps.step_zero_ns + step * self.identity.fast_step_ns)[0]

@@ -1,4 +1,4 @@
-"""Both devices of a rig are opened, identified and compared with the rig file."""
+"""Open both devices of a rig, identify them and compare them with the rig file."""
 
 from __future__ import annotations
 
@@ -32,20 +32,19 @@ def open_devices(
     Parameters
     ----------
     camera_port, mirror_port:
-        Ports of devices that speak aolink's packets; where None, the rig file's table ``[devices]`` says what drives
-        the device.
+        Ports of devices that speak aolink's packets; where None, the rig file's table ``[devices]`` names the driver.
     stop:
-        Once it says so, no device is waited for longer than for one answer.
+        Once it gives True, no device is waited for longer than for one answer.
 
     Raises
     ------
     PortError
         A port cannot be opened.
     DeviceError
-        No device answers, it is another one, speaks another protocol, or is not what the rig file says; or its driver
-        is not there or fails.
+        A device does not answer, is another one, speaks another protocol, or is not that of the rig file; or its driver
+        is not installed or fails.
     RigError
-        The rig file does not say what drives the device, or says it wrongly.
+        The rig file names no driver for a device, or wrong keys for it.
     """
     tables = {kind: _table(rig, kind, port) for kind, port in zip(_KINDS, (camera_port, mirror_port), strict=True)}
     if tables["camera"].driver == NATIVE != tables["mirror"].driver:
@@ -77,7 +76,7 @@ def open_devices(
 
 
 def _table(rig: Rig, kind: Kind, port: str | None) -> DeviceTable:
-    """What drives a device."""
+    """The driver of a device and its keys, from the port or the rig file."""
     if port is not None:
         return DeviceTable(driver=NATIVE, options={"port": port})
     if kind not in rig.devices:
@@ -98,7 +97,7 @@ def _port(kind: Kind, table: DeviceTable) -> str:
 def _open_native(
     rig: Rig, host: Host, ports: dict[Kind, str], stop: Callable[[], bool]
 ) -> tuple[NativeCamera | None, NativeMirror | None, list[str]]:
-    """The devices that speak packets, None for those that do not, and what is doubtful about them."""
+    """The devices that speak packets, None for those that do not, and warnings about them."""
     if not ports:
         return None, None, []
     links = {kind: host.connect(kind, SerialPort(port, stop=stop)) for kind, port in ports.items()}

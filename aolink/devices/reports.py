@@ -1,4 +1,4 @@
-"""What a mirror has reported, fast step by fast step; what is missing is asked for again."""
+"""The reports of a mirror, fast step by fast step; missing ones are asked for again."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from aolink.wire import messages_pb2 as pb
 
 _LEAST_TRIES = 3
-"""A report is not given up before it was asked for so often: a host that was held up has not read the answers yet."""
+"""Least queries before a report is given up: a host that was held up has not read the answers yet."""
 
 
 @dataclass(slots=True)
@@ -45,7 +45,7 @@ class AppliedReports:
         """First step that neither a report nor a gap covers."""
         self._gaps: list[_Gap] = []
         self.asked = 0
-        """Queries so far."""
+        """Number of queries so far."""
 
     def begin(self, first_step: int) -> None:
         """From ``first_step`` on every step has to be reported. Only the first call counts."""
@@ -91,7 +91,7 @@ class AppliedReports:
         return min((_due_ns(gap, interval_ns) for gap in self._gaps), default=None)
 
     def ask(self, now_ns: int, interval_ns: int) -> tuple[list[pb.AppliedQuery], list[pb.Applied]]:
-        """The queries that are due, and ``NOT_REPORTED`` for what was asked for long enough."""
+        """The queries that are due, and ``NOT_REPORTED`` for steps that were asked for long enough."""
         queries, given_up, gaps = [], [], []
         for gap in self._gaps:
             if _due_ns(gap, interval_ns) <= now_ns:

@@ -1,8 +1,8 @@
-"""What a driver of another package has to do, and what makes a device of a session out of it.
+"""Protocols for drivers of other packages, and adapters that make a session's devices of them.
 
-A simple driver knows its device and nothing of aolink's packets. It never waits: it is asked every few milliseconds,
-by the thread of the session, what has come. Here its frames and samples get their fast steps, its clock is compared
-with the host's, and each command gets its answer and its report.
+A simple driver knows its device and nothing of aolink's packets. It never waits: the session's thread polls it every
+few milliseconds. The adapters assign fast steps to its frames and samples, compare its clock with the host's, and give
+each command its answer and its report.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from aolink.wire.truth import truth_message
 _OFFSETS = 16
 """An exposure's start is rounded to this part of a fast step: estimators keep a model for each that occurs."""
 _START_SIGMA = 3.0
-"""A camera is told to start so many standard deviations of the clocks' comparison later than the fast step begins."""
+"""A camera is started this many standard deviations of the clocks' comparison after the fast step begins."""
 _PATIENCE_NS = 1_000_000_000
 """How long the end of a session waits for reports."""
 _FUTURE_NS = 1_000_000_000
@@ -46,7 +46,7 @@ class SimpleFrame:
     start_ns: int
     """Start of the exposure on the camera's own clock."""
     exposure_ns: int
-    """How long it lasted."""
+    """Length of the exposure, ns."""
     truth: Truth | None = None
     """What really happened, where the driver simulates a camera."""
 
@@ -73,7 +73,7 @@ class SimpleCamera(Protocol):
         """Take no more frames."""
 
     def close(self) -> None:
-        """Give the device back."""
+        """Release the device."""
 
 
 class SimpleMirror(Protocol):
@@ -87,7 +87,7 @@ class SimpleMirror(Protocol):
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         """Queue inputs (n_steps, n_inputs) for the fast steps from ``first_step``; a later command replaces an earlier.
 
-        Gives how many of the first of them came too late. What it raises refuses the whole command.
+        Gives how many steps, from the first on, came too late. If it raises, the whole command counts as refused.
         """
 
     def applied(self) -> Iterable[tuple[int, NDArray[np.float64]]]:
@@ -101,7 +101,7 @@ class SimpleMirror(Protocol):
 
 
 class _Adapted:
-    """What the devices of simple drivers share: a clock that is asked and answers at once, and events that wait."""
+    """The common part of both adapters: a clock that is read at once, and events that wait to be taken."""
 
     def __init__(self, name: str, driver: SimpleCamera | SimpleMirror, now_ns: Callable[[], int]) -> None:
         self.name = name
@@ -131,7 +131,7 @@ class _Adapted:
 class AdaptedCamera(_Adapted):
     """A camera with a simple driver, beside a mirror that counts the fast steps.
 
-    Frames carry no number. One that begins some periods after the one before has lost those between.
+    Frames carry no number: where one begins several periods after the one before, those between are lost.
     """
 
     rig_digest = ""
@@ -163,7 +163,7 @@ class AdaptedCamera(_Adapted):
 
     def stop(self) -> None:
         try:
-            self._events += self.poll()
+            self._events = self.poll()  # with those that were waiting
         finally:
             self._running = False
             with calling(self.name, "when it was told to stop"):
@@ -187,13 +187,13 @@ class AdaptedCamera(_Adapted):
         if pixels.shape != sensor.shape or int(pixels.max()) >> sensor.bit_depth or int(pixels.min()) < 0:
             raise DeviceError(
                 f"the camera gives {pixels.shape} pixels from {pixels.min()} to {pixels.max()}, the rig file says"
-                f" {sensor.shape} (rows, columns) of {sensor.bit_depth} bits: mend [sensor] or the camera's settings"
+                f" {sensor.shape} (rows, columns) of {sensor.bit_depth} bits: correct [sensor] or the camera's settings"
             )
         expected_ns = timing.exposure_steps * self._step_ns
         if abs(raw.exposure_ns - expected_ns) > self._step_ns / 2:
             raise DeviceError(
-                f"the camera exposes for {raw.exposure_ns / 1e9:g} s, the rig file says {expected_ns / 1e9:g} s: mend"
-                " timing.exposure_steps or the camera's settings"
+                f"the camera exposes for {raw.exposure_ns / 1e9:g} s, the rig file says {expected_ns / 1e9:g} s:"
+                " correct timing.exposure_steps or the camera's settings"
             )
         host_start_ns, _ = self.clock.host_ns(raw.start_ns)
         if host_start_ns + expected_ns > now_ns + _FUTURE_NS:
@@ -330,7 +330,7 @@ class AdaptedMirror(_Adapted):
         return block_id, pb.Applied.COMMAND if as_told else pb.Applied.CLIPPED
 
     def _give_up(self, end: int) -> list[Event]:
-        """Nobody knows what the mirror held in the steps before ``end`` that were not reported."""
+        """``NOT_REPORTED`` for the steps before ``end`` that were not reported."""
         if self._next is None or end <= self._next:
             return []
         unknown = pb.Applied(first_step=self._next, n_steps=end - self._next, source=pb.Applied.NOT_REPORTED)

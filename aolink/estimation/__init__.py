@@ -67,7 +67,7 @@ __all__ = [
 if not TYPE_CHECKING:  # the type checker would believe in any name
 
     def __getattr__(name: str) -> Any:
-        """The names of all estimators are looked for in other packages as well, when somebody wants to know them."""
+        """Search other packages for estimators, too, but only when somebody asks for all names."""
         if name == "ESTIMATOR_NAMES":
             return tuple(row.name for row in estimator_rows())
         raise AttributeError(f"module 'aolink.estimation' has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Exposures one after the other, and of them all at once what does not depend on what came before."""
+"""Batches of exposures: what does not depend on earlier exposures is computed for a whole batch at once."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 
-# Exposures together, and numbers in them: some megabytes. What a batch costs whatever its size is nothing beside them.
+# Most exposures in a batch, and most numbers (a few megabytes): enough that the fixed cost of a batch does not matter.
 _AT_ONCE = 512
 _NUMBERS_AT_ONCE = 1_000_000
 
 
 class Batch:
-    """Some exposures with the responses to their inputs, each to the same bits as alone."""
+    """Some exposures with the responses to their inputs, the same bits as for each exposure alone."""
 
     def __init__(self, rig: Rig, exposures: Sequence[Exposure]) -> None:
         self.exposures = exposures
         self._plant = rig.plant
         kinds = {(each.n_steps, each.start_offset, each.inputs.shape) for each in exposures}
         self.model: ExposureModel | None = None
-        """The model of all exposures, where they have the same; `responses` and `finite` are there only then."""
+        """The model that all exposures share, None if they differ; `responses` and `finite` exist only if they share
+        one."""
         if len(kinds) > 1:
             return
         ((n_steps, offset, _),) = kinds
         inputs = np.array([each.inputs for each in exposures])
         self.model = exposure_model(rig.plant, n_steps, offset)
         self.responses = self.model.responses(inputs)
-        """Those of an exposure's axes after those of the one before, (exposures * axes, ...)."""
+        """Responses of all axes of the first exposure, then of the second, (exposures * axes, ...)."""
         self.finite: list[bool] = np.isfinite(inputs).all(axis=(1, 2)).tolist()
         """Whether all inputs of an exposure are numbers."""
 
@@ -49,7 +50,7 @@ class Batch:
 
 
 def batches(rig: Rig, exposures: Iterable[Exposure]) -> Iterator[Batch]:
-    """Some exposures at a time, a few megabytes of them."""
+    """Split a series into batches of a few megabytes."""
     some: list[Exposure] = []
     numbers = 0
     for exposure in exposures:

@@ -18,7 +18,7 @@ from aolink.exposure import Exposure
 from aolink.rig import Rig
 
 _MOST_SKIPPED_STEPS = 100_000
-"""Over a longer gap an estimator is not led input by input: the first of its inputs are forgotten."""
+"""Longest gap, in fast steps, that is predicted input by input; of a longer one the oldest inputs are dropped."""
 
 
 class SkippedInputs:
@@ -55,9 +55,18 @@ class Driver:
 
     Parameters
     ----------
+    names:
+        The estimators, some of `ESTIMATOR_NAMES`.
+    engine:
+        As in `Options`.
     skipped:
         Frame ids of the exposures that an estimator does not get, by its name: those that it had no time for in a
-        session. It gives the same bits as there, and no estimate of these.
+        session. Its estimates of the others are those of that session, bit for bit.
+
+    Raises
+    ------
+    EstimatorError
+        There is no such estimator, or it cannot work on this rig.
     """
 
     def __init__(
@@ -73,14 +82,14 @@ class Driver:
         self._inputs = {name: SkippedInputs() for name in self._skipped}
 
     def step(self, exposure: Exposure) -> list[Estimate]:
-        """What each of them that gets an exposure says about it, in the order of the names."""
+        """The estimates of one exposure, in the order of the names; an estimator that skips it gives none."""
         ((_, estimates),) = self._steps(Batch(self.rig, [exposure]))
         return estimates
 
     def steps(self, exposures: Iterable[Exposure]) -> Iterator[tuple[Exposure, list[Estimate]]]:
-        """The same for a series, to the same bits; what knows no recursion is done for many exposures at once.
+        """The estimates of a series of exposures, the same bits as by `step`; frames are measured in batches.
 
-        It is ahead of what it has given by up to a batch, so it must be taken to its end before the next step.
+        The iterator reads up to a batch ahead of what it has given, so exhaust it before the next `step`.
         """
         for batch in batches(self.rig, exposures):
             yield from self._steps(batch)
@@ -108,7 +117,7 @@ class Driver:
 
 
 def run(rig: Rig, exposures: Iterable[Exposure], names: Sequence[str]) -> dict[str, list[Estimate]]:
-    """Estimates of a series of exposures, by the estimators' names."""
+    """Lists of estimates of a series of exposures, by the estimators' names. Raises EstimatorError as `Driver`."""
     driver = Driver(rig, names)
     estimates: dict[str, list[Estimate]] = {name: [] for name in names}
     for _, each in driver.steps(exposures):

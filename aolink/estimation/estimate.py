@@ -30,9 +30,9 @@ class Status(enum.IntEnum):
     REINITIALISED = 3
     """The filter started again from the plant's prior."""
     INPUT_INVALID = 4
-    """The exposure, or what it shows of some axes, could not be used; the reason says why. These are predicted."""
+    """The exposure could not be used, or not for some axes; the reason says why. These axes are predicted."""
     PREDICTED = 5
-    """The estimator does not look at the camera (`open-loop`)."""
+    """The estimator takes no measurements (`open-loop`)."""
 
 
 @plain_data
@@ -40,9 +40,8 @@ class Estimate:
     """Start state, end state and path of one exposure, with their covariances.
 
     The three are jointly Gaussian. The path is kept as coefficients of the exposure basis
-    (`aolink.estimation.ExposureModel.basis`): path = basis @ coefficients + response to the inputs. It is unfolded
-    where somebody reads it: of 1800 axes it takes longer than all that was estimated. Nothing of it is to be written
-    to.
+    (`aolink.estimation.ExposureModel.basis`): path = basis @ coefficients + response to the inputs. It is computed
+    when it is first read: for 1800 axes that takes longer than the estimation. The arrays are not to be written to.
     """
 
     estimator: str
@@ -51,7 +50,7 @@ class Estimate:
     n_steps: int
     status: Status
     reason: str
-    """Why the status is not OK, or what an estimate had to do without; empty where there is nothing to say."""
+    """Why the status is not OK, or what the estimate had to do without; otherwise empty."""
     start_state: FloatArray
     """State at the exposure's first fast step, (axes, n_states)."""
     start_covariance: FloatArray
@@ -65,17 +64,17 @@ class Estimate:
     coefficient_covariance: FloatArray
     """(axes, n_coefficients, n_coefficients)"""
     inputs: FloatArray
-    """The exposure's, which are part of the path, (n_steps, n_inputs)."""
+    """Inputs during the exposure; their response is part of the path, (n_steps, n_inputs)."""
     model: ExposureModel = field(compare=False, repr=False)
-    """What the coefficients are of."""
+    """Model of the exposure, whose basis the coefficients belong to."""
     innovation: FloatArray
     """Measurement minus its prediction, (axes, n_measurements)."""
     innovation_covariance: FloatArray
-    """(axes, n_measurements, n_measurements); of more than 32 measurements its diagonal, (axes, n_measurements)."""
+    """(axes, n_measurements, n_measurements); for more than 32 measurements its diagonal, (axes, n_measurements)."""
     nis: FloatArray
     """Normalised innovation squared, (axes,); zero for an axis of which nothing was measured.
 
-    Chi-square with n_measurements degrees of freedom if all is well.
+    Chi-square with n_measurements degrees of freedom where model and covariances are right.
     """
 
     @property
@@ -115,18 +114,18 @@ class Estimate:
 
 
 COMPARED = (*(each.name for each in fields(Estimate) if each.compare), "path", "path_sd")
-"""What of two estimates must agree if they are the same."""
+"""Fields that agree in two estimates that are the same."""
 
 
 def coefficient_roots(estimate: Estimate) -> list[FloatArray]:
-    """Roots of the covariance of each axis's coefficients."""
+    """A root R of each axis's coefficient covariance R R', axes times (n_coefficients, n)."""
     return [psd_root(each) for each in estimate.coefficient_covariance]
 
 
 def motion(
     estimate: Estimate, mix: FloatArray, roots: Sequence[FloatArray], *, after: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """A sum of an estimate's outputs at each fast step, and a root of its covariance.
+    """Weighted sums of an estimate's outputs at each fast step, and a root of their covariance.
 
     Parameters
     ----------
@@ -135,7 +134,7 @@ def motion(
     roots:
         The estimate's `coefficient_roots`.
     after:
-        With the step after the last.
+        Whether the step after the last is added.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""One estimator on one rig: what comes between exposures is bridged, what the filter says of each is an `Estimate`."""
+"""One estimator on one rig: it predicts over gaps between exposures and makes an `Estimate` of each posterior."""
 
 from __future__ import annotations
 
@@ -20,22 +20,30 @@ class Estimator:
     """One estimator on one rig: exposures in, estimates out, in the order in which they come.
 
     It has no clock and does no input or output: the same exposures give the same estimates, bit for bit.
+
+    Parameters
+    ----------
+    name:
+        Name that the estimates have.
+    filter:
+        The filter of this rig, such as a `BlurFilter`.
     """
 
     def __init__(self, rig: Rig, name: str, filter: Filter) -> None:
         self.rig, self.name, self.filter = rig, name, filter
         self.several: NDArray[np.bool_] | None = None
-        """Which axes of the last exposure have a blur of more than one reading; None of estimators that do not look."""
+        """Axes whose last posterior has several modes (the blur has more than one reading), (axes,); None if the filter
+        does not look for modes."""
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
 
     def step(self, exposure: Exposure) -> Estimate:
-        """The estimate of an exposure, from it and from all that came before."""
+        """The estimate of an exposure, from its frame and all earlier ones."""
         (estimate,) = self.steps(Batch(self.rig, [exposure]))
         return estimate
 
     def steps(self, batch: Batch) -> Iterator[Estimate]:
-        """The estimates of exposures one after the other, to the same bits."""
+        """The estimates of a batch of exposures, one after the other, the same bits as by `step`."""
         measured = Measurements(self.rig, batch.exposures, self.filter.needs)
         k = 0
         while k < len(batch.exposures):
@@ -47,11 +55,11 @@ class Estimator:
             count = len(done.nis)
             last = batch.exposures[k + count - 1]
             self._next_step, self._last_input = last.first_step + last.n_steps, last.inputs[-1]
-            yield from self._believed(batch, k, done)
+            yield from self._run_estimates(batch, k, done)
             k += count
 
     def _run(self, batch: Batch, measured: Measurements, first: int) -> Run | None:
-        """What the filter makes of exposures from ``first`` on between which there is no gap, and that have no flaw."""
+        """Have the filter take at once the exposures from ``first`` to the next gap or flaw; None where it cannot."""
         row, moments = measured.rows[first], measured.moments
         if batch.model is None or moments is None or row < 0:
             return None
@@ -67,8 +75,8 @@ class Estimator:
         responses = batch.responses.of(slice(first * axes, end * axes))
         return self.filter.run(batch.model, responses, measured.some(row, row + end - first))
 
-    def _believed(self, batch: Batch, first: int, done: Run) -> Iterator[Estimate]:
-        """Estimates of a run of exposures."""
+    def _run_estimates(self, batch: Batch, first: int, done: Run) -> Iterator[Estimate]:
+        """The estimates of exposures that the filter took at once."""
         assert batch.model is not None
         exposures = batch.exposures[first : first + len(done.nis)]
         for exposure, state, covariance, end, end_covariance, innovation, S, nis in zip(
@@ -96,13 +104,13 @@ class Estimator:
             )
 
     def _stepped(self, batch: Batch, k: int, measured: Measured) -> Estimate:
-        """The estimate of exposure k, whatever it is like."""
+        """The estimate of exposure k, which may have gaps and flaws."""
         exposure, model = batch.exposures[k], batch.model_of(k)
         reasons = self._bridge(exposure)
         taken, remark = measured
         posterior = self.filter.step(model, batch.response_to(k), taken)
         self.several = posterior.several
-        reasons = [*([remark] if remark else []), *reasons, *_told(posterior)]
+        reasons = [*([remark] if remark else []), *reasons, *_status_reasons(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
         return Estimate(
             estimator=self.name,
@@ -125,7 +133,7 @@ class Estimator:
         )
 
     def _bridge(self, exposure: Exposure) -> list[str]:
-        """Predict to the start of an exposure; what there is to say about it."""
+        """Predict to the start of an exposure; returns reasons to doubt its step numbers or inputs."""
         lead, reasons = exposure.lead_inputs, []
         gap = len(lead) if self._next_step is None else exposure.first_step - self._next_step
         if gap < 0:
@@ -142,7 +150,7 @@ class Estimator:
         return reasons
 
 
-# From good to bad; the worst of all axes is the estimate's status.
+# From good to bad; an estimate has the worst status of its axes.
 _BY_GRAVITY = (Status.PREDICTED, Status.OK, Status.REINITIALISED, Status.GATED, Status.DIVERGED, Status.INPUT_INVALID)
 
 
@@ -151,8 +159,8 @@ def _worst(status: NDArray[np.int64]) -> Status:
     return max((Status(int(s)) for s in np.flatnonzero(counts)), key=_BY_GRAVITY.index)
 
 
-def _told(posterior: Posterior) -> list[str]:
-    """What the statuses of the axes say, in words."""
+def _status_reasons(posterior: Posterior) -> list[str]:
+    """The statuses of the axes, and how many have several modes, in words."""
     words = {
         Status.GATED: "too far from the prediction, not used",
         Status.DIVERGED: "too far from the prediction several times in a row: it starts again",
@@ -160,12 +168,12 @@ def _told(posterior: Posterior) -> list[str]:
     }
     counts = np.bincount(posterior.status, minlength=len(Status))
     axes = len(posterior.status)
-    told = []
+    reasons = []
     for status, text in words.items():
         if counts[status]:
             nis = f"NIS {posterior.nis[posterior.status == status].max():.3g}"
-            told.append(f"{nis}, {text}" if axes == 1 else f"{counts[status]} of {axes} axes: {nis}, {text}")
+            reasons.append(f"{nis}, {text}" if axes == 1 else f"{counts[status]} of {axes} axes: {nis}, {text}")
     if posterior.several is not None and posterior.several.any():
         of = "" if axes == 1 else f"{int(posterior.several.sum())} of {axes} axes: "
-        told.append(f"{of}the blur has more than one reading")
-    return told
+        reasons.append(f"{of}the blur has more than one reading")
+    return reasons

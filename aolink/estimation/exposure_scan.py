@@ -1,8 +1,8 @@
-"""Which exposure time tells most: the error that o1 will have, by its covariances, without a single frame.
+"""Which exposure time is best: the expected error of o1, from covariances alone, without a single frame.
 
-Everything is linear: what o1 does with a centroid is a constant gain, and the plant's noise moves the centroid, the
-path and the end state together. So the true covariance of o1's error follows from a recursion of its own, which
-counts what o1 itself leaves out: the process noise within the exposure.
+Everything is linear: o1 multiplies a centroid's innovation by a constant gain, and the process noise moves the
+centroid, the path and the end state together. So the true covariance of o1's error follows from a recursion of its
+own, which includes what o1 itself leaves out: the process noise within the exposure.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LONGEST = 20_000
 
 @dataclass(frozen=True, kw_only=True)
 class ExpectedError:
-    """What is to be expected of an exposure time, in the long run; root mean squares over outputs and steps."""
+    """Expected errors at one exposure time, in steady state; root mean squares over outputs and steps."""
 
     exposure_steps: int
     path_rms: float
@@ -45,16 +45,17 @@ class ExpectedError:
 
 
 def candidates(rig: Rig) -> list[int]:
-    """Exposure times from a sixteenth of the rig's own to four times it, fast steps."""
+    """Exposure times in fast steps, from a sixteenth of the rig's own to four times that."""
     own = rig.timing.exposure_steps
     steps = {max(1, round(own * 2 ** (k / 2))) for k in range(-8, 5)}
     return sorted(n for n in steps if n <= _LONGEST)
 
 
 def with_exposure(rig: Rig, exposure_steps: int) -> Rig:
-    """The rig with another exposure time: as much dead time, and light in proportion.
+    """The rig with another exposure time: the same dead time, and light in proportion.
 
-    A pixel's read-out noise stays in counts, so over a density of unit mass V goes with the light's square.
+    A pixel's read-out noise stays the same in counts, so V, the noise of a density of unit mass, is divided by the
+    square of the light's factor.
     """
     timing, sensor = rig.timing, rig.sensor
     light = exposure_steps / timing.exposure_steps
@@ -75,7 +76,7 @@ def exposure_scan(rig: Rig, steps: Iterable[int] | None = None) -> list[Expected
     Raises
     ------
     EstimatorError
-        The plant has too many outputs or states, or a mode that neither dies out nor is seen.
+        The plant has too many outputs or states, or an undamped mode that the centroid does not observe.
     """
     if rig.plant.n_outputs > _MOST_OUTPUTS:
         raise EstimatorError(f"an exposure scan takes {_MOST_OUTPUTS} outputs at most, {rig.name} has more")
@@ -88,12 +89,12 @@ def exposure_scan(rig: Rig, steps: Iterable[int] | None = None) -> list[Expected
 
 
 def best(errors: Iterable[ExpectedError]) -> ExpectedError:
-    """The one whose path is known best."""
+    """The one with the smallest path error."""
     return min(errors, key=lambda e: e.path_rms)
 
 
 def _expected(rig: Rig) -> ExpectedError:
-    """Over all copies of the plant, of which those whose spots have as much light are alike."""
+    """Over all copies of the plant; those whose spots have the same light are computed once."""
     noises, counts = np.unique(centroid_covariance(rig), axis=0, return_counts=True)
     each = [_expected_of(rig, linalg.block_diag(*noise)) for noise in noises]
     squares = np.array([[e.path_rms**2, e.end_rms**2, e.noise_rms**2] for e in each])

@@ -1,4 +1,4 @@
-"""What there is to choose about an estimator."""
+"""The options of estimators."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Options:
     flux: Flux = "known"
     """"known": the light of a frame sums to one; "measured": moments are divided by what it sums to."""
     gate: bool = True
-    """Whether measurements that cannot be believed are left out."""
+    """Whether a measurement too far from its prediction is left out."""
     engine: Engine = "aolink"
     """What o1 to o3 run on: "aolink", or "filterpy", for one axis."""
     orders: tuple[int, ...] = (0, 1, 2, 3)
-    """Orders of `moments`: which functions of the basis; 0 is the light in the window."""
+    """Orders of the moments that `moments` takes, in its basis; 0 is the light in the window."""
     basis: Basis = "monomial"
     """Basis of `moments`: "monomial", "legendre" or "fourier"."""
     particles: int = 3000

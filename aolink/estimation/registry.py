@@ -55,15 +55,15 @@ class EstimatorRow:
 
     name: str
     rank: int
-    """Place in tables and plots, from the plainest to the one that a user wants to look at first; ours are tens."""
+    """Place in tables and plots, from the plainest to the one that a user wants to see first; ours are tens."""
     colour: tuple[int, int, int]
     """Red, green and blue, 0 to 255."""
     build: Callable[[Rig, Options], Filter]
-    """The filter that it runs on a rig: it says what it needs of a frame, and updates with it."""
+    """Makes the filter for a rig, which says what it needs of a frame and updates with that."""
     refusal: Callable[[Rig], str | None] = lambda rig: None
     """Why it cannot work on a rig, and what to use instead; None where it can."""
     engines: tuple[Engine, ...] = ("aolink",)
-    """What it runs on."""
+    """Engines that it can run on."""
     in_demo: Callable[[Rig], bool] = lambda rig: True
     """Whether it is fast enough on a rig for `aolink demo`."""
 
@@ -156,10 +156,10 @@ def _paper(*orders: int) -> Callable[[Rig, Options], Filter]:
 
 @lru_cache(maxsize=4)
 def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
-    """The gain of o1 with the noise that a frame has by the rig file, of all axes or of each; None if there is none."""
+    """The steady-state gain of o1 by the noise in the rig file, one for all axes or one each; None if there is none."""
     model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
     Q = added_noise(model, options.process_noise)
-    # Axes whose spots have as much light share a gain.
+    # Axes whose spots have the same light share a gain.
     noises, of_axis = np.unique(centroid_covariance(rig), axis=0, return_inverse=True)
     gains = [steady_gain(model, Q, noise) for noise in noises]
     if len(gains) == 1:
@@ -188,14 +188,14 @@ def _windowed(rig: Rig, options: Options) -> Observation[Any]:
 def _moments_refusal(rig: Rig) -> str | None:
     if rig.plant.n_outputs > 2 * _MOST_SPOTS and alike_systems(rig.plant) is None:
         return (
-            f"moments looks at each two spots that one plant moves together: at most {_MOST_SPOTS},"
-            f" {rig.name} has {rig.plant.n_outputs // 2}; use o3"
+            f"moments takes at most {_MOST_SPOTS} spots that one plant moves together (it compares every two of them),"
+            f" {rig.name} has {rig.plant.n_outputs // 2}: use o3"
         )
     return None
 
 
 def _warm_up(rig: Rig) -> None:
-    """Have a dark exposure of many spots estimated: what that loads, a session need not wait for."""
+    """Estimate a dark exposure of many spots, so that what this loads is loaded before the session."""
     assert isinstance(rig.sensor, SpotSensor)
     steps = rig.timing.exposure_steps
     model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
@@ -230,12 +230,12 @@ def _sampled(rig: Rig, options: Options) -> Filter:
 
 
 def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
-    """The filters of the pixels themselves; the code that they compile is loaded when one is wanted."""
+    """The filters that use every pixel; their compiled code is loaded when the first one is made."""
     from aolink.estimation.pixels.filter import MixtureFilter
     from aolink.estimation.pixels.updates import MIXTURE
 
     pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
-    # What profile compiles when a blur has several readings, mixture does at once.
+    # mixture compiles at once what profile would compile at the first posterior of several modes.
     make_ready()
     pixels.warm_up(MIXTURE)
     updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
@@ -243,7 +243,7 @@ def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
 
 
 def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
-    """Why the pixels' own filters cannot work on a rig: profile has another form for many alike systems."""
+    """Why a filter that uses every pixel cannot work on a rig; profile has another form for many alike systems."""
 
     def refusal(rig: Rig) -> str | None:
         if name == "profile" and alike_systems(rig.plant) is not None:
@@ -251,7 +251,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
         if rig.plant.n_states > MANY_STATES:
             alike = " that is not of alike systems side by side" if name == "profile" else ""
             return (
-                f"{name} follows the readings of a blur for at most {MANY_STATES} states of one plant, {rig.name} has"
+                f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
             )
         if isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None:
@@ -265,7 +265,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
 
 
 def _is_line(rig: Rig) -> bool:
-    """Whether the sensor is a line: on spots on a plane the filters of pixels would make a demo long."""
+    """Whether the sensor is a line: for spots on a plane the filters that use every pixel are too slow for a demo."""
     return isinstance(rig.sensor, Sensor)
 
 

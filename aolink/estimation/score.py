@@ -1,4 +1,4 @@
-"""Estimates against the truth, and what became of the frames that they were made from."""
+"""Estimates against the truth: RMSE, NIS, NEES; and why measurements were not used."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Consistency:
-    """A mean of squares that follows chi-square where the covariance is right."""
+    """The mean of a normalised square, NIS or NEES, which is chi-square distributed where the covariance is right."""
 
     mean: float
     """NaN where there was nothing to average."""
     low: float
     high: float
-    """Bounds that a consistent estimator's mean keeps to with 95 % probability, for samples that are independent."""
+    """``low`` and ``high``: 95 % bounds of a consistent estimator's mean, for independent samples."""
 
     @property
     def inside(self) -> bool:
@@ -83,14 +83,14 @@ _NUMBER = re.compile(r"\d+(\.\d+)?(e[+-]?\d+)?")
 
 @dataclass(frozen=True, kw_only=True)
 class Score:
-    """How well an estimator knew the truth, and how many of its frames it could measure."""
+    """An estimator's errors against the truth, their consistency, and how many frames gave a measurement."""
 
     exposures: int
     """Exposures with truth that were scored."""
     estimated: int
     """Exposures that were estimated, with truth or without."""
     measured: int
-    """Those of them whose frame gave a measurement, for one axis at least."""
+    """Estimated exposures whose frame gave a measurement, for one axis at least."""
     looks: bool
     """Whether the estimator takes measurements at all; `open-loop` does not."""
     unused: tuple[Unused, ...]
@@ -101,7 +101,7 @@ class Score:
     start_rmse: float
     """Root mean square over exposures and axes of the norm of the error of the start state (Mishra & Wen, figure 5)."""
     end_rmse: float
-    """The same of the end state."""
+    """The same for the end state."""
     path_rmse: float
     """Root mean square error of the path, slope units."""
     nis: Consistency

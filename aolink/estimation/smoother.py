@@ -1,4 +1,4 @@
-"""The smoother of a whole recording: what later exposures say of earlier ones.
+"""The Rauch-Tung-Striebel smoother over a whole recording: later exposures correct the estimates of earlier ones.
 
 An exposure's coefficients and its end state are jointly Gaussian, cov(z, end) = P E', E the rows of the end state, and
 between exposures the state goes on by the plant's transition A_g over the gap. So Rauch, Tung and Striebel's
@@ -31,10 +31,12 @@ FloatArray = NDArray[np.float64]
 
 
 def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Estimates of one estimator corrected by all that came later.
+    """Estimates of one estimator, each corrected by all later exposures.
 
     Parameters
     ----------
+    plant:
+        The plant of the rig that they are from.
     exposures, estimates:
         One estimate for each exposure, in the order of time.
 
@@ -65,7 +67,7 @@ def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Esti
 def _corrected(
     plant: Plant, exposure: Exposure, estimate: Estimate, next_exposure: Exposure, later: Estimate
 ) -> Estimate:
-    """An estimate of the filter with what is known of the next exposure's start from all that came later."""
+    """An estimate of the filter, corrected by ``later``, the smoothed estimate of the next exposure."""
     model = estimate.model
     z, P = estimate.coefficients, estimate.coefficient_covariance
     end, P_end = estimate.end_state, estimate.end_covariance
@@ -105,6 +107,6 @@ def _gap(plant: Plant, before: Exposure, after: Exposure) -> tuple[FloatArray, F
 
 
 def _without_negative(covariance: FloatArray) -> FloatArray:
-    """The same without the negative variances that rounding makes where much was known before."""
+    """The nearest covariance without negative eigenvalues, which rounding makes where variances are tiny."""
     values, vectors = np.linalg.eigh(covariance)
     return batched.symmetric(batched.matmul(vectors * np.maximum(values, 0.0)[:, None], batched.transpose(vectors)))

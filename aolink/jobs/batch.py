@@ -102,7 +102,7 @@ class Job:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What came of a job."""
+    """The result of a job."""
 
     job: Job
     rows: list[dict[str, Any]]
@@ -115,7 +115,7 @@ class Done:
     def nothing_measured(self) -> list[str]:
         """Estimators that could not use a single exposure, with the reason, in words."""
         whole = [(row["estimator"], row.get("nothing_measured")) for row in self.rows]
-        return [f"{name} has predicted only: {why}" for name, why in whole if why]
+        return [f"{name} only predicted: {why}" for name, why in whole if why]
 
     @property
     def warnings(self) -> list[str]:

@@ -47,7 +47,7 @@ _GAINS = (1e-3, 1e3)
 _STILL = 0.01
 """Motion inside an exposure, in kernel sds, below which there is nothing to see."""
 _WINDOWS = 64
-"""Exposures along the drive's path whose blur is looked at."""
+"""Exposures along the drive's path whose blur is checked."""
 
 
 @dataclass(frozen=True, kw_only=True)

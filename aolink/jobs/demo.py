@@ -29,7 +29,7 @@ _RIG_END_S = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class DemoResult:
-    """What the demo made."""
+    """The results of the demo."""
 
     recording: Path
     rrd: Path | None
@@ -39,9 +39,9 @@ class DemoResult:
     """Why the picture is not one of the viewer, but of matplotlib or None; empty where it is the viewer's."""
     report: Report
     deblurred: Summary | None = None
-    """What came of the pictures that a picture sensor took; None where the rig has none."""
+    """Summary of the restored pictures; None where the rig has no picture sensor."""
     deblurred_by: str = ""
-    """Whose path they were restored with."""
+    """Estimator whose path they were restored with."""
     deblurred_recording: Path | None = None
     """The session with them."""
     differences: dict[str, str]

@@ -1,7 +1,7 @@
 """Small matrices, many at once, the batch axis first.
 
-What comes out for one of them does not depend on how many are beside it, nor on the number of threads,
-bit for bit: sizes up to four are written out in elementwise operations, larger ones are one product each.
+The result for one matrix does not depend on how many there are, nor on the number of threads, bit for bit: sizes up to
+four are written out in elementwise operations, larger ones are one product each.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def mean_over_path(values: FloatArray) -> FloatArray:
 
 
 def symmetric(a: FloatArray) -> FloatArray:
-    """Half of a matrix plus its transpose: rounding makes no covariance lopsided."""
+    """(a + a') / 2, (..., n, n): removes the asymmetry that rounding gives a covariance."""
     return (a + transpose(a)) / 2
 
 
@@ -99,7 +99,7 @@ def inverse(a: FloatArray) -> FloatArray:
 
 
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
-    """A P A', (..., n, n)."""
+    """A P A', (..., m, n) and (..., n, n) -> (..., m, m)."""
     return matmul(matmul(a, p), transpose(a))
 
 

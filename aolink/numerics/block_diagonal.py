@@ -1,4 +1,4 @@
-"""Systems that fall apart: a mirror's actuators are many small systems side by side, and most of them are alike."""
+"""Block-diagonal systems: a mirror's actuators are many small systems side by side, and most of them are alike."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Indices = NDArray[np.intp]
 
 
 def components(*matrices: FloatArray) -> list[Indices]:
-    """States that hang together by any of square matrices, (n, n) each."""
+    """Connected components: the states that square matrices (n, n) couple, for each block of all of them."""
     linked = np.any([matrix != 0 for matrix in matrices], axis=0)
     count, of_state = connected_components(csr_array(linked), directed=False)
     order = np.argsort(of_state, kind="stable")
@@ -25,7 +25,7 @@ def components(*matrices: FloatArray) -> list[Indices]:
 def blockwise(
     function: Callable[..., tuple[FloatArray, ...]], matrices: tuple[FloatArray, ...], parts: list[Indices]
 ) -> tuple[FloatArray, ...]:
-    """A function of square matrices that works on each component by itself; once on those that are alike."""
+    """Apply a function of square matrices to each component by itself, once to those that are alike."""
     if len(parts) == 1:
         return function(*matrices)
     known: dict[bytes, tuple[FloatArray, ...]] = {}
@@ -42,12 +42,12 @@ def blockwise(
 
 
 def alike(A: FloatArray, *columns: FloatArray) -> Indices | None:
-    """States of systems side by side that are all the same, each with one column of its own in other matrices.
+    """States of block-diagonal systems that are all the same, each with one column of its own in other matrices.
 
     Returns
     -------
     (systems, n): system a has the states ``order[a]``, and column a of each of ``columns``, (n_states, systems).
-    None where A does not fall apart into such systems.
+    None where A has no such blocks.
     """
     parts = components(A)
     if len({len(part) for part in parts}) > 1 or any(each.shape[1] != len(parts) for each in columns):
@@ -60,7 +60,7 @@ def alike(A: FloatArray, *columns: FloatArray) -> Indices | None:
 
 
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """P = A P A' + Q for a stable A, (n, n)."""
+    """P with P = A P A' + Q (discrete Lyapunov equation) for a stable A, (n, n)."""
 
     def solved(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, ...]:
         return (np.asarray(linalg.solve_discrete_lyapunov(A, Q), dtype=np.float64),)
@@ -69,7 +69,7 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
 
 
 def eigenvalues(A: FloatArray, parts: list[Indices]) -> NDArray[np.complex128]:
-    """Of each component that is unlike the others, (k,)."""
+    """Eigenvalues of A, (k,), those of components that are alike only once."""
     blocks = {block.tobytes(): block for block in (np.ascontiguousarray(A[np.ix_(part, part)]) for part in parts)}
     return np.concatenate([np.linalg.eigvals(block) for block in blocks.values()]).astype(np.complex128)
 
@@ -77,7 +77,7 @@ def eigenvalues(A: FloatArray, parts: list[Indices]) -> NDArray[np.complex128]:
 def null_space(
     A: FloatArray, value: complex, parts: list[Indices], tolerance: float, *, left: bool = False, power: int = 1
 ) -> NDArray[np.complex128]:
-    """Orthonormal basis of the eigenvectors of A for a value, (n, k); or of left ones, or up to a power."""
+    """Orthonormal basis of the (left) null space of (A - value I)^power, (n, k): for power 1, the eigenvectors."""
     known: dict[bytes, NDArray[np.complex128]] = {}
     columns: list[tuple[Indices, NDArray[np.complex128]]] = []
     for part in parts:

@@ -1,10 +1,9 @@
 """Matrices of one or two rows, many at once, as their entries: arithmetic written out.
 
-An entry is an array with a value for each axis, or one number for all of them; of a single axis all are numbers, which
-NumPy would take ten times as long for. Every operation is then one pass
-over arrays that lie in the processor's cache, and half of what is symmetric need not be computed; for
-larger matrices the calls would cost more than the arithmetic (`aolink.numerics.batched`). What comes
-out for one axis does not depend on how many are beside it, bit for bit.
+An entry is an array with a value for each axis, or one number for all axes; with a single axis all are numbers, since
+NumPy would take ten times as long. Every operation is then one pass over arrays that lie in the processor's cache, and
+only half of a symmetric matrix is computed; for larger matrices the calls would cost more than the arithmetic
+(`aolink.numerics.batched`). The result for one axis does not depend on how many there are, bit for bit.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ Entry = FloatArray | float
 Matrix = list[list[Entry]]
 
 MOST_ROWS = 2
-"""Matrices with more rows or columns than this are not for here."""
+"""Most rows or columns of a matrix that is worth doing entry by entry."""
 
 
 def unpack(a: FloatArray) -> Matrix:
     """Entries of (axes, n, m), or of one (n, m) for all axes."""
     if a.ndim == 2:
         return list(a.tolist())
-    # One matrix seen through strides of zero is one, too.
+    # One matrix that is broadcast (stride zero) counts as one, too.
     if a.strides[0] == 0 or len(a) == 1:
         return list(a[0].tolist())
     return [[a[:, i, j] for j in range(a.shape[2])] for i in range(a.shape[1])]

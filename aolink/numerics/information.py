@@ -1,4 +1,4 @@
-"""Information matrices, the inverses of covariances, with what may be singular made safe. One thread of BLAS."""
+"""Information matrices, the inverses of covariances, which may be singular. By one thread of BLAS."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from aolink.numerics import single_thread
 
 FloatArray = NDArray[np.float64]
 
-# Relative to each variance; what a prior knows for certain stays certain to this.
+# Added to the diagonal, relative to each variance: a state that the prior knows for certain stays certain to this.
 _JITTER = 1e-10
 
 

@@ -19,7 +19,7 @@ from threadpoolctl import ThreadpoolController
 
 FloatArray = NDArray[np.float64]
 
-# A matrix with fewer entries than this share is multiplied by its entries.
+# A matrix with a smaller share of nonzero entries than this is multiplied as a sparse one.
 _SPARSE = 0.05
 
 
@@ -80,7 +80,7 @@ def congruences(a: FloatArray, p: FloatArray) -> FloatArray:
 
 @by_one_thread
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
-    """a p a' of a symmetric p, by the entries of ``a`` where they are few.
+    """a p a' for a symmetric p, (m, n) and (n, n) -> (m, m); ``a`` is taken as sparse where few entries are not zero.
 
     Rows of ``p`` at its end that are those of the identity cost next to nothing.
     """

@@ -22,7 +22,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-"""What tells the libraries of linear algebra how many threads to have."""
+"""The environment variables that set the number of threads of linear algebra libraries."""
 _PATIENCE_S = 3.0
 """How long a process may take to end in good order when it has been asked to."""
 _FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
@@ -30,7 +30,7 @@ _FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
 
 
 def in_threads(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """A function of each item, on as many threads as there are cores for this process; for what lets go of the lock."""
+    """A function of each item, on as many threads as this process has cores; for functions that release the GIL."""
     threads = min(thread_count(), len(items))
     if threads < 2:
         return [function(item) for item in items]
@@ -54,7 +54,7 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
     """
     environment = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    # A helper process of the standard library's, which the pool would start where the terminal reaches it.
+    # Start the standard library's resource tracker here, out of reach of the terminal's signals.
     with _unheard_by_children():
         resource_tracker.ensure_running()
     try:
@@ -116,7 +116,7 @@ def _unheard_by_children() -> Iterator[None]:
 
 
 def _until_ended(function: Callable[..., Result], *arguments: Any, **options: Any) -> Result:
-    """Call a function in a worker, which ends if it is told to meanwhile; the pool itself would only note an error."""
+    """Call a function in a worker, which ends if a signal asks it to; the pool itself would only note an error."""
     try:
         return function(*arguments, **options)
     except SystemExit as end:

@@ -16,18 +16,18 @@ FloatArray = NDArray[np.float64]
 
 
 def to_counts(sensor: BaseSensor, density: FloatArray) -> NDArray[np.uint16]:
-    """What the camera reads out for a density: rounded, and cut at zero and at full scale."""
+    """The counts that the camera reads out for a density: rounded, and cut at zero and at full scale."""
     counts = np.rint(sensor.black_level + sensor.counts_per_density * density)
     return np.clip(counts, 0, sensor.full_scale).astype(np.uint16)
 
 
 def to_density(sensor: BaseSensor, counts: NDArray[np.uint16] | FloatArray) -> FloatArray:
-    """The density that counts stand for; noise makes it negative where nothing shines."""
+    """The density for counts, shape of ``counts``; noise makes it negative where there is no light."""
     return (counts.astype(np.float64) - sensor.black_level) / sensor.counts_per_density
 
 
 def is_saturated(sensor: BaseSensor, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """True where a count is at an end of the scale, so that the light may have been more, or less."""
+    """True where a count is at an end of the scale (zero or full scale), so that the light is not known."""
     return np.asarray((counts == 0) | (counts >= sensor.full_scale))
 
 

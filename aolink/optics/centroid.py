@@ -1,4 +1,4 @@
-"""Where a spot is in its window, by the usual baselines: centre of gravity, thresholded, weighted, correlation.
+"""Centroids of spots by the usual methods: centre of gravity, thresholded, weighted, correlation.
 
 Windows are densities or counts without background, (n, rows, columns). Positions are (x, y) in pixels, x along
 the columns and y along the rows, and 0 is the middle of the first pixel. NaN where a window holds no light.
@@ -18,8 +18,8 @@ def centre_of_gravity(windows: FloatArray, threshold: FloatArray | float = 0.0) 
     Parameters
     ----------
     threshold:
-        What each window's light must exceed to count, and by which it is lowered; one for all or (n,). At zero
-        everything counts, negative noise as well, so that its mean stays zero.
+        Subtracted from each window, of which only what is above zero then counts; one for all or (n,). At zero all
+        pixels count, those of negative noise as well, so that the noise's mean stays zero.
     """
     if np.any(threshold):
         windows = np.maximum(windows - np.broadcast_to(threshold, len(windows))[:, None, None], 0.0)
@@ -34,17 +34,17 @@ def centre_of_gravity(windows: FloatArray, threshold: FloatArray | float = 0.0) 
 def weighted_centroid(
     windows: FloatArray, weight_sd: float, iterations: int = 20, start: FloatArray | None = None
 ) -> FloatArray:
-    """Centre of gravity under a Gaussian weight that is moved to where it was found, (n, 2).
+    """Weighted centre of gravity: a Gaussian weight is moved to the centroid that it gives, again and again, (n, 2).
 
-    The mean under a weight at distance d from a Gaussian spot lies at a share of d; moved to the end of that, the
-    weight stays where the spot is. Thomas et al., Mon. Not. R. Astron. Soc. 371, 323 (2006).
+    The centroid under a weight at distance d from a Gaussian spot is off by a share of d; repeated, the weight ends on
+    the spot. Thomas et al., Mon. Not. R. Astron. Soc. 371, 323 (2006).
 
     Parameters
     ----------
     weight_sd:
         Standard deviation of the weight, pixels.
     start:
-        Where the weight is at first, (n, 2); None: at each window's brightest pixel.
+        First position of the weight, (n, 2); each window's brightest pixel where None.
     """
     rows, columns = windows.shape[1:]
     x, y = np.arange(columns), np.arange(rows)
@@ -58,14 +58,14 @@ def weighted_centroid(
 
 
 def correlation_centroid(windows: FloatArray, template: FloatArray, iterations: int = 8) -> FloatArray:
-    """Where a template fits best, (n, 2): the place of its first moment, moved by the correlation's maximum.
+    """Position of the template's centroid where it correlates best with each window, (n, 2).
 
     The correlation is a trigonometric polynomial of the shift, and Newton's method finds its maximum.
 
     Parameters
     ----------
     template:
-        The spot that is looked for, without background, no larger than a window.
+        An image of the spot, without background, no larger than a window, (rows, columns).
     """
     rows, columns = (2 * n for n in windows.shape[1:])  # so that nothing comes round the edge
     product = np.fft.fft2(windows, (rows, columns)) * np.fft.fft2(template, (rows, columns)).conj()
@@ -75,7 +75,7 @@ def correlation_centroid(windows: FloatArray, template: FloatArray, iterations: 
     shift = np.stack([np.where(x < columns // 2, x, x - columns), np.where(y < rows // 2, y, y - rows)], 1).astype(
         float
     )
-    # Nyquist's wave has two signs; half of each is none.
+    # The Nyquist frequency has both signs, whose derivatives cancel.
     k_x, k_y = (2 * np.pi * np.where(np.abs(f) == 0.5, 0, f) for f in (np.fft.fftfreq(columns), np.fft.fftfreq(rows)))
     start = shift.copy()
     for _ in range(iterations):

@@ -16,14 +16,14 @@ from aolink.optics.sensor import BaseSensor, Kernel, Sensor, SpotSensor
 FloatArray = NDArray[np.float64]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
-# Spots together: their masses stay in the processor's cache.
+# Spots computed together: their masses stay in the processor's cache.
 _AT_ONCE = 16
-# Points of the table of masses in one sigma. Half a step to the third, times a sixth of the third derivative's
-# maximum, is what the expansion leaves out: 2e-9 of a spot's light.
+# Points of the table of masses in one sigma. The expansion leaves out half a step cubed times a sixth of the third
+# derivative's maximum: 2e-9 of a spot's light.
 _POINTS = 256
-# Beyond so many sigma from the pixels there is no light on them.
+# A spot further than this many sigma from the pixels gives them no light.
 _REACH = 6.0
-# Numbers in a table at most; a kernel so narrow that it needs more is integrated step by step.
+# Most numbers in a table; a kernel so narrow that it needs more is integrated step by step.
 _LARGEST_TABLE = 4_000_000
 
 
@@ -37,7 +37,7 @@ def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
 
     Returns
     -------
-    (rows, columns); of a lenslet that is lit in part, so much less.
+    (rows, columns); the spot of a lenslet that is lit in part has that share of the light.
     """
     if isinstance(sensor, SpotSensor):
         rows, columns = sensor.grid

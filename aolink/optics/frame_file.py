@@ -48,7 +48,7 @@ def parse_fits(data: bytes) -> NDArray[np.float64]:
     Raises
     ------
     FrameError
-        It is not such a file.
+        The data are not such a file.
     """
     _, stored, scale, zero = parse_fits_array(data)
     if stored.ndim != 2:

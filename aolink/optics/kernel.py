@@ -68,7 +68,7 @@ def pixel_mass(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> Floa
     edges:
         Pixel edges, slope units, (pixels + 1,).
     positions:
-        Where the spot rests, slope units, (...).
+        Positions of the spot, slope units, (...).
 
     Returns
     -------
@@ -76,7 +76,7 @@ def pixel_mass(kernel: Kernel, edges: FloatArray, positions: FloatArray) -> Floa
 
     References
     ----------
-    Mishra & Wen (3), with the kernel's constant corrected to 1/(sigma sqrt(pi)), which makes it of unit mass.
+    Psi is the kernel of Mishra & Wen, section VI, with its constant corrected to 1/(sigma sqrt(pi)) for unit mass.
     """
     return pixel_masses(kernel.variance, edges, positions, 0)[0]
 

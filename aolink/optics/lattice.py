@@ -1,4 +1,4 @@
-"""The lattice of spots on a frame, found without knowing anything of it: kind, pitch, turn, which spots are missing."""
+"""The lattice of spots on a frame, found from the frame alone: kind, pitch, rotation, and which spots are missing."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Kind = Literal["square", "hexagonal"]
 
-# The fewest spots that show a lattice, and the fewest that must be neighbours for the search to start from them.
+# The fewest spots of a lattice, and the fewest that must be neighbours for the search to start from them.
 _FEWEST_SPOTS, _SEED = 7, 4
 # How far from its node a spot may be to belong to it, in pitches.
 _NEAR = 0.25
@@ -82,7 +82,7 @@ class Lattice:
     nodes: IntArray
     """Column i and row j of each spot, from 0, (n, 2), in the order of rows."""
     spots: FloatArray
-    """Where each spot is, (n, 2)."""
+    """Centroid of each spot, pixels, (n, 2)."""
     background: float
     """Median background of the frame, counts."""
 
@@ -93,12 +93,12 @@ class Lattice:
 
     @property
     def pitch(self) -> float:
-        """From a spot to the next one, pixels: of the regular lattice whose cells are as large."""
+        """Distance between neighbouring spots, pixels, on the regular lattice with cells of the same area."""
         return _pitch(self.kind, self.steps)
 
     @property
     def turn_deg(self) -> float:
-        """Angle of the rows against the frame's, degrees."""
+        """Angle from the frame's rows to the lattice's, degrees."""
         return math.degrees(math.atan2(self.column_step[1], self.column_step[0]))
 
     @property
@@ -114,7 +114,7 @@ class Lattice:
         return lit
 
     def node_positions(self, nodes: IntArray) -> FloatArray:
-        """Where the lattice has nodes (..., 2), pixels."""
+        """Positions of nodes (..., 2), pixels."""
         return np.asarray(self.origin + nodes @ self.steps)
 
     @property
@@ -124,7 +124,7 @@ class Lattice:
 
     @property
     def lenslet(self) -> FloatArray:
-        """Points that fill the cell about a node evenly, from the node, pixels, (144, 2): a square or a hexagon."""
+        """Points that fill the cell about a node (a square or a hexagon) evenly, pixels from the node, (144, 2)."""
         part = (np.arange(12) + 0.5) / 12
         points = np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) @ self.steps
         corners = np.array([(0, 0), (1, 0), (0, 1), (1, 1)]) @ self.steps
@@ -141,9 +141,9 @@ def find_lattice(frame: NDArray[np.generic]) -> Lattice:
     """Find the spots of a Shack-Hartmann frame and the square or hexagonal lattice that they lie on.
 
     Background and single hot pixels are taken out, and maxima above the noise are found. The differences between
-    neighbouring maxima suggest lattices; each one is followed from spot to spot over the largest group that hangs
-    together, and from there to all other spots that lie on its nodes. The lattice that explains most spots is taken.
-    Spots may be missing anywhere, and the groups that remain need not touch.
+    neighbouring maxima suggest lattices; each one is followed from spot to spot over the largest connected group, and
+    from there to all other spots that lie on its nodes. The lattice that explains most spots is taken. Spots may be
+    missing anywhere, and the groups that remain need not touch.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def find_lattice(frame: NDArray[np.generic]) -> Lattice:
         raise FrameError(
             rejected
             or f"no usable spots: {most} stand out of the noise, a grid needs {_FEWEST_SPOTS};"
-            " expose longer, or look whether the spots are in focus"
+            " expose longer, or check whether the spots are in focus"
         )
     lattice = _look_again(best, flat)
     return _fit(lattice.kind, refine(flat, lattice.spots, lattice.pitch), lattice.nodes, lattice.background)
@@ -190,8 +190,8 @@ def _explain(maxima: Maxima, background: float) -> tuple[float, Lattice]:
     best = max((lattice for lattice in followed if lattice), key=lambda each: len(each.spots), default=None)
     if best is None:
         raise FrameError(
-            f"no grid: {len(maxima.places)} spots, and too few of them hang together in steps of a square or hexagonal"
-            " grid; is this a Shack-Hartmann frame?"
+            f"no grid: {len(maxima.places)} spots, and too few of them are neighbours on a square or hexagonal grid;"
+            " is this a Shack-Hartmann frame?"
         )
     heights = maxima.heights[cKDTree(maxima.places).query(best.spots)[1]]
     rivals = int((maxima.heights > _RIVAL * np.median(heights)).sum())
@@ -253,7 +253,7 @@ def _regular(lattice: Lattice) -> bool:
 
 
 def _follow(kind: Kind, steps: FloatArray, maxima: Maxima, background: float) -> Lattice | None:
-    """All maxima on the lattice with about these steps, or None where too few hang together."""
+    """All maxima on the lattice with about these steps, or None where too few are connected."""
     group, nodes = _walk(maxima.places, _MOVES[kind], steps)
     if len(group) < _SEED or np.linalg.matrix_rank(nodes - nodes[0]) < 2:
         return None
@@ -280,7 +280,7 @@ def _grow(lattice: Lattice, maxima: Maxima) -> Lattice | None:
 def _bend(lattice: Lattice, maxima: Maxima) -> Lattice:
     """The lattice with the maxima that lie on it where it bends, as an aberrated wavefront makes it.
 
-    Each maximum is where its neighbourhood has a node, by a polynomial of the third degree of its place.
+    A polynomial of the third degree of a maximum's position tells which node it belongs to.
     """
     for _ in range(_ROUNDS):
         before, spots = lattice, lattice.spots
@@ -314,10 +314,10 @@ def _cubic(places: FloatArray, spots: FloatArray) -> FloatArray:
 
 
 def _look_again(lattice: Lattice, flat: FloatArray) -> Lattice:
-    """The lattice with its fainter spots, where it bends as well, and without what has only come near a node.
+    """The lattice with its fainter spots, where it bends as well, and without light that is near a node by chance.
 
-    The frame is smoothed as suits the spots, whose width is known now, and maxima stand out of the noise far
-    from all spots, if the frame has such a place. Those that are not of the largest group must have its spots' shape.
+    The frame is smoothed by the width of the spots, which is known now, and maxima must stand out of the noise far
+    from all spots, where there is such a part. Those outside the largest group must have the shape of its spots.
     """
     scale = max(spot_sd(flat, lattice.spots, lattice.pitch) / 2, 0.75)
     smooth = ndimage.gaussian_filter(flat, scale)
@@ -360,7 +360,7 @@ def _refuse_veiled(lattice: Lattice, flat: FloatArray, background: FloatArray) -
 
 
 def _walk(places: FloatArray, moves: IntArray, steps: FloatArray) -> tuple[IntArray, IntArray]:
-    """The largest group of spots that are steps apart, and each one's node."""
+    """The largest group of spots that are connected by steps, and the node of each."""
     tree, near = cKDTree(places), _NEAR * float(np.linalg.norm(steps[0]))
     edges, taken = [], []
     for move in moves:
@@ -394,7 +394,7 @@ def _side_by_side(nodes: IntArray, moves: IntArray) -> IntArray:
 
 
 def _groups(nodes: IntArray, moves: IntArray) -> IntArray:
-    """The number of the group that each node hangs together with, (n,)."""
+    """The number of the connected group that each node belongs to, (n,)."""
     a, b = _side_by_side(nodes, moves).T
     graph = sparse.coo_array((np.ones(len(a)), (a, b)), shape=(len(nodes), len(nodes)))
     return np.asarray(connected_components(graph.tocsr(), directed=False)[1])
@@ -414,7 +414,7 @@ def _fit(kind: Kind, spots: FloatArray, nodes: IntArray, background: float) -> L
 def match(lattice: Lattice, reference: Lattice) -> Lattice:
     """The lattice with its nodes counted as the reference counts them, and the spots that both have.
 
-    Which spot is which is known up to a whole step: the step is taken that moves the spots least.
+    Spots correspond up to a whole step of the lattice: the step is taken that moves the spots least.
 
     Raises
     ------

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Points along a lenslet's side that tell how much of it is lit; and for means of a wavefront that is smooth over it.
+# Points along a lenslet's side to compute how much of it is lit; and for means of a wavefront that is smooth over it.
 _EDGE_POINTS = 64
 _SMOOTH_POINTS = 8
 
@@ -32,7 +32,7 @@ class Lenslets:
     focal_length_m: float
     """From the lenslets to the camera, m."""
     pupil_diameter_m: float | None = None
-    """Of the round pupil, centred on the grid, m; None where the light covers the whole grid."""
+    """Diameter of the round pupil, centred on the grid, m; None where the light covers the whole grid."""
     obstruction: float = 0.0
     """Diameter of the pupil's central obstruction over that of the pupil."""
 
@@ -47,7 +47,7 @@ class Lenslets:
 
     @cached_property
     def centres_m(self) -> FloatArray:
-        """Middles of the lenslets, (spots, 2)."""
+        """Middles of the lenslets, m, (spots, 2)."""
         rows, columns = self.grid
         y, x = np.mgrid[:rows, :columns].astype(np.float64)
         return self.pitch_m * np.stack([x - (columns - 1) / 2, y - (rows - 1) / 2], axis=-1).reshape(-1, 2)
@@ -67,11 +67,11 @@ class Lenslets:
         return np.array([self.lit_part(spot).mean() for spot in range(self.spots)])
 
     def offsets_m(self, per_side: int = _EDGE_POINTS) -> FloatArray:
-        """Even points along a lenslet's side from its middle, (per_side,)."""
+        """Evenly spaced points along a lenslet's side, m from its middle, (per_side,)."""
         return self.pitch_m * ((np.arange(per_side) + 0.5) / per_side - 0.5)
 
     def lit_part(self, spot: int, per_side: int = _EDGE_POINTS) -> NDArray[np.bool_]:
-        """Which of even points over a lenslet are in the pupil, (y, x)."""
+        """Which of a lenslet's evenly spaced points are in the pupil, (per_side, per_side), y before x."""
         points = self.centres_m[spot] + _square(self.offsets_m(per_side))
         return self.is_lit(points).reshape(per_side, per_side)
 

@@ -1,4 +1,4 @@
-"""Spots on a frame before anything is known of their lattice: background taken out, maxima found, centroids."""
+"""Spots on a frame before their lattice is known: background, maxima, centroids."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from aolink.optics.centroid import weighted_centroid
 
 FloatArray = NDArray[np.float64]
 
-# A spot is a maximum that stands out so many times above the noise of the smoothed frame.
+# A spot is a maximum this many standard deviations above the noise of the smoothed frame.
 _SIGNIFICANCE = 8.0
 # It must also exceed this share of the brightest spots: without noise, anything fainter is a ring of a spot.
 _FAINTEST = 2e-3
-# A pixel so many times as bright as its neighbours is hot: a spot of sd 0.6 pixels or more makes none such.
+# A pixel this many times as bright as its neighbours is hot: no pixel of a spot of sd 0.6 pixels or more is.
 _HOT = 4.0
 _TINY = float(np.finfo(np.float64).tiny)
 # The height of the brightest spots is that of the maximum with this rank: a few may be cosmic rays.
 _BRIGHT = 7
-# Background: medians of blocks of so many pixels.
+# The background is the medians of blocks with this many pixels along a side.
 _BLOCK = 32
 # Noise is measured in this many parts along each side of a frame; a part needs at least this many dark pixels.
 _PARTS, _FEWEST_DARK = 4, 300
-# Standard deviations of the Gaussians that frames are smoothed by, pixels, the usual spots' first.
+# Standard deviations of the Gaussians that frames are smoothed by, pixels; the one for usual spots is first.
 _SCALES = (1.5, 3.0, 6.0, 0.75)
 
 
@@ -39,7 +39,7 @@ class Maxima:
     places: FloatArray
     """(n, 2) as (x, y), pixels."""
     heights: FloatArray
-    """Of the smoothed frame, counts above the background, (n,)."""
+    """Value of the smoothed frame there, counts above the background, (n,)."""
     scale: float
     """Standard deviation of the Gaussian that the frame was smoothed by, pixels."""
     dense: bool
@@ -52,7 +52,7 @@ def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
     Raises
     ------
     FrameError
-        It is not a picture, or has pixels that are not numbers.
+        The frame is not a picture, or has pixels that are not numbers.
     """
     if frame.ndim != 2 or min(frame.shape) < _BLOCK or frame.dtype.kind not in "biuf":
         raise FrameError(
@@ -63,7 +63,7 @@ def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
         raise FrameError(f"{int((~np.isfinite(counts)).sum())} pixels are not numbers")
     if counts.min() == counts.max():
         raise FrameError(
-            f"no usable spots: every pixel is {counts.flat[0]:g}; look whether the camera is saturated or dark"
+            f"no usable spots: every pixel is {counts.flat[0]:g}; check whether the camera is saturated or dark"
         )
     rows, columns = (max(1, n // _BLOCK) for n in counts.shape)
     blocks = [[np.median(part) for part in np.array_split(strip, columns, 1)] for strip in np.array_split(counts, rows)]
@@ -81,10 +81,10 @@ def flatten(frame: NDArray[np.generic]) -> tuple[FloatArray, FloatArray]:
 
 
 def find_maxima(flat: FloatArray) -> Iterator[Maxima]:
-    """The maxima of a flattened frame, smoothed more and less and by two estimates of its noise: one attempt each.
+    """The maxima of a flattened frame for several widths of smoothing and two estimates of its noise, one at a time.
 
-    The spread of all pixels is the noise where most of them are dark. Where spots stand close together it is the
-    spots' own, and the noise is what second differences from pixel to pixel say.
+    Where most pixels are dark, the noise is the standard deviation of all pixels. Where spots stand close together that
+    is the spots' own, and the noise is estimated from second differences from pixel to pixel.
     """
     for scale in _SCALES:
         smooth = ndimage.gaussian_filter(flat, scale)
@@ -96,9 +96,9 @@ def find_maxima(flat: FloatArray) -> Iterator[Maxima]:
 
 
 def smoothed_noise(flat: FloatArray, scale: float) -> float:
-    """What smoothing by a Gaussian of sd ``scale`` leaves of the noise, if pixels' noises are independent.
+    """Standard deviation of independent noise after smoothing by a Gaussian of sd ``scale``, counts.
 
-    The pixels' noise is told by their second differences along both axes.
+    The pixels' noise is estimated from their second differences along both axes.
     """
     fine = np.abs(np.diff(np.diff(flat, 2, axis=0), 2, axis=1))
     # A quarter of a normal variable's values lie within .3186 sd; there are fewer spots among them than in the half.
@@ -106,7 +106,7 @@ def smoothed_noise(flat: FloatArray, scale: float) -> float:
 
 
 def noise_map(smooth: FloatArray, dark: NDArray[np.bool_]) -> FloatArray:
-    """Standard deviation of a frame's dark pixels about each pixel, (rows, columns): noise grows with stray light."""
+    """Standard deviation of the dark pixels near each pixel, (rows, columns): noise grows with stray light."""
     noise = np.full(smooth.shape, spread(smooth[dark]))
     for rows in np.array_split(np.arange(smooth.shape[0]), _PARTS):
         for columns in np.array_split(np.arange(smooth.shape[1]), _PARTS):
@@ -119,7 +119,7 @@ def noise_map(smooth: FloatArray, dark: NDArray[np.bool_]) -> FloatArray:
 def maxima_above(
     smooth: FloatArray, scale: float, noise: FloatArray | float, dark: float, *, dense: bool = False
 ) -> Maxima:
-    """Maxima of a frame that a Gaussian of sd ``scale`` has smoothed, far above the noise that it has then.
+    """Maxima of a frame smoothed by a Gaussian of sd ``scale`` that are far above its ``noise``.
 
     ``dark`` is the smoothed frame's level without spots, which is above zero where a camera cuts its noise off below.
     """
@@ -139,12 +139,12 @@ def maxima_above(
 
 
 def spread(values: FloatArray) -> float:
-    """Standard deviation by the median of what deviates: spots do not count."""
+    """Standard deviation from the median absolute deviation, which spots do not change."""
     return max(1.4826 * float(np.median(np.abs(values - np.median(values)))), _TINY)
 
 
 def refine(flat: FloatArray, places: FloatArray, pitch: float) -> FloatArray:
-    """Each spot's weighted centroid, (n, 2); the weight is as wide as the spots themselves prove to be.
+    """Each spot's weighted centroid, pixels, (n, 2); the weight's width is that of the spots.
 
     A centroid that leaves its maximum by more than a quarter of the pitch is not taken.
     """
@@ -157,9 +157,9 @@ def refine(flat: FloatArray, places: FloatArray, pitch: float) -> FloatArray:
 
 
 def likeness(flat: FloatArray, places: FloatArray, models: FloatArray, pitch: float) -> FloatArray:
-    """Correlation of what is at each place with the median spot of the models' places, (n,), 1 for the same shape.
+    """Correlation of the light at each place with the median spot at the models' places, (n,), 1 for the same shape.
 
-    The largest one over shifts by a pixel, not below zero.
+    It is the largest over shifts by a pixel, and not below zero.
     """
     sd = spot_sd(flat, models, pitch)
     half = min(math.ceil(3 * sd), _half(pitch))

@@ -24,7 +24,7 @@ class Membrane:
     radius_m: float
     tension_n_per_m: float
     pads_m: FloatArray
-    """Middles of the pads from the membrane's middle, (actuators, 2), m."""
+    """Middles of the pads, from the membrane's middle, m, (actuators, 2)."""
     pad_radius_m: float
 
     def __post_init__(self) -> None:
@@ -40,7 +40,7 @@ class Membrane:
         Parameters
         ----------
         points_m:
-            Where, (..., 2), m, on the membrane.
+            Points on the membrane, m, (..., 2).
 
         Returns
         -------
@@ -79,14 +79,14 @@ class Membrane:
 
 
 def square_pads(rows: int, columns: int, pitch_m: float) -> FloatArray:
-    """Middles of a grid of pads, row by row, (rows * columns, 2)."""
+    """Middles of a grid of pads, row by row, m, (rows * columns, 2)."""
     y, x = np.mgrid[:rows, :columns].astype(np.float64)
     return pitch_m * np.stack([x - (columns - 1) / 2, y - (rows - 1) / 2], axis=-1).reshape(-1, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoltageLaw:
-    """An electrostatic actuator pulls with gamma V^2, Mishra & Wen, section II; inputs count from the bias."""
+    """An electrostatic actuator pulls with gamma V^2, Mishra & Wen, section II; inputs are relative to the bias."""
 
     gamma: float
     """Input units per V^2."""
@@ -99,7 +99,7 @@ class VoltageLaw:
         return -self.gamma * self.bias_v**2, self.gamma * (self.max_v**2 - self.bias_v**2)
 
     def force(self, volts: FloatArray) -> FloatArray:
-        """The input that voltages make."""
+        """The input for voltages, shape of ``volts``."""
         return np.asarray(self.gamma * (volts**2 - self.bias_v**2))
 
     def volts(self, force: FloatArray) -> FloatArray:
@@ -134,8 +134,8 @@ def mirror_plant(
 ) -> MirrorPlant:
     """A mirror whose every actuator has the same dynamics.
 
-    The states are the inputs as the mirror follows them. Actuators couple in what those deflect, not in how they move:
-    A falls apart into small systems, and a mirror of a thousand actuators can be calculated with.
+    The states are the inputs as the mirror follows them. Actuators are coupled by their influence functions (in C), not
+    in their dynamics: A is block diagonal, and a mirror of a thousand actuators can be computed.
 
     Parameters
     ----------
@@ -144,8 +144,8 @@ def mirror_plant(
     dynamics:
         A (n, n) and B (n, 1) of one actuator, whose first state follows its input with unit gain.
     drift_per_step:
-        None: process noise adds to each input. Otherwise to a state of each input's own, which keeps this
-        share of itself over a fast step and adds to the input: disturbances slower than the mirror.
+        None: process noise adds to each input. Otherwise each input has one more state, which keeps this share of
+        itself over a fast step and adds to the input, and noise adds to that: disturbances slower than the mirror.
     """
     one_A, one_B = dynamics
     inputs = slopes.shape[1]

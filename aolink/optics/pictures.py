@@ -17,12 +17,12 @@ from aolink.files import writing
 def read_picture(path: Path) -> NDArray[Any]:
     """A picture as numbers, (rows, columns) or (rows, columns, 3 or 4), of its own type.
 
-    ``.npy`` as it is; anything else that Pillow opens: 8 bits grey or colour, 16 bits grey, floats.
+    ``.npy`` is taken as it is; otherwise any format of Pillow's: 8 bits grey or colour, 16 bits grey, floats.
 
     Raises
     ------
     RestorationError
-        It cannot be read.
+        The file cannot be read as a picture.
     """
     if path.suffix == ".npy":
         return _load(path, "picture")
@@ -50,12 +50,12 @@ def finite_pixels(picture: NDArray[Any]) -> NDArray[np.bool_] | None:
 
 
 def write_picture(path: Path, picture: NDArray[Any], *, overwrite: bool = False, sources: Iterable[Path] = ()) -> None:
-    """Write what `read_picture` reads back; ``sources`` are files that it never replaces.
+    """Write a picture that `read_picture` reads back; ``sources`` are files that it never replaces.
 
     Raises
     ------
     RestorationError
-        It exists and not ``overwrite``, or cannot be written, or not in this format.
+        The file exists and ``overwrite`` is False, or it cannot be written, or its format cannot hold the picture.
     """
     from PIL import Image
 
@@ -84,12 +84,12 @@ def _format(path: Path) -> str:
 
 
 def read_psf(path: Path) -> NDArray[np.float64]:
-    """A PSF as numbers, from ``.npy`` or from text with commas or spaces; one row or column is one along the rows.
+    """A PSF as numbers, from ``.npy`` or from text with commas or spaces; one row or column is a PSF along the rows.
 
     Raises
     ------
     RestorationError
-        It cannot be read.
+        The file cannot be read as a PSF.
     """
     if path.suffix == ".npy":
         values = _load(path, "PSF")

@@ -40,11 +40,11 @@ def pixel_mass_2d(
     Parameters
     ----------
     covariance:
-        Of the kernel, slope units squared, (2, 2).
+        Covariance of the kernel, slope units squared, (2, 2).
     x_edges, y_edges:
         Edges of columns and rows, slope units, (columns + 1,) and (rows + 1,).
     positions:
-        Where the spot rests, slope units, (..., 2).
+        Positions of the spot, slope units, (..., 2).
 
     Returns
     -------
@@ -56,7 +56,7 @@ def pixel_mass_2d(
     x = x_edges[:-1, None] + half[:, None] * (nodes + 1)  # (columns, nodes)
     away = x - positions[..., 0, None, None]
     across = np.exp(-(away**2) / (2 * xx)) / math.sqrt(2 * math.pi * xx) * half[:, None] * weights
-    # Given x, y is Gaussian about a line, with what x does not explain of its variance.
+    # Given x, y is Gaussian about a regression line, with the part of its variance that x does not explain.
     line = positions[..., 1, None, None] + xy / xx * away
     (along,) = pixel_masses(yy - xy**2 / xx, y_edges, line, 0)  # (..., columns, nodes, rows)
     return np.asarray(np.einsum("...cn,...cnr->...rc", across, along))
@@ -70,7 +70,7 @@ def exposure_density_2d(
     Parameters
     ----------
     covariance, x_edges, y_edges:
-        As of `pixel_mass_2d`.
+        As in `pixel_mass_2d`.
     paths:
         Positions at each fast step, slope units, (spots, n_steps, 2).
 

@@ -24,7 +24,7 @@ class SceneSensor:
     pixel_scale: float
     """Slope units of the spot that move the scene by one pixel."""
     kernel: Kernel
-    """Of the picture's optics; its width is in slope units, as the spot's."""
+    """Image kernel of the picture's optics; its width is in slope units, as the spot's."""
     noise_sd: float
     """Standard deviation of a pixel's intensity by read-out noise."""
     bit_depth: int
@@ -32,7 +32,7 @@ class SceneSensor:
     """Counts of a dark pixel."""
     counts_per_intensity: float
     picture: str
-    """What a simulated rig shows: a picture file beside the rig file, or one that comes with aolink; may be empty."""
+    """Picture that a simulated rig shows: a file beside the rig file, or one that comes with aolink; may be empty."""
     picture_pixels: int
     """Rows and columns of the picture's own pixels in one of the sensor's."""
 
@@ -42,12 +42,12 @@ class SceneSensor:
         return (1 << self.bit_depth) - 1
 
     def to_counts(self, intensity: FloatArray) -> NDArray[np.uint16]:
-        """What the sensor reads out: rounded, and cut at zero and at full scale."""
+        """The counts that the sensor reads out: rounded, and cut at zero and at full scale."""
         counts = np.rint(self.black_level + self.counts_per_intensity * intensity)
         return np.clip(counts, 0, self.full_scale).astype(np.uint16)
 
     def to_intensity(self, counts: NDArray[np.uint16]) -> FloatArray:
-        """The intensity that counts stand for; noise makes it negative where it is dark."""
+        """The intensity for counts; noise makes it negative where it is dark."""
         return np.asarray((counts.astype(np.float64) - self.black_level) / self.counts_per_intensity)
 
     def is_saturated(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
@@ -56,7 +56,7 @@ class SceneSensor:
 
 
 def scene_motion(n_outputs: int) -> FloatArray:
-    """How the scene moves when the spots do: as their mean along x and y; along x alone where a line is seen.
+    """How the scene moves with the spots: by their mean displacement along x and y, or along x for a line sensor.
 
     Returns
     -------
@@ -71,12 +71,12 @@ def framed(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
 
 
 def framed_rows(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
-    """The same for the rows alone, (rows, the picture's columns)."""
+    """`framed` for the rows alone, (rows, the picture's columns)."""
     n, rows = sensor.picture_pixels, sensor.shape[0]
     top = (picture.shape[0] - n * rows) // 2
     return np.asarray(picture[top : top + n * rows].reshape(rows, n, -1).mean(axis=1))
 
 
 def framed_columns(sensor: SceneSensor, picture: FloatArray) -> FloatArray:
-    """And for the columns alone, (the picture's rows, columns)."""
+    """`framed` for the columns alone, (the picture's rows, columns)."""
     return framed_rows(replace(sensor, shape=sensor.shape[::-1]), picture.T).T

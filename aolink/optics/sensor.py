@@ -1,4 +1,4 @@
-"""What a camera is: where its pixels lie, how it counts, and how well that is known.
+"""Sensors as dataclasses: pixels, image kernel, counts and noise.
 
 Quantities are in the rig's own slope unit: that of ``sensor.field``, of the plant's output and of the
 kernel's width. A density is light over length for a line of pixels, and over area where pixels have two sides.
@@ -26,7 +26,7 @@ class Kernel:
     sigma: float
     """Width, slope units, in the paper's convention: Psi = exp(-w^2/sigma^2) / (sigma sqrt(pi)), variance sigma^2/2.
 
-    Of a kernel that is not round, that of the round one whose variance is the mean of both directions'.
+    For a kernel that is not round, the width of the round one whose variance is the mean of both directions.
     """
     matrix: tuple[tuple[float, float], tuple[float, float]] | None = None
     """Sigma of Psi = exp(-w' Sigma^-2 w) / (pi |Sigma|), Mishra & Wen (4), symmetric; None where it is round."""
@@ -45,7 +45,7 @@ class Kernel:
 
 @dataclass(frozen=True, kw_only=True)
 class BaseSensor(ABC):
-    """What all sensors have: equal pixels, each spot seen on ``field``, an integer read-out."""
+    """The common part of all sensors: equal pixels, each spot seen on ``field``, an integer read-out."""
 
     field: tuple[float, float]
     """Outer edges of the first and the last pixel that see a spot, slope units; the same in both directions."""
@@ -140,8 +140,8 @@ class SpotSensor(BaseSensor):
     """A camera behind lenslets: a grid of windows, a spot in each, seen in two directions.
 
     The rig's outputs are spot 0's slope along x (columns), spot 0's along y (rows), spot 1's along x, ...;
-    spots are counted along the rows of the grid, windows in the dark left out. Densities are those of a wholly lit
-    lenslet's spot: of one that is lit in part, a window has so much less.
+    spots are counted along the rows of the grid, windows in the dark left out. A density of one is that of a wholly lit
+    lenslet's spot: the window of a lenslet that is lit in part has that share of it.
     """
 
     kind: Literal["spots"]
@@ -186,8 +186,8 @@ class SpotSensor(BaseSensor):
     def profile(self) -> Sensor:
         """The line sensor whose counts are the sums of a window's counts over its rows, or over its columns.
 
-        A density summed over the other direction's length L has noise density V L. Every pixel is rounded,
-        not only the sum: the variance of the other roundings is in V.
+        A density summed over the other direction's length L has noise density V L. Every pixel is rounded, not only
+        the sum: V includes the variance of the other roundings.
         """
         side, across = self.pixel_width, self.window[0]
         roundings = (across - 1) * side**3 / (12 * self.counts_per_density**2)

@@ -19,13 +19,13 @@ from aolink.optics.zernike import zernike
 FloatArray = NDArray[np.float64]
 
 
-# Zernike modes that are fitted, by Noll's index, up to the fourth order; fewer where spots do not tell them apart.
+# Zernike modes that are fitted, by Noll's index, up to the fourth order; fewer where the spots do not determine them.
 _HIGHEST = (15, 10, 6, 3)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ZernikeFit:
-    """The wavefront as Zernike modes over the round pupil that just holds all lenslets of the reference."""
+    """The wavefront as Zernike modes over the smallest circle that holds all lenslets of the reference."""
 
     centre_px: FloatArray
     """(2,)"""
@@ -40,7 +40,7 @@ class ZernikeFit:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameSlopes:
-    """What a frame shows against its reference. Grids are the reference's, NaN where the frame has no spot.
+    """Displacements, slopes and wavefront of a frame against its reference; NaN where the frame has no spot.
 
     Row j and column i of a grid are node (i, j) of the reference's lattice, square or hexagonal, and lie on the frame
     at ``positions_px``. Vectors are (x, y) along the frame's columns and rows, however the lattice is turned.
@@ -49,10 +49,10 @@ class FrameSlopes:
     frame: FloatArray
     """(rows, columns) of pixels, counts."""
     lattice: Lattice
-    """The frame's own."""
+    """Lattice of the frame's spots."""
     reference: Lattice
     positions_px: FloatArray
-    """Where the reference's lattice has its nodes, with spots or without, (rows, columns, 2)."""
+    """Positions of the nodes of the reference's lattice, with spots or without, pixels, (rows, columns, 2)."""
     displacements_px: FloatArray
     """From the reference's spot to the frame's, without their mean, pixels, (rows, columns, 2)."""
     shift_px: FloatArray
@@ -60,11 +60,11 @@ class FrameSlopes:
     slopes: FloatArray
     """(rows, columns, 2): radians, or pixels where the optics are not known."""
     wavefront: FloatArray
-    """Zone by zone, (rows, columns), without piston and tilt: metres, or pixels times the pitch of a lenslet."""
+    """Zonal wavefront, (rows, columns), without piston and tilt: metres, or pixels times the pitch of a lenslet."""
     pieces: NDArray[np.int64]
-    """Which lenslets hang together, counted from 0, -1 where the frame has no spot, (rows, columns).
+    """Connected piece that each lenslet belongs to, from 0, -1 where the frame has no spot, (rows, columns).
 
-    Slopes do not tell the step from one piece to another; the wavefront's mean is zero in each.
+    Slopes do not determine the step from one piece to another; the wavefront's mean is zero in each.
     """
     zernikes: ZernikeFit
     in_metres: bool
@@ -87,7 +87,7 @@ def measure_slopes(
     pitch_m: float | None = None,
     focal_m: float | None = None,
 ) -> FrameSlopes:
-    """Find the spots of a frame and of its reference, and what lies between them.
+    """Slopes and wavefront of a frame against its reference, from the displacements of their spots.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def measure_slopes(
 def _zernikes(
     base: Lattice, nodes: NDArray[np.int64], slopes: FloatArray, pitch: float
 ) -> tuple[tuple[int, ...], FloatArray, FloatArray, tuple[FloatArray, float]]:
-    """Indices and coefficients, their sum at the nodes, centre and radius of the pupil in pixels."""
+    """Indices and coefficients of the modes, their sum at the nodes, centre and radius of the pupil in pixels."""
     middles = base.node_positions(base.nodes)
     centre, radius = _circle((middles[:, None] + base.lenslet).reshape(-1, 2))
     scale = pitch / base.pitch

@@ -20,11 +20,11 @@ from aolink.errors import FrameError
 
 FloatArray = NDArray[np.float64]
 
-# Numbers at once: the masses of so many spots stay in the processor's cache.
+# Spots computed together: their masses stay in the processor's cache.
 _AT_ONCE = 16
 # Rows of the table of diffraction's masses from the middle to the first zero: linearly between them, 1e-6 is left out.
 _POINTS = 512
-# Numbers in a table at most; for wider windows it is not worth its memory.
+# Most numbers in a table; for wider windows it is not worth its memory.
 _LARGEST_TABLE = 4_000_000
 
 
@@ -34,9 +34,9 @@ class Psi:
 
     shape: Literal["delta", "sinc2", "image"]
     zero_px: float = 0.0
-    """Of ``sinc2``, diffraction at a square lenslet: from the middle to the first zero, wavelength over pitch."""
+    """For kind ``sinc2``, diffraction at a square lenslet: from the middle to the first zero, wavelength over pitch."""
     image: FloatArray | None = None
-    """Of ``image``: the spot on a grid of ``finer`` points a pixel, odd sides, the middle one at its origin."""
+    """For kind ``image``: the spot on a grid of ``finer`` points a pixel; odd sides, the middle point is its origin."""
     finer: int = 1
 
     def __post_init__(self) -> None:
@@ -114,7 +114,7 @@ def _sinc2_below(x: FloatArray) -> FloatArray:
 
 
 def _image_windows(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
-    """Some spots at a time, of which the paths are about as long."""
+    """Windows of spots by `_image_of_some`, for groups of spots whose paths are about as long."""
     light = np.empty((len(path_px), side, side))
     order = np.argsort(np.ptp(path_px, axis=2).max(axis=1))
     for k in range(0, len(order), _AT_ONCE):
@@ -180,7 +180,7 @@ def _cut(light: FloatArray, corner: NDArray[np.int64], side: int) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detector:
-    """An integer camera and its faults. Light is in photo-electrons; what pixels differ in is (rows, columns)."""
+    """An integer camera and its faults. Light is in photo-electrons; values of single pixels are (rows, columns)."""
 
     bits: int = 16
     """8 to 16."""
@@ -190,9 +190,9 @@ class Detector:
     background_electrons: FloatArray | float = 0.0
     """Light that is everywhere; it has shot noise."""
     dark_electrons: FloatArray | float = 0.0
-    """What a pixel gathers without light in one exposure; it has shot noise."""
+    """Dark current of a pixel in one exposure, photo-electrons; it has shot noise."""
     flat: FloatArray | float = 1.0
-    """Sensitivity."""
+    """Sensitivity of the pixels (flat field)."""
     dead: NDArray[np.bool_] | None = None
     """Pixels that always read the offset, (rows, columns)."""
 

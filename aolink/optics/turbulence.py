@@ -1,4 +1,4 @@
-"""Turbulence that the wind blows past the pupil: von Karman's spectrum, several layers, exact at any time.
+"""Frozen-flow turbulence, which the wind blows past the pupil: von Karman's spectrum, several layers, at any time.
 
 A layer is a sum of plane waves of random direction, phase and size, one for each stretch of a logarithmic ladder
 of wave numbers: Charnotskii, "Sparse spectrum model for a turbulent phase", J. Opt. Soc. Am. A 30, 479 (2013). Its
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 # The longest wave over the outer scale: longer ones add nothing to the structure function within it.
 _LONGEST = 20.0
 _WAVES = 600
-# Along the side of a lenslet that the pupil cuts; the shortest wave is half a lenslet long.
+# Points along the side of a lenslet that the pupil cuts; the shortest wave is half a lenslet long.
 _POINTS = 32
 
 
@@ -64,7 +64,7 @@ class FrozenFlow:
         self.layer = layer
         low, high = 2 * math.pi / (layer.outer_scale_m * _LONGEST), 2 * math.pi / shortest_m
         rungs = np.geomspace(low, high, waves + 1)
-        # Within its rung every wave number is as likely as the plane gives it room: k dk.
+        # Within its rung the density of wave numbers is proportional to k, as in the plane.
         k = np.sqrt(rungs[:-1] ** 2 + (rungs[1:] ** 2 - rungs[:-1] ** 2) * rng.random(waves))
         turn = rng.uniform(0, 2 * math.pi, waves)
         self.wave_numbers = k[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -97,7 +97,7 @@ class FrozenFlow:
         return np.asarray(mean[:, None] * (1j * k.T * self.amplitudes))
 
     def blown(self, times_s: FloatArray) -> NDArray[np.complex128]:
-        """What the wind turns each wave by at each time, (waves, times)."""
+        """Factor exp(-i k v t) of each wave at each time, (waves, times)."""
         return np.asarray(np.exp(-1j * (self.wave_numbers @ np.asarray(self.layer.wind_m_s))[:, None] * times_s))
 
 

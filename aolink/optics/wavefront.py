@@ -1,4 +1,4 @@
-"""From slopes to the wavefront: zonal and modal least squares, and how good what is left of it is.
+"""Wavefront reconstruction from slopes: zonal and modal least squares; residual rms and Strehl ratio.
 
 Slopes are means over lenslets as `aolink.optics.lenslets` has them, (rows, columns, 2) on a grid or (spots, 2);
 wavefronts come in the unit of slopes times the lenslets' pitch.
@@ -29,7 +29,7 @@ _Equations = tuple[sparse.csr_array, sparse.csr_array, FloatArray, NDArray[np.bo
 class _LeastSquares:
     """Sparse equations differences @ values = averages @ slopes, factored once.
 
-    What they do not tell is zero: the mean of values over each part that they join, ``parts`` (points,).
+    They leave the mean of values over each connected part, ``parts`` (points,), undetermined; it is set to zero.
     """
 
     def __init__(self, differences: sparse.csr_array, averages: sparse.csr_array, weights: FloatArray) -> None:
@@ -55,17 +55,22 @@ class SpotReconstructor:
     """Least squares of a wavefront's values at spots anywhere, sparse, factored once for a pattern of spots.
 
     Southwell's geometry on the graph of neighbours, whatever lattice they are on: along each edge the wavefront
-    changes by the mean slope of its two spots times the way from one to the other. On a square lattice that is
+    changes by the mean slope of its two spots times the vector from one to the other. On a square lattice that is
     `ZonalReconstructor`. It is exact for wavefronts of the second degree.
 
     Parameters
     ----------
     positions:
-        Of the spots' lenslets, (spots, 2) as (x, y), in the length that the wavefront's unit is slopes times.
+        Positions of the spots' lenslets, (spots, 2) as (x, y); the wavefront's unit is that of slopes times theirs.
     edges:
         Pairs of neighbours, as numbers of spots, (edges, 2).
     weights:
-        Of the slopes of each spot, (spots,); one where None.
+        Weights of the slopes of each spot, (spots,); one where None.
+
+    Raises
+    ------
+    ValueError
+        There are no spots.
     """
 
     def __init__(self, positions: FloatArray, edges: NDArray[np.int64], weights: FloatArray | None = None) -> None:
@@ -76,9 +81,9 @@ class SpotReconstructor:
 
     @property
     def parts(self) -> NDArray[np.int64]:
-        """The number, from 0, of the part that each spot hangs together with, (spots,).
+        """The number, from 0, of the connected part that each spot belongs to, (spots,).
 
-        Slopes do not tell the step from one part to another: the mean of each part is zero.
+        Slopes do not determine the step from one part to another: the mean of each part is zero.
         """
         return self._equations.parts
 
@@ -96,7 +101,7 @@ class ZonalReconstructor:
     times the pitch (Southwell, J. Opt. Soc. Am. 70, 998 (1980)). ``fried`` puts values on the corners of lit
     lenslets, whose opposite sides differ by the slope (Fried, J. Opt. Soc. Am. 67, 370 (1977)).
 
-    What slopes do not tell is zero: the mean of each part that hangs together, and in Fried's geometry waffle.
+    What slopes do not determine is zero: the mean of each connected part, and in Fried's geometry waffle.
 
     Parameters
     ----------
@@ -105,7 +110,12 @@ class ZonalReconstructor:
     pitch:
         Side of a lenslet.
     weights:
-        Of the slopes of each lenslet, (rows, columns); one where None.
+        Weights of the slopes of each lenslet, (rows, columns); one where None.
+
+    Raises
+    ------
+    ValueError
+        No lenslet is lit.
     """
 
     def __init__(
@@ -120,7 +130,7 @@ class ZonalReconstructor:
 
     @property
     def where(self) -> NDArray[np.bool_]:
-        """Which points have a value: (rows, columns) of lenslets, or one more of each of their corners."""
+        """Which points have a value: lenslets, (rows, columns), or their corners, (rows + 1, columns + 1)."""
         return self._where
 
     def __call__(self, slopes: FloatArray) -> FloatArray:
@@ -137,7 +147,7 @@ class ZonalReconstructor:
 def _along_edges(
     positions: FloatArray, edges: NDArray[np.int64], weights: FloatArray | None
 ) -> tuple[sparse.csr_array, sparse.csr_array, FloatArray]:
-    """Differences of values, means of slopes along the way, and weights: differences @ values = means @ slopes."""
+    """Differences of values along edges, means of slopes, and weights: differences @ values = means @ slopes."""
     a, b = edges.T
     row, n = np.arange(len(edges)), len(positions)
     half_x, half_y = (positions[b] - positions[a]).T / 2
@@ -184,9 +194,9 @@ def _matrix(
 
 
 def _joined(differences: sparse.csr_array) -> NDArray[np.int64]:
-    """The number of the part that each point is joined with, (points,).
+    """The number of the connected part that each point belongs to, (points,).
 
-    Two points are joined where the normal matrix pulls them together; differences do not see what is even over a part.
+    Two points are connected where the normal matrix couples them; a constant over a part changes no difference.
     """
     joined = (differences.T @ differences).tocoo()
     pulls = joined.data < -1e-9
@@ -204,11 +214,11 @@ class ZernikeModes:
     slopes: FloatArray
     """Slopes of each mode of unit rms in the unit of path per m, (spots, 2, modes); NaN in the dark."""
     light: FloatArray
-    """(spots,)"""
+    """Lit share of each lenslet, (spots,)."""
     radius_m: float
 
     def wavefront(self, coefficients: FloatArray, points_m: FloatArray) -> FloatArray:
-        """Sum of the modes at points (..., 2), (...)."""
+        """Sum of the modes, coefficients (modes,), at points (..., 2), m, (...)."""
         modes = [zernike(index, points_m / self.radius_m) for index in self.indices]
         return np.asarray(np.tensordot(coefficients, modes, axes=1))
 
@@ -231,11 +241,12 @@ def zernike_slopes(
     Parameters
     ----------
     positions:
-        Of the spots' lenslets from the middle of the pupil, (spots, 2).
+        Positions of the spots' lenslets from the middle of the pupil, (spots, 2).
     radius:
-        Of the pupil, in the unit of the positions.
+        Radius of the pupil, in the unit of the positions.
     within:
-        Points that fill a lenslet evenly, from its middle, (points, 2): the slope is their mean. None: at its middle.
+        Points that fill a lenslet evenly, from its middle, (points, 2): the slope is the mean over them. None: at its
+        middle.
 
     Returns
     -------
@@ -248,18 +259,18 @@ def zernike_slopes(
 def modal_reconstructor(
     slopes: FloatArray, weights: FloatArray, noise_variance: float = 0.0, prior_variance: FloatArray | None = None
 ) -> FloatArray:
-    """The matrix from slopes to coefficients: least squares, or with a prior the smallest mean square error.
+    """The matrix from slopes to coefficients: least squares, or with a prior the minimum mean square error estimate.
 
     Parameters
     ----------
     slopes:
-        Of each mode, (spots, 2, modes).
+        Slopes of each mode, (spots, 2, modes).
     weights:
-        Of each lenslet's slopes, (spots,), the light; zero leaves it out.
+        Weight of each lenslet's slopes, (spots,), such as its light; zero leaves it out.
     noise_variance:
-        Of a slope of weight one.
+        Variance of a slope of weight one.
     prior_variance:
-        Of each coefficient, (modes,), about zero; None: nothing is known.
+        Variance of each coefficient about zero, (modes,); None: no prior.
 
     Returns
     -------
@@ -268,7 +279,7 @@ def modal_reconstructor(
     Raises
     ------
     ValueError
-        Without a prior, and the slopes do not tell the modes apart.
+        There is no prior, and the slopes do not determine the modes.
     """
     both = np.repeat(weights, 2)
     H = np.where(both[:, None] > 0, slopes.reshape(len(both), -1), 0.0)
@@ -278,7 +289,7 @@ def modal_reconstructor(
     # The modes may have any size: what counts is how alike their slopes are.
     size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     if np.linalg.cond(normal / np.outer(size, size)) > 1e10:
-        raise ValueError("the lit lenslets do not tell the modes apart: use fewer modes, or a prior")
+        raise ValueError("the lit lenslets do not determine the modes: use fewer modes, or a prior")
     return np.asarray(linalg.solve(normal, H.T * both, assume_a="pos"))
 
 
@@ -292,7 +303,7 @@ def kolmogorov_variances(indices: tuple[int, ...], diameter_m: float, r0_m: floa
 
 
 def residual_rms(wavefront: FloatArray, weights: FloatArray | None = None) -> float:
-    """Standard deviation over the pupil; points that are NaN do not count."""
+    """Standard deviation of a wavefront over the pupil; points that are NaN do not count."""
     known = np.isfinite(wavefront)
     w = np.ones(known.sum()) if weights is None else weights[known]
     values = wavefront[known]
@@ -300,7 +311,7 @@ def residual_rms(wavefront: FloatArray, weights: FloatArray | None = None) -> fl
 
 
 def strehl(wavefront_m: FloatArray, wavelength_m: float, weights: FloatArray | None = None) -> float:
-    """Peak of the point image over that without aberration, |mean exp(i phase)|^2; NaN points do not count."""
+    """Strehl ratio of a wavefront in metres of path, |mean exp(i phase)|^2; points that are NaN do not count."""
     known = np.isfinite(wavefront_m)
     w = np.ones(known.sum()) if weights is None else weights[known]
     return float(abs(np.average(np.exp(2j * math.pi * wavefront_m[known] / wavelength_m), weights=w)) ** 2)

@@ -1,1 +1,1 @@
-"""The plant lifted over many fast steps, and what the camera can know of it."""
+"""The plant lifted over many fast steps, and its observability by the camera."""

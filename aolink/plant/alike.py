@@ -1,4 +1,4 @@
-"""Plants that are many small systems side by side, all alike: a mirror taken by its actuators."""
+"""Plants that are many small systems side by side, all alike, such as the actuators of a mirror."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ FloatArray = NDArray[np.float64]
 
 
 MANY_STATES = 64
-"""With more states than this a plant's matrices are large: a mirror is taken by its actuators."""
+"""With more states than this a plant's matrices are large, and a mirror is treated actuator by actuator."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AlikeSystems:
-    """A plant of many inputs, each of which moves a small system of its own, all alike: outputs mix what these do.
+    """A plant of many inputs, each of which moves a small system of its own, all alike; outputs mix their outputs.
 
-    A = I (x) A_1 and so on, C = gains (x) C_1.
+    A = I (x) A_1, B and B_w likewise, and C = gains (x) C_1, with (x) the Kronecker product.
     """
 
     one: Plant
-    """One of them, with unit noise; its output is what the plant's outputs see of it."""
+    """One of them, with unit noise; its output is the one that the plant's outputs mix."""
     gains: FloatArray
     """(n_outputs, systems)"""
     noise_sd: FloatArray
@@ -37,11 +37,11 @@ class AlikeSystems:
 
 @lru_cache(maxsize=16)
 def alike_systems(plant: Plant) -> AlikeSystems | None:
-    """The systems of a large plant that falls apart into such; None for another one.
+    """The systems that a large plant consists of; None where it is not large or not of alike systems.
 
     A plant is large with more than `MANY_STATES` states, and also with more outputs than states where each output has
-    a coefficient of its own (`UnmodelledSlopes`): `moments` with dense matrices takes 4 s for 48 spots, a fiftieth of
-    that with these.
+    a coefficient of its own (`UnmodelledSlopes`): for 48 spots `moments` takes 4 s with dense matrices, and a fiftieth
+    of that with these.
     """
     W = plant.process_noise
     large = plant.n_states > MANY_STATES or (plant.unmodelled is not None and plant.n_outputs > plant.n_states)

@@ -1,4 +1,4 @@
-"""Where the spot goes if nothing disturbs it: what a check of the rig file compares with the field of view."""
+"""The spot's path without noise, which a check of the rig file compares with the field of view."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LARGEST_CHECK = 200_000
 
 
 def nominal_path(rig: Rig) -> tuple[FloatArray, FloatArray]:
-    """Where the spot goes under the drive without noise, and how far noise takes it from there.
+    """The spot's path under the drive without noise, and the standard deviation about it, both in slope units.
 
     Returns
     -------

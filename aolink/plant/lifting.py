@@ -80,7 +80,7 @@ def _block_maps(plant: Plant) -> tuple[FloatArray, FloatArray, FloatArray, Float
 
 
 def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What the inputs do from rest.
+    """Response of outputs and state to the inputs, from rest.
 
     Parameters
     ----------

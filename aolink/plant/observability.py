@@ -1,4 +1,4 @@
-"""What the camera can know of the plant (remarks 1 and 2 of Mishra & Wen)."""
+"""Observability and detectability of the plant by the camera (remarks 1 and 2 of Mishra & Wen)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from aolink.rig import Plant
 FloatArray = NDArray[np.float64]
 
 
-# A mode that shrinks to this over one exposure is gone before the next, whatever the camera saw of it.
+# A mode that decays to this over one exposure is gone before the next, observed or not.
 _FORGOTTEN = 1e-3
 
 
@@ -24,22 +24,22 @@ _FORGOTTEN = 1e-3
 _SAME = 1e-7
 
 
-# What an eigenvector makes of the outputs, relative to their size, below which they do not see it.
+# An eigenvector whose outputs are smaller than this, relative to the outputs' size, is not observable.
 _UNSEEN = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mode:
-    """One eigenvalue of A (of a complex pair, the one above the axis)."""
+    """A mode of the plant, an eigenvalue of A (of a complex pair, the one above the real axis)."""
 
     eigenvalue: complex
     frequency_hz: float
     time_constant_s: float
     """Time in which it falls to 1/e; infinite where it does not."""
     seen: bool
-    """Whether the outputs see it at the fast rate, (A, C)."""
+    """Whether it is observable from the outputs at the fast rate, (A, C)."""
     seen_by_centroid: bool
-    """Whether the mean over each exposure sees it, (A^N, C-bar)."""
+    """Whether it is observable from the mean over each exposure, (A^N, C-bar)."""
 
     def __str__(self) -> str:
         lasts = "undamped" if math.isinf(self.time_constant_s) else f"time constant {self.time_constant_s:.3g} s"
@@ -48,40 +48,40 @@ class Mode:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservabilityReport:
-    """What can be known of the plant's state (remarks 1 and 2 of Mishra & Wen)."""
+    """Which modes of the plant are observable, and from what (remarks 1 and 2 of Mishra & Wen)."""
 
     n_states: int
     rank: int
-    """Dimension of the state space that the outputs see at the fast rate."""
+    """Dimension of the observable subspace of (A, C), at the fast rate."""
     centroid_rank: int
-    """Dimension that the means over exposures see; remark 1 holds where it equals ``rank``, and it need not."""
+    """The same for (A^N, C-bar), the means over exposures; remark 1 holds where it equals ``rank``, and it need not."""
     modes: tuple[Mode, ...]
     o2_needs: str
     """What an estimator of the second moment alone (`o2`) needs before it can work."""
 
     @property
     def detectable(self) -> bool:
-        """Whether every mode that the outputs do not see dies out by itself."""
+        """Whether every unobservable mode decays by itself."""
         return all(m.seen or abs(m.eigenvalue) < 1 - 1e-9 for m in self.modes)
 
     @property
     def unseen(self) -> tuple[Mode, ...]:
-        """Modes that the outputs do not see at the fast rate."""
+        """Modes that are not observable at the fast rate."""
         return tuple(m for m in self.modes if not m.seen)
 
     @property
     def lost_by_centroid(self) -> tuple[Mode, ...]:
-        """Modes that the outputs see and the means over exposures do not."""
+        """Modes that are observable at the fast rate and not from the means over exposures."""
         return tuple(m for m in self.modes if m.seen and not m.seen_by_centroid)
 
 
 def observability(plant: Plant, n_steps: int, fast_step_s: float) -> ObservabilityReport:
-    """Rank of what the camera sees, mode by mode (Popov-Belevitch-Hautus), for exposures of ``n_steps``."""
+    """Observability of a plant, mode by mode (Popov-Belevitch-Hautus test), for exposures of ``n_steps`` fast steps."""
     A, parts = plant.A, components(plant.A)
     transition, mean, square = blockwise(partial(_powers, n_steps), (A,), parts)
     values = _distinct(eigenvalues(A, parts))
     blind = [_unobservable(A, plant.C / np.linalg.norm(plant.C), value, parts) for value in values]
-    # The outputs' mean over an exposure, in units of what they are in its steps.
+    # The outputs' mean over an exposure, in units of their rms over its steps.
     centroid = plant.C @ mean / math.sqrt(float(((plant.C @ square) * plant.C).sum()))
     lifted = values**n_steps
     distinct = _distinct(lifted)
@@ -129,7 +129,7 @@ def _powers(n_steps: int, A: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def _distinct(values: NDArray[Any]) -> NDArray[Any]:
-    """Values without repetition: a mirror's actuators are alike, and what holds for one holds for all."""
+    """Distinct values: a mirror's actuators are alike, and have the same eigenvalues."""
     keep: list[complex] = []
     for value in values:
         if all(abs(value - other) > _SAME for other in keep):
@@ -138,7 +138,7 @@ def _distinct(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _unobservable(A: FloatArray, C: FloatArray, value: complex, parts: list[Indices]) -> NDArray[Any]:
-    """Basis of the eigenvectors for a value that (A, C) cannot tell from zero, (n_states, dimension), orthonormal."""
+    """Orthonormal basis of the eigenvectors of A for a value that C maps to zero, (n_states, dimension)."""
     vectors = null_space(A, value, parts, _SAME)
     seen = C @ vectors
     if not vectors.shape[1]:

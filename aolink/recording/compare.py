@@ -18,19 +18,19 @@ from aolink.recording.reader import Recording
 from aolink.wire import messages_pb2 as wire
 
 RELATIVE = 1e-9
-"""Default tolerance: what another machine's arithmetic may change."""
+"""Default relative tolerance: differences that another machine's arithmetic may make."""
 ABSOLUTE = 1e-12
 _BYTES_KEPT = 32 << 20
-"""Of messages whose counterpart has not come yet; more of them are in a temporary file."""
+"""Bytes in memory of messages whose counterpart has not come yet; the rest is in a temporary file."""
 _Key = tuple[str, str]
-"""Topic, and what a message is of."""
+"""Topic, and the name that a message and its counterpart share."""
 
 
 class Difference(NamedTuple):
     """The first place where two recordings differ in a field."""
 
     frame_id: int | None
-    """Of the exposure that the message belongs to; None where it belongs to none."""
+    """Frame id of the exposure that the message belongs to; None where it belongs to none."""
     text: str
     """Both values, in short."""
 
@@ -41,23 +41,23 @@ class FieldDifference:
 
     first: Difference
     messages: int = 0
-    """In how many messages it does."""
+    """Number of messages in which it differs."""
     largest: float = 0.0
     """Largest absolute difference between numbers; infinite where one is not finite, or the lengths differ."""
     largest_relative: float = 0.0
-    """The same, relative to the larger of the two."""
+    """Largest difference relative to the larger of the two numbers."""
 
 
 @dataclass(slots=True)
 class TopicComparison:
-    """What was found in one topic."""
+    """The differences in one topic."""
 
     compared: int = 0
-    """Messages that are in both."""
+    """Messages that are in both recordings."""
     missing: int = 0
-    """In the first only."""
+    """Messages that are in the first only."""
     added: int = 0
-    """In the second only."""
+    """Messages that are in the second only."""
     first_missing: str = ""
     first_added: str = ""
     fields: dict[str, FieldDifference] = field(default_factory=dict)
@@ -89,22 +89,22 @@ def compare(
 ) -> dict[str, TopicComparison]:
     """Compare two recordings by topic.
 
-    Messages are matched by what they are of (exposure, command block, or place in the topic), not by
-    their place in the file. Two numbers are the same if they differ by no more than ``absolute`` plus
-    ``relative`` times the larger, or if both are NaN; integers, texts and pictures must be equal.
+    Messages are matched by the exposure or command block that they belong to, or else by their number in the topic, not
+    by their place in the file. Two numbers are the same if they differ by no more than ``absolute`` plus ``relative``
+    times the larger, or if both are NaN; integers, texts and pictures must be equal.
 
     Parameters
     ----------
     only:
-        Topics to look at; all if none is given. One that ends with "/" means all that begin with it.
+        Topics to compare; all if none is given. One that ends with "/" means all that begin with it.
     relative_to_start:
-        Count exposures and fast steps from the first of each recording, and leave clock times out: those of two
-        sessions of one rig go on.
+        Count exposures and fast steps from the first of each recording, and leave out clock times: in two sessions of
+        one rig they differ.
 
     Raises
     ------
     RecordingError
-        Neither recording has any of the topics; what waits for its counterpart does not fit on the disk.
+        Neither recording has any of the topics; or messages without a counterpart do not fit on the disk.
     """
     names = {topic for recording in (first, second) for topic in recording.counts if _is_wanted(topic, only)}
     if not names:
@@ -151,7 +151,7 @@ class _Kept(NamedTuple):
 class _Waiting:
     """Messages whose counterpart has not come yet: the first megabytes in memory, what comes then in a temporary file.
 
-    Of messages with the same name the first comes out first; what is in the file came after all that is in memory.
+    Messages with the same name come out in their order; those in the file came after all those in memory.
     """
 
     def __init__(self) -> None:

@@ -27,7 +27,7 @@ _MOST_STEPS = 1_000_000
 
 
 def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
-    """A frame as it is recorded: what is known about it, and its picture."""
+    """A frame as it is recorded: its facts, and its picture."""
     height, width = frame.pixels.shape
     offsets, lengths = _runs(~frame.mask.ravel())
     info = pb.ExposureInfo(
@@ -54,7 +54,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
 
 
 def restoration_message(done: RestoredPictures) -> pb.Restoration:
-    """What is known about an exposure's restored pictures, as it is recorded."""
+    """The facts about an exposure's restored pictures, as they are recorded."""
     return pb.Restoration(
         frame_id=done.frame_id, estimator=done.estimator, method=done.method, scene_noise_sd=done.scene_noise_sd,
         path_noise_sd=done.path_noise_sd, reason=done.reason,
@@ -128,7 +128,7 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
 
 @lru_cache(maxsize=8)
 def _whole(shape: tuple[int, int]) -> NDArray[np.bool_]:
-    """The mask of every frame of which nothing is missing."""
+    """The mask of a complete frame, shared by all of them."""
     mask = np.ones(shape, dtype=bool)
     mask.flags.writeable = False
     return mask
@@ -162,7 +162,7 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
 
 
 def _fill(message: Message, field: str, values: NDArray[np.float64]) -> None:
-    """Numbers as the bytes that they have on the wire: of half a million it takes a tenth of the time."""
+    """Set a field of numbers by their bytes on the wire: for half a million numbers, in a tenth of the time."""
     data = np.ascontiguousarray(values, dtype="<f8").tobytes()
     packed = 8 * message.DESCRIPTOR.fields_by_name[field].number + 2
     message.MergeFromString(_varint(packed) + _varint(len(data)) + data)
@@ -207,7 +207,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
 
 
 def truth_from_message(message: wire.Truth) -> Truth:
-    """What the simulated rig said about an exposure."""
+    """The truth of an exposure from the simulated rig's message."""
     axes, outputs = message.axes, message.n_outputs
     return Truth(
         start_state=_array(message.start_state, axes, -1),

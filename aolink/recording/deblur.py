@@ -1,4 +1,4 @@
-"""A recording with its pictures restored: each with the path that its exposure's estimate gives."""
+"""Copy a recording with its pictures restored, each with the estimated path of its exposure."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from aolink.restoration.deblur import blurred_psnr, psnr
 from aolink.rig import Rig
 
 _AHEAD = 4
-"""Exposures for each worker that are handed out before the first of them is written."""
+"""Exposures handed out to each worker before the first of them is written."""
 
 
 @dataclass(kw_only=True)
 class Summary:
-    """What came of a recording, and how good it is where the true scene is known."""
+    """How many pictures were restored, and how well where the true scene is known."""
 
     exposures: int = 0
     scenes: int = 0
     """Scenes restored."""
     reasons: Counter[str] = field(default_factory=Counter)
-    """Why pictures are missing, each with how often."""
+    """Reasons why pictures are missing, each with its number."""
     psnr_blurred: list[float] = field(default_factory=list)
-    """Peak signal-to-noise ratio of each scene as it came, moved back by its mean displacement, dB."""
+    """Peak signal-to-noise ratio of each scene before restoration, moved back by its mean displacement, dB."""
     psnr_restored: list[float] = field(default_factory=list)
     motion: Scorer = field(default_factory=Scorer)
-    """Of the estimates whose paths the pictures were restored with."""
+    """Score of the estimates whose paths the pictures were restored with."""
 
 
 def write_deblurred(
@@ -54,7 +54,7 @@ def write_deblurred(
     """Copy a recording with its pictures restored.
 
     Everything else stays, byte for byte; restored pictures that it has are replaced, and estimates of ``estimator``
-    are added if it has none. With ``workers`` so many processes do it, one thread each; without, this one.
+    are added if it has none. ``workers`` processes do it, with one thread each; this process does it if that is 0.
 
     Raises
     ------

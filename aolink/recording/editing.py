@@ -23,12 +23,12 @@ from aolink.recording.writer import begin_recording
 from aolink.wire import messages_pb2 as wire
 
 _ALIKE_NS = 2_000_000_000
-"""Log times between which the same message in two files is one."""
+"""Largest difference in log time at which equal messages in two files are one message."""
 
 
 @dataclass(slots=True)
 class Edited:
-    """What a new recording holds, and what did not get into it."""
+    """The contents of a new recording, and what was lost."""
 
     path: Path
     messages: int = 0
@@ -86,7 +86,7 @@ class RecordingCopy:
 def recover(
     source: Path, target: Path, *, overwrite: bool = False, progress: Callable[[int], None] = lambda exposures: None
 ) -> Edited:
-    """Copy what is whole of a damaged recording into a new one with an index.
+    """Copy the undamaged parts of a recording into a new one with an index.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def merge(
     overwrite: bool = False,
     progress: Callable[[int], None] = lambda exposures: None,
 ) -> Edited:
-    """Join the parts of one session, in any order. What is in several of them is written once.
+    """Join the parts of one session, in any order. Messages that are in several parts are written once.
 
     Raises
     ------
@@ -173,7 +173,7 @@ def merge(
 
 
 def _begun(recording: Recording) -> dict[str, str]:
-    """What was known of the session at its start, without which part of it this is."""
+    """Facts from the session's start, without the number of the part."""
     later = recording.end_metadata.keys() | {"part"}
     return {name: value for name, value in recording.metadata.items() if name not in later}
 

@@ -19,7 +19,7 @@ from aolink.wire.runs_pb2 import Run
 
 
 class ExposureAssembly:
-    """Messages become exposures, as they did in the session."""
+    """Assembles exposures from the messages of a recording, as the session did."""
 
     def __init__(self, rig: Rig) -> None:
         self._assembler = Assembler(rig)

@@ -1,4 +1,4 @@
-"""What was commanded and applied before an exposure and reaches into it: a file that begins there needs it."""
+"""Commands and reports from before an exposure that reach into it, which a file that begins there needs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aolink.wire import messages_pb2 as wire
 
 
 class Lead:
-    """Follows the messages of a recording, and keeps those that an exposure still to come is made from."""
+    """Follows the messages of a recording, and keeps those that later exposures are made from."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[str, Message, int, int]] = deque()

@@ -86,7 +86,7 @@ class McapFile:
     Parameters
     ----------
     descriptor:
-        Of ``path``, where that is open for writing and empty already; otherwise the file is created.
+        Descriptor of ``path`` if that is open for writing and empty already; otherwise the file is created.
 
     Raises
     ------

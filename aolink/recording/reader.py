@@ -55,18 +55,18 @@ class RawMessage(NamedTuple):
 
 
 class Recording:
-    """A recording on disk, read piece by piece: files larger than the memory are no matter.
+    """A recording on disk, read piece by piece, so files may be larger than the memory.
 
-    A whole file is read by its index. One that was cut off or damaged is scanned and gives what is
-    whole, with what was lost in `losses`.
+    A complete file is read by its index. One that was cut off or damaged is scanned for its undamaged parts; `losses`
+    lists the others.
 
     Parameters
     ----------
     path:
         The file.
     rig:
-        Use this instead of the rig that is in the file: what is estimated from it then is by another model.
-        Estimates that are in the file cannot be read with it.
+        Used instead of the rig that is in the file, so new estimates are made with another model. Estimates that are in
+        the file cannot be read with it.
     check:
         Read every byte at once, so that `losses` is known from the start. Without it, damage in the
         middle of a file that has its index is noticed when it is read.
@@ -82,11 +82,11 @@ class Recording:
         self.metadata: dict[str, str] = {}
         """Facts about the session, from its start and its end."""
         self.end_metadata: dict[str, str] = {}
-        """Those from its end alone."""
+        """Facts from the session's end alone."""
         self.attachments: dict[str, bytes] = {}
-        """By name, among them the rig file and the exposure basis."""
+        """Attachments by name, among them the rig file and the exposure basis."""
         self.counts: dict[str, int] = {}
-        """Messages by topic."""
+        """Number of messages by topic."""
         self.start_ns = self.end_ns = 0
         """Log times of the first and of the last message."""
         self._losses: dict[int, Loss] = {}
@@ -95,9 +95,9 @@ class Recording:
         self._channels: dict[int, tuple[str, str]] = {}
         """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
-        """By name, as they are in the file."""
+        """Schemas by name, as they are in the file."""
         self.encodings: dict[str, str] = {}
-        """What the messages of a topic are encoded as, where the file says it."""
+        """Encoding of the messages by topic, where the file states it."""
         self._index: list[ChunkIndex] | None = None
         rig_text = self._survey(check=check)
         if rig_text is None:
@@ -115,7 +115,7 @@ class Recording:
 
     @property
     def losses(self) -> list[Loss]:
-        """What of the file could not be read, as far as it has been read, in the order of the file."""
+        """The parts that could not be read, so far as the file has been read, in the order of the file."""
         found = [self._losses[offset] for offset in sorted(self._losses)]
         for topic, messages in self._undecoded.items():
             times = [time_ns for _, time_ns in messages]
@@ -142,7 +142,7 @@ class Recording:
 
     @property
     def n_frames(self) -> int:
-        """How many of the camera's frames are in the file."""
+        """Number of the camera's frames in the file."""
         return self.counts.get(topics.IMAGE, 0)
 
     def skipped(self, estimator: str) -> frozenset[int]:
@@ -169,7 +169,7 @@ class Recording:
                 yield RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
 
     def decoded(self, raw: RawMessage) -> Message | None:
-        """What a message's bytes say; None if aolink does not know its kind, or if it is not of its kind: a loss."""
+        """The decoded message; None if aolink does not know its kind, or, as a loss, if it cannot be decoded."""
         kind = topics.SCHEMAS.get(raw.schema)
         if kind is None:
             return None
@@ -210,8 +210,8 @@ class Recording:
     def assembled(self, *others: str) -> Iterator[tuple[RecordedMessage | None, list[Exposure]]]:
         """Messages with the exposures that each completes, as they were in the session.
 
-        Of ``others`` all topics if none is named, besides those that make exposures. Exposures that were
-        still incomplete when the recording ended come last, with None.
+        The messages are those of the topics ``others`` (of all, if none is named), besides those that make exposures.
+        Exposures that were still incomplete when the recording ended come last, with None.
         """
         assembly = ExposureAssembly(self.rig)
         for recorded in self.messages(*({*others, *_ASSEMBLED} if others else ())):
@@ -219,7 +219,7 @@ class Recording:
         yield None, assembly.flush()
 
     def __iter__(self) -> Iterator[Exposure]:
-        """Its exposures, from the first one on: a recording is used as `aolink.simulate`'s exposures are."""
+        """Its exposures, from the first one on, as for the `Exposures` of `aolink.simulate`."""
         return self.exposures()
 
     def exposures(self) -> Iterator[Exposure]:
@@ -253,7 +253,7 @@ class Recording:
         return np.asarray(counts)
 
     def restored(self) -> Iterator[RestoredPictures]:
-        """What `aolink deblur` wrote, exposure by exposure."""
+        """The restored pictures that `aolink deblur` wrote, exposure by exposure."""
         info: schemas_pb2.Restoration | None = None
         pictures: dict[str, RawImage] = {}
         for recorded in self.messages(topics.RESTORATION, topics.RESTORED_SCENE, topics.RESTORED_SPOTS):

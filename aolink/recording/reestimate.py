@@ -1,4 +1,4 @@
-"""Estimates from a recording again, with the code that made them live."""
+"""New estimates from a recording, by the same code as in a live session."""
 
 from __future__ import annotations
 
@@ -33,7 +33,13 @@ def reestimate(
 ) -> dict[str, list[Estimate]]:
     """Run estimators over a recording; gives the estimates by name, one for each exposure.
 
-    With ``as_recorded`` an estimator skips what it had no time for in the session, and gives the same bits as there.
+    With ``as_recorded`` an estimator skips the exposures that it had no time for in the session, and gives the same
+    bits as there.
+
+    Raises
+    ------
+    EstimatorError
+        There is no such estimator, or it cannot work on this rig.
     """
     estimates: dict[str, list[Estimate]] = {name: [] for name in names}
     for _, each in reestimated(recording, names, progress, as_recorded=as_recorded):
@@ -50,7 +56,7 @@ def reestimated(
     *,
     as_recorded: bool = False,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
-    """The same exposure by exposure, estimates in the order of ``names``; nothing of it stays in memory."""
+    """`reestimate`, exposure by exposure, with estimates in the order of ``names``; nothing stays in memory."""
     driver = Driver(recording.rig, names, engine, skipped_by(recording, names) if as_recorded else None)
     for number, done in enumerate(driver.steps(recording.exposures()), 1):
         yield done
@@ -58,7 +64,7 @@ def reestimated(
 
 
 def skipped_by(recording: Recording, names: Sequence[str]) -> dict[str, frozenset[int]]:
-    """Frame ids of what the session's estimators skipped, by the names of those that skipped any."""
+    """Frame ids of the exposures that estimators skipped in the session, by the names of those that skipped any."""
     return {name: skipped for name in names if (skipped := recording.skipped(name))}
 
 
@@ -231,7 +237,7 @@ def _estimated(driver: Driver, messages: Sequence[tuple[RawMessage, list[Exposur
 
 
 def first_difference(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> str | None:
-    """Where two runs of an estimator first differ, in words; None if they agree bit for bit."""
+    """The first difference between two runs of an estimator, in words; None if they agree bit for bit."""
     if len(ours) != len(theirs):
         return f"{len(ours)} estimates against {len(theirs)}"
     for mine, other in zip(ours, theirs, strict=True):

@@ -62,7 +62,7 @@ _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
     Opcode.METADATA_INDEX: MetadataIndex.read,
     Opcode.FOOTER: Footer.read,
 }
-"""What is looked into; message indexes and other records are stepped over."""
+"""The kinds of records that are parsed; message indexes and others are skipped."""
 
 # What the mcap library and the decompressors raise on content that is damaged.
 _DAMAGE = (McapError, struct.error, RuntimeError, ValueError, OverflowError, EOFError, KeyError, zstandard.ZstdError)
@@ -90,7 +90,7 @@ class Loss:
 
 @dataclass(slots=True)
 class Summary:
-    """What the end of a file says about it."""
+    """The summary section at the end of a file: its index and statistics."""
 
     statistics: Statistics | None = None
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -121,7 +121,7 @@ def open_recording(path: Path) -> IO[bytes]:
     Raises
     ------
     RecordingError
-        It cannot be read, or is no MCAP file, nor what is left of one.
+        The file cannot be read, or is neither an MCAP file nor a part of one.
     """
     try:
         if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):

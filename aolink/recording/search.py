@@ -1,4 +1,4 @@
-"""Where the next record of a damaged MCAP file is: the next bytes that can only be a chunk, our metadata or the end."""
+"""Search for the next record of a damaged MCAP file: bytes that can only be a chunk, our metadata or the end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _CHUNK_HEAD = struct.Struct("<QQQII")
 """First and last log time, size and CRC without compression, length of the compression's name."""
 _SEARCH_BYTES = 1 << 20
 _LOOK_BYTES = 320
-"""Of a record's first bytes; the name of metadata of ours is shorter than 256."""
+"""Number of a record's first bytes that are checked; the name of metadata of ours is shorter than 256."""
 _BEFORE_INDEX = (Opcode.CHUNK, Opcode.MESSAGE_INDEX)
 _COMPRESSIONS = (b"lz4", b"zstd", b"")
 _CANDIDATE = re.compile(rb"[\x06\x0f].{4}\x00{4}|\x0c.{4}\x00{4}.\x00{3}aolink", re.DOTALL)

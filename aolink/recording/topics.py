@@ -41,7 +41,7 @@ class Topic:
     """One that ends with "/" is a prefix: an estimator's name follows."""
     message: type[Message]
     belongs_to: Literal["exposure", "steps", "time"] = "time"
-    """What a message is of: an exposure (by its ``frame_id``), fast steps (from its ``first_step`` on), or nothing but
+    """What a message belongs to: an exposure (by its ``frame_id``), fast steps (from its ``first_step`` on), or only
     its time. `cut` copies it with that, and `compare` finds its counterpart by it."""
     after: str = ""
     """Topic of the message that comes before a picture and says which exposure it is of: a picture does not say it."""
@@ -98,7 +98,7 @@ def estimate_topic(estimator: str) -> str:
 
 
 def estimation_topic(estimator: str) -> str:
-    """Topic of what an estimator had time for."""
+    """Topic of the messages that say which exposures an estimator had time for."""
     return ESTIMATION + estimator
 
 

@@ -29,7 +29,7 @@ from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.rig import Rig
 
 _QUEUE_BYTES = 256 << 20
-"""What may wait for the disk."""
+"""Most bytes that may wait for the disk."""
 _POLL_S = 0.005
 """How often the thread looks for what is queued: woken for each message, it would cost more than the writing."""
 _STALL_S = 5.0
@@ -37,7 +37,7 @@ _STALL_S = 5.0
 _LOOK_BYTES = 16 << 10
 """Bytes that go to the file between two looks at the clock: it tells of a stalled disk, and when to synchronise."""
 _MESSAGE_BYTES = 64
-"""What a message is on top of its data, at least."""
+"""Least bytes of a message in the queue besides its data."""
 _LARGEST_BASIS = 32 << 20
 """Bytes of an exposure basis that are kept whole."""
 
@@ -80,13 +80,13 @@ class RecordingWriter:
         The file; it must not exist unless ``overwrite``. Where the options ask for several files, their
         names are this one with -001, -002 ... before the suffix.
     rig:
-        Goes into the file as an attachment, with its exposure basis.
+        The rig, which goes into the file as an attachment, with its exposure basis.
     metadata:
         Facts about the session, written at the start.
     start_ns:
         Host time of the start.
     attachments:
-        What else goes into the file at its start, by name.
+        Further attachments that go into the file at its start, by name.
     deterministic:
         Cut the file by the messages' own times only, not by the wall clock as well: the same messages
         give the same bytes. For sessions on virtual time and for re-estimation.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 else:  # the type checker would believe in any name
 
     def __getattr__(name: str) -> Any:
-        """METHODS, the names: whoever does not ask for them does not wait for a search through the packages."""
+        """METHODS, the names of all methods; installed packages are searched only when somebody asks for it."""
         if name == "METHODS":
             return method_names()
         raise AttributeError(f"module 'aolink.restoration' has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""The row smoother as a banded solve: what the Kalman smoother gives with a first-order scanner, all rows at once."""
+"""The Kalman smoother of all rows at once, for a first-order scanner, as the solution of a banded system."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from aolink.restoration.psf import line_matrix
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# From so many lines on, products of blocks are faster than solving line by line.
+# From this many lines on, products of blocks are faster than solving line by line.
 _MANY_LINES = 64
 # Smallest block, pixels; and multiplications in one product of blocks: linear algebra's own threads would wait for
 # each other longer than a smaller one takes.
@@ -27,7 +27,7 @@ def smooth_lines(
     seen: BoolArray | None = None,
     known: FloatArray | None = None,
 ) -> FloatArray:
-    """Expected scene of zero mean, given all pixels of each line.
+    """Posterior mean of a scene of zero mean, given all pixels of each line.
 
     Minimises |image - C scene|^2 / s^2 + scene' Q scene, with Q the tridiagonal inverse covariance of a first-order
     line; (C'C / s^2 + Q) has as many bands as the PSF has taps.
@@ -37,9 +37,11 @@ def smooth_lines(
     lines:
         (lines, columns)
     values:
-        (taps,) or (columns, taps).
+        The PSF, (taps,), or that of each pixel, (columns, taps).
     correlation, variance:
-        Of the scene, see `aolink.restoration.scanner.first_order`.
+        Those of the scene, see `aolink.restoration.scanner.first_order`.
+    noise_variance:
+        s^2, variance of the lines' white noise.
     seen:
         False where a pixel was not measured, (lines, columns).
     known:
@@ -99,7 +101,7 @@ def normal_bands(taps: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def dense(bands: FloatArray) -> FloatArray:
-    """The whole symmetric matrix of its lower bands."""
+    """The whole symmetric matrix from its lower bands."""
     n = bands.shape[1]
     out, i = np.zeros((n, n)), np.arange(n)
     for d, band in enumerate(bands[:n]):

@@ -1,6 +1,6 @@
-"""What an exposure's sensors saw, without its blur: restored with the path that the exposure's estimate gives.
+"""Pictures of an exposure without its blur, restored with the PSF of the estimated path.
 
-Neither the truth nor the true scene is read for it; the latter tells afterwards how good it is.
+Neither the truth nor the true scene is used; `psnr` compares with the true scene afterwards.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class RestoredPictures:
     """Whose path they were restored with."""
     method: str
     scene_noise_sd: float
-    """Standard deviation of the scene's noise, as found; NaN where there is no scene."""
+    """Standard deviation of the scene's noise, as found in it; NaN where there is no scene."""
     path_noise_sd: float
-    """What the path's uncertainty adds to it."""
+    """Standard deviation of what the path's uncertainty adds to that noise."""
     reason: str
     """Why pictures are missing; empty where none is."""
     scene: NDArray[np.float32] | None
@@ -50,7 +50,7 @@ class RestoredPictures:
 def estimated_psfs(
     exposure: Exposure, estimate: Estimate, mixes: Iterable[FloatArray], kernel: Kernel, pixel_scale: float
 ) -> Iterator[Psf]:
-    """The PSF, with its uncertainty, of each of some sums of outputs: see `motion`."""
+    """The PSF, with its uncertainty, for each weighted sum of outputs (weights as in `motion`)."""
     roots, offset = coefficient_roots(estimate), exposure.start_offset
     shares = step_shares(exposure.n_steps, offset)
     for mix in mixes:
@@ -66,7 +66,11 @@ def scene_psf(rig: Rig, exposure: Exposure, estimate: Estimate) -> Psf:
 
 
 def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: str = "tv") -> RestoredPictures:
-    """Restore what an exposure's sensors saw, with the path of its estimate; intensities are cut at 0 and 1."""
+    """Restore the pictures of an exposure with the path of its estimate; intensities are cut at 0 and 1.
+
+    A picture that cannot be restored is None, and ``reason`` says why; ``method`` is a name of
+    `aolink.restoration.METHODS`.
+    """
     scene = spots = None
     noise, added, reasons = math.nan, math.nan, list[str]()
     if rig.scene is not None:
@@ -121,7 +125,7 @@ def psnr(picture: FloatArray, scene: FloatArray, mask: NDArray[np.bool_] | None 
 
 
 def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: NDArray[np.intp], scene: FloatArray) -> float:
-    """`psnr` of a scene as it came, against the true one moved as it is in the mean: no blur is mistaken for a shift.
+    """`psnr` of the scene before restoration, against the true scene moved by the mean displacement.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The exact inverse of the blur (Shahin, III): no noise is thought of, and none is forgiven."""
+"""The exact inverse of the blur (Shahin, III), for pictures without noise."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from aolink.restoration.psf import line_matrix
 FloatArray = NDArray[np.float64]
 Direction = Literal["forward", "backward"]
 
-# Zeros may lie on the unit circle (a uniform PSF's do): an error then stays as it is and does not grow.
+# Zeros may lie on the unit circle, as those of a uniform PSF do: an error then keeps its size.
 _ON_CIRCLE = 1e-6
 
 
 def largest_zero(values: FloatArray) -> float:
-    """Largest magnitude of the zeros of c_0 z^m + .. + c_m; of every pixel's, where each has its own PSF.
+    """Largest magnitude of the zeros of c_0 z^m + .. + c_m, over all pixels where each has its own PSF.
 
-    The inverse is stable if it is below one: by so much is a wrong initial state multiplied from pixel to pixel.
+    An error of the initial state is multiplied by it from pixel to pixel: below one, the inverse is stable.
     """
     largest = 0.0
     for taps in np.unique(values.reshape(-1, values.shape[-1]), axis=0):
@@ -67,7 +67,7 @@ def check_direction(values: FloatArray, direction: Direction) -> None:
 
 
 def invert_lines(lines: FloatArray, values: FloatArray, known: FloatArray | None) -> FloatArray:
-    """Scenes that give exactly these lines, scanned forwards.
+    """The scenes whose blur is exactly these lines, scanned forwards.
 
     Parameters
     ----------

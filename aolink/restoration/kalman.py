@@ -20,7 +20,7 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LineModel:
-    """The augmented model (12), with what is known before the first pixel."""
+    """The augmented model, Shahin (12), with the prior of its state at the first pixel."""
 
     A: FloatArray
     """(states, states); B gamma and alpha in it."""
@@ -42,10 +42,14 @@ def line_model(values: FloatArray, columns: int, scanner: Scanner, known: FloatA
     Parameters
     ----------
     values:
-        c_0 .. c_m, (taps,), or for each pixel, (columns, taps).
+        The PSF c_0 .. c_m, (taps,), or that of each pixel, (columns, taps).
+    columns:
+        Number of pixels of a line.
+    scanner:
+        Model of the scene.
     known:
         The m pixels of the scene before the first, about its mean, the nearest first, (lines or 1, m); None where they
-        are as unknown as the rest and have the scanner's stationary covariance.
+        are not known and have the scanner's stationary covariance.
     """
     taps = np.broadcast_to(values, (columns, values.shape[-1]))
     m, q = taps.shape[1] - 1, len(scanner.gamma)
@@ -154,9 +158,9 @@ def smooth(model: LineModel, result: Filtered) -> FloatArray:
 
 
 def scene_from_states(model: LineModel, states: FloatArray, pixels: range, lag: int = 0, first: int = 0) -> FloatArray:
-    """Pixels of the scene out of states, pixel k as state k + lag has it, (lines, len(pixels)).
+    """Pixels of the scene from states: pixel k from state k + lag, (lines, len(pixels)).
 
-    What lies before state ``first``'s own pixel is taken from that state's memory.
+    Pixels before that of state ``first`` are taken from the past pixels X which that state holds.
     """
     columns, n_lines, _ = states.shape
     out = np.empty((n_lines, len(pixels)))

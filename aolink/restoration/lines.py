@@ -31,14 +31,14 @@ _Boundary = float | ArrayLike | None
 def inverse(
     picture: Blurred, *, boundary: _Boundary = None, scanner: Scanner | None = None, direction: Direction | None = None
 ) -> Restored:
-    """The scene that gives exactly this picture; no noise is thought of, and no scanner used."""
+    """The scene whose blur is exactly this picture; noise and ``scanner`` are ignored."""
     values, origin = _without_delay(picture.psf.values, picture.psf.origin[0])
     way = _checked_direction(direction) or stable_direction(values)
     check_direction(values, way)
     lines = _Lines.of(picture, values, origin, boundary, way)
     columns = lines.rows.shape[1]
     out = invert_lines(lines.rows, lines.values, lines.known)
-    # What the PSF never brings into the frame is as the last pixel that it does.
+    # Pixels that the PSF never brings into the frame take the value of the last one that it does.
     place = np.arange(columns) + lines.values.shape[-1] - 1 - lines.origin
     scene = lines.picture(out[:, np.clip(place, 0, out.shape[1] - 1)], picture.planes.shape)
     return Restored(image=scene, scanner=scanner, direction=way)
@@ -129,7 +129,7 @@ class _Lines:
 
 
 def _without_delay(values: FloatArray, origin: int) -> tuple[FloatArray, int]:
-    """Without taps at the ends that are zero in every pixel's PSF: the first one would divide."""
+    """The PSF and its origin without end taps that are zero for every pixel: the inverse divides by the first one."""
     lit = np.flatnonzero(values.reshape(-1, values.shape[-1]).any(axis=0))
     first, last = int(lit[0]), int(lit[-1])
     kept = values[..., first : last + 1]
@@ -156,7 +156,7 @@ def _known(boundary: float | ArrayLike | None, rows: int, m: int) -> FloatArray 
 
 
 def _estimated(scanned: _Lines, which: str, scanner: Scanner, variance: float) -> FloatArray:
-    """Filter or smooth lines whose mean is taken out first: the processing is for zero mean."""
+    """Filter or smooth lines after subtracting their mean, since the model has zero mean."""
     lines, values, origin, seen, known = scanned.rows, scanned.values, scanned.origin, scanned.seen, scanned.known
     n_lines, columns = lines.shape
     m = values.shape[-1] - 1
@@ -165,12 +165,12 @@ def _estimated(scanned: _Lines, which: str, scanner: Scanner, variance: float) -
     lines = lines - mean * light
     if known is not None:
         known = known - mean
-        # A state all of which lies before the frame: begin as many unseen pixels earlier.
+        # The first state lies before the frame: begin with as many pixels that are not measured.
         lines = np.pad(lines, ((0, 0), (origin, 0)))
         seen = np.pad(np.ones((n_lines, columns), bool) if seen is None else seen, ((0, 0), (origin, 0)))
         if values.ndim == 2:
             values = np.concatenate([np.repeat(values[:1], origin, axis=0), values])
-    # The first state that has seen a pixel, and the first pixel of the frame.
+    # The first state after a measured pixel, and the first pixel of the frame.
     first, start = (origin, 0) if known is not None else (0, -origin)
     pixels = range(start, start + columns)
     if which == "smoother" and len(scanner.gamma) == 1:

@@ -1,4 +1,4 @@
-"""The two-dimensional Gauss-Markov scene: differences along rows and columns are white.
+"""Restoration of a two-dimensional Gauss-Markov scene, whose differences along rows and columns are white.
 
 A solver holds (H'WH + kappa L) for one PSF: H blurs a scene that goes beyond the frame into the frame, W masks pixels
 that were not measured, L = Dx'Dx + Dy'Dy, and kappa is lambda times the noise's variance. Nothing is periodic, and
@@ -27,13 +27,13 @@ _TOLERANCE = 1e-4
 # Above this kappa, in squares of the PSF's sum, single precision is wrong by far less than the noise; its error grows
 # with one over kappa.
 _SINGLE = 1e-3
-# Scenes of so many pixels are solved by one dense factorisation, which conjugate gradients do not come up to; FFTs of
-# less than this gain nothing by a second thread.
+# Scenes of up to this many pixels are solved by one dense factorisation, which is faster than conjugate gradients; and
+# FFTs of fewer pixels than this gain nothing by a second thread.
 _SMALL_SCENE, _SMALL_FFT = 1200, 40_000
 
 
 class Solver(Protocol):
-    """What the methods need of (H'WH + kappa L)."""
+    """Solves (H'WH + kappa L) x = b for the methods on the plane."""
 
     @property
     def frame(self) -> tuple[slice, slice]:
@@ -45,16 +45,16 @@ class Solver(Protocol):
         ...
 
     def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
-        """The scene x with (H'WH + kappa L) x = right; an error is measured against the root of kappa x'L x."""
+        """The scene x with (H'WH + kappa L) x = right; ``tolerance`` is relative to the root of kappa x'L x."""
         ...
 
     def guess(self, images: FloatArray) -> FloatArray | None:
-        """A scene to start from, of images that hold something likely where they were not measured, if it helps."""
+        """A scene to start from, if that helps; ``images`` hold likely values where nothing was measured."""
         ...
 
 
 def difference_spectrum(n: int) -> NDArray[np.float64]:
-    """Eigenvalues of D'D for n pixels in a row, whose vectors are the cosines of the DCT-II, (n,)."""
+    """Eigenvalues of D'D for n pixels in a row, whose eigenvectors are the cosines of the DCT-II, (n,)."""
     return 2 - 2 * np.cos(np.pi * np.arange(n) / n)
 
 
@@ -63,11 +63,11 @@ class LineSolver:
     """Blur along the rows, all pixels measured: exact. Cosines down the columns, one eigenbasis along the rows."""
 
     C: FloatArray
-    """Blurs a line, (columns, columns + m)."""
+    """Matrix that blurs a line, (columns, columns + m)."""
     vectors: FloatArray
-    """Of C'C + kappa Dx'Dx, (columns + m, columns + m)."""
+    """Eigenvectors of C'C + kappa Dx'Dx, (columns + m, columns + m)."""
     inverse: FloatArray
-    """One over their values plus kappa times those of Dy'Dy, (rows, columns + m)."""
+    """One over their eigenvalues plus kappa times those of Dy'Dy, (rows, columns + m)."""
     first: int
     """Element of a line at which the frame starts."""
 
@@ -89,9 +89,9 @@ class LineSolver:
 
 
 def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = False) -> LineSolver:
-    """The exact solver of a PSF along the rows, which may differ from pixel to pixel; in single precision if allowed.
+    """The exact solver of a PSF along the rows, which may differ from pixel to pixel.
 
-    It is the latter where that costs nothing that shows.
+    ``single`` allows single precision, which is used where its error is far below the noise.
     """
     taps = np.broadcast_to(psf.values, (shape[1], psf.values.shape[-1]))
     single = single and kappa >= _SINGLE * float(taps.sum(axis=1).max()) ** 2
@@ -115,11 +115,11 @@ class DenseSolver:
     """Any blur on the plane and any mask of a small frame: exact, by the Cholesky factor of the whole matrix."""
 
     H: FloatArray
-    """Blurs a scene, zero where nothing was measured, (pixels, scene's pixels)."""
+    """Matrix that blurs a scene, zero where nothing was measured, (pixels, scene's pixels)."""
     factor: FloatArray
-    """Lower one of (H'WH + kappa L), (scene's pixels, scene's pixels)."""
+    """Lower Cholesky factor of (H'WH + kappa L), (scene's pixels, scene's pixels)."""
     shape: tuple[int, int]
-    """Of the scene."""
+    """Rows and columns of the scene."""
     frame: tuple[slice, slice]
 
     def project(self, images: FloatArray) -> FloatArray:
@@ -168,13 +168,13 @@ def _on_plane(psf: Psf, shape: tuple[int, int]) -> tuple[NDArray[np.float64], tu
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class IterativeSolver:
-    """Any blur on the plane and any mask, by conjugate gradients from a solver that is nearly right."""
+    """Any blur on the plane and any mask, by preconditioned conjugate gradients."""
 
     kappa: float
     blur: Callable[[FloatArray], FloatArray]
     blur_transposed: Callable[[FloatArray], FloatArray]
     nearly: Callable[[FloatArray], FloatArray]
-    """A symmetric positive definite operator near the inverse."""
+    """Preconditioner: a symmetric positive definite operator near the inverse."""
     guess: Callable[[FloatArray], FloatArray]
     seen: BoolArray | None
     frame: tuple[slice, slice]
@@ -190,7 +190,7 @@ class IterativeSolver:
         r = right - self._apply(x)
         z = self.nearly(r)
         p, rz = z, _dot(r, z)
-        # Rounding leaves the second one of a picture that is even.
+        # The second limit is rounding, for a picture that is the same everywhere.
         goal = np.maximum(tolerance**2 * prior, 1e-28 * _dot(right, self.nearly(right)))
         for _ in range(_MOST_STEPS):
             if (rz <= goal).all():
@@ -231,7 +231,7 @@ def differences_transposed(along: FloatArray, down: FloatArray) -> FloatArray:
 def plane_solver(
     psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, white: bool = False
 ) -> IterativeSolver:
-    """The solver of a PSF on the plane (or along all rows alike), starting from its periodic one."""
+    """The solver of a PSF on the plane (or along all rows alike), with the periodic solver as preconditioner."""
     taps, frame = _on_plane(psf, shape)
     reach = (taps.shape[0] - 1, taps.shape[1] - 1)
     rows, columns = size = (shape[0] + reach[0], shape[1] + reach[1])
@@ -243,7 +243,7 @@ def plane_solver(
     share = fraction * shape[0] * shape[1] / (rows * columns)
 
     def spectra(plane: tuple[int, int]) -> tuple[NDArray[np.complexfloating[Any]], FloatArray]:
-        """Transfer function, and what is nearly the inverse."""
+        """Transfer function, and the spectrum of the preconditioner."""
         transfer = fft.rfft2(taps, plane)
         y, x = fft.fftfreq(plane[0])[:, None], fft.rfftfreq(plane[1])[None]
         rough = 4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2
@@ -268,7 +268,7 @@ def plane_solver(
         return through(scene, transfer)[..., reach[0] :, reach[1] :]
 
     def guess(images: FloatArray) -> FloatArray:
-        """The periodic scene of images that go over from their last pixel to their first where nothing is known."""
+        """The periodic solution for images continued from their last pixel to their first beyond the frame."""
         padded = placed(images)
         down = (np.arange(1, reach[0] + 1) / (reach[0] + 1))[:, None]
         padded[..., : reach[0], :] = (1 - down) * padded[..., -1:, :] + down * padded[..., reach[0], None, :]
@@ -284,7 +284,7 @@ def plane_solver(
 
 
 def masked_line_solver(psf: Psf, seen: BoolArray, kappa: float) -> IterativeSolver:
-    """Blur along the rows with pixels missing: conjugate gradients from the exact solver of the whole frame."""
+    """Blur along the rows, pixels missing: conjugate gradients preconditioned by the whole frame's exact solver."""
     exact = line_solver(psf, (seen.shape[0], seen.shape[1]), kappa)
     return IterativeSolver(
         kappa=kappa, blur=lambda x: np.asarray(x @ exact.C.T), blur_transposed=lambda y: np.asarray(y @ exact.C),
@@ -297,7 +297,7 @@ def make_solver(
 ) -> Solver:
     """The solver for a PSF, a frame's shape, kappa, and a mask (rows, columns), False where nothing was measured.
 
-    ``single`` allows single precision, where it costs nothing that shows.
+    ``single`` allows single precision, which is used where its error is far below the noise.
     """
     if psf.on_line and seen is None:
         return line_solver(psf, shape, kappa, single)

@@ -1,4 +1,4 @@
-"""What a restoration method is given, what it gives, and what the registry knows about it."""
+"""Input and result of a restoration method, and its row in the registry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Blurred:
-    """A blurred picture as a method is given it."""
+    """A blurred picture and its PSF, the input of a method."""
 
     planes: FloatArray
     """The colours one after the other, zero where nothing was measured, (colours, rows, columns)."""
@@ -31,7 +31,7 @@ class Blurred:
     seen: BoolArray | None
     """True where a pixel was measured, (rows, columns); None where all were."""
     given_noise_sd: float | None
-    """Standard deviation of the picture's white noise; None where it is to be found in the picture."""
+    """Standard deviation of the picture's white noise; None where it is to be estimated from the picture."""
 
     @cached_property
     def whole(self) -> FloatArray:
@@ -43,12 +43,12 @@ class Blurred:
 
     @cached_property
     def power_spectrum(self) -> spectrum.Spectrum:
-        """Of the whole planes, for a scene whose differences are white."""
+        """Periodogram of `whole`, for a scene whose differences are white."""
         return spectrum.plane_spectrum(self.whole, self.psf.mean)
 
     @cached_property
     def noise_variance(self) -> float:
-        """As given, or as found in the picture; above what rounding of the numbers makes."""
+        """Variance of the noise, as given or as estimated from the picture; at least that of rounding."""
         if self.given_noise_sd is not None:
             return self.given_noise_sd**2
         planes = self.whole
@@ -70,15 +70,15 @@ class Restored:
     (colours, rows, columns)."""
     method: str = ""
     noise_sd: float = math.nan
-    """Standard deviation of the picture's white noise, as given or as found; NaN for a method that needs none."""
+    """Standard deviation of the picture's white noise, as given or as estimated; NaN for a method that needs none."""
     psf_noise_sd: float = math.nan
-    """What the PSF's uncertainty adds to it, root of the added variance; NaN for a method that does without."""
+    """Root of the variance that the PSF's uncertainty adds to the noise; NaN for a method that ignores it."""
     difference_weight: float = math.nan
     """lambda of gauss_markov, tv and pnp, one over the picture's unit squared; NaN for the other methods."""
     scanner: Scanner | None = None
-    """What the methods on lines took the scene for."""
+    """Model of the scene that a method on lines used."""
     direction: Direction = "forward"
-    """In which the lines were scanned."""
+    """Direction in which the lines were scanned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +87,7 @@ class Method:
 
     name: str
     summary: str
-    """What is special about it, in some words."""
+    """What it is, in a few words."""
     restore: Callable[..., Restored]
     """Takes a `Blurred`, and those of `parameters` that the caller gives, by name."""
     why_not: Callable[[Blurred], str | None] = lambda blurred: None

@@ -16,21 +16,21 @@ from aolink.restoration.plug_and_play import Denoiser, non_local_means, plug_and
 from aolink.restoration.tv import total_variation
 from aolink.restoration.uncertainty import plane_variance
 
-# Noise below this share of the scene's differences (variances) is taken for as much where conjugate gradients solve:
-# their steps grow with one over its root, and the picture is no sharper for it.
+# Least ratio of the variances of the noise and of the scene's differences for conjugate gradients: below it they need
+# more steps, as one over the ratio's root, and the picture gets no sharper.
 _SMALLEST_RATIO = 3e-4
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Weights:
-    """How much a picture is believed, and how rough its scene is."""
+    """Variances of a picture's noise, and the weight of its scene's differences."""
 
     noise: float
     """Variance of the picture's noise."""
     unexplained: float
     """Variance that the PSF's uncertainty adds to it."""
     total: float
-    """Variance that the methods reckon with."""
+    """Variance that the methods use: the sum of both."""
     difference: float
     """lambda, one over the variance of the scene's differences."""
 
@@ -53,7 +53,7 @@ class _Weights:
 
 
 def gauss_markov(picture: Blurred) -> Restored:
-    """Differences of the scene are Gaussian and white."""
+    """Posterior mean of a scene whose differences are Gaussian and white."""
     weights = _Weights.of(picture)
     solver = make_solver(picture.psf, _shape(picture), weights.difference * weights.total, picture.seen)
     whole = picture.whole
@@ -61,13 +61,13 @@ def gauss_markov(picture: Blurred) -> Restored:
 
 
 def tv(picture: Blurred) -> Restored:
-    """Differences of the scene are Laplacian."""
+    """Total variation: the posterior mode of a scene whose differences are Laplacian."""
     weights = _Weights.of(picture)
     return weights.restored(*_with_edges(picture, weights))
 
 
 def pnp(picture: Blurred, *, denoise: Denoiser = non_local_means) -> Restored:
-    """The scene is what a denoiser leaves as it is."""
+    """Plug and play: a denoiser takes the place of the scene's prior."""
     weights = _Weights.of(picture)
     start, solver = _with_edges(picture, weights)
     scene = plug_and_play(

@@ -1,4 +1,4 @@
-"""Plug and play: any denoiser in turn with the data's own step; non-local means unless another is given.
+"""Plug and play: steps of any denoiser and of the data term in turn; non-local means unless another is given.
 
 References
 ----------
@@ -19,7 +19,7 @@ from aolink.restoration.markov import IterativeSolver
 
 FloatArray = NDArray[np.float64]
 Denoiser = Callable[[FloatArray, float], FloatArray]
-"""A picture (rows, columns) and its noise's standard deviation to the picture without noise."""
+"""From a picture (rows, columns) and the standard deviation of its noise to the picture without noise."""
 
 # Coupling of scene and denoised picture, and the denoiser's first sd as a share of the picture's range.
 _COUPLING = 0.23

@@ -1,4 +1,4 @@
-"""The point spread function of a motion: where it comes from, what it may be, how uncertain it is.
+"""The point spread function (PSF) of a motion, with its uncertainty.
 
 Convention of the centre: a scene point at pixel p, moved by d pixels, lands on pixel p + d. Tap j of a PSF stands
 for a displacement of j - origin, so that
@@ -23,11 +23,11 @@ from aolink.optics.sensor import Kernel
 
 FloatArray = NDArray[np.float64]
 
-# Light beyond so many standard deviations of the kernel is left out, as are taps below this share of the largest.
+# Light beyond this many standard deviations of the kernel is left out, as are taps below this share of the largest.
 _REACH = 5.0
 _NEGLIGIBLE = 1e-5
-# Correlation of x and y in one step's light that is left out, and points to integrate over it where it is not: so many,
-# and so many more by its ratio to what is not correlated.
+# Correlation of x and y in one step's light below which it is left out. Above, points to integrate over it: a first
+# number, and a second one times its ratio to the uncorrelated part.
 _UNCORRELATED = 1e-3
 _POINTS, _MORE_POINTS, _MOST_POINTS = 6, 8, 256
 # Modes of the PSF's error that together hold less than this share of its variance are left out.
@@ -129,14 +129,14 @@ def motion_psf(
         Displacement at each fast step, slope units, (n_steps,) along the rows of the picture, or (2, n_steps): x along
         its columns' numbers, y along its rows' numbers.
     path_covariance:
-        Of the path, slope units squared, (n_steps, n_steps) or (2 n_steps, 2 n_steps) with all of x first; None
-        where the path is known.
+        Covariance of the path, slope units squared, (n_steps, n_steps), or (2 n_steps, 2 n_steps) with all of x first;
+        None where the path is known exactly.
     kernel:
         The picture's image kernel.
     pixel_scale:
         Width of one pixel of the picture, slope units.
     shares:
-        Of the exposure in each step, (n_steps,), see `aolink.exposure.step_shares`; None where all have the same.
+        Share of the exposure in each step, (n_steps,), see `aolink.exposure.step_shares`; None where all are the same.
 
     Returns
     -------
@@ -172,7 +172,7 @@ def motion_psf_by_root(
     axes, n = steps.shape
     share = _checked_shares(shares, n)
     error = (np.zeros((steps.size, 1)) if root is None else root).reshape(axes, n, -1) / pixel_scale
-    # Of where light of each step lies, (n_steps, axes, axes).
+    # Covariance of the position of each step's light, (n_steps, axes, axes).
     spread = np.einsum("aim,bim->iab", error, error) + kernel.covariance[:axes, :axes] / pixel_scale**2
     together, points, weights = _correlated_part(spread)
     width = np.sqrt(2 * (spread[:, range(axes), range(axes)].T - together**2))
@@ -232,7 +232,7 @@ def _path_root(covariance: ArrayLike | None, size: int) -> FloatArray:
 
 
 def _axis(positions: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatArray, int]:
-    """Masses in pixels and their slopes by the position, (n_steps, points, pixels), and the pixel of no displacement.
+    """Masses in pixels and their derivatives by position, (n_steps, points, pixels), and the pixel of no displacement.
 
     Positions (n_steps, points), widths (n_steps,).
     """
@@ -246,7 +246,7 @@ def _axis(positions: FloatArray, width: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def _trimmed(values: FloatArray, modes: FloatArray, origin: tuple[int, ...]) -> Psf:
-    """Without negligible edges (the origin stays inside), of unit sum, with the modes that matter."""
+    """The PSF of unit sum, without negligible edges (the origin stays inside) and negligible modes."""
     keep = []
     for axis, centre in enumerate(origin):
         others = tuple(a for a in range(values.ndim) if a != axis)
@@ -285,10 +285,10 @@ def line_matrix(values: FloatArray, columns: int) -> FloatArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Line:
-    """What of a PSF on the plane lies along one line."""
+    """Projection of a PSF on the plane onto a straight line."""
 
     angle_rad: float
-    """Of the line, from the direction of growing columns towards growing rows."""
+    """Angle of the line, from the direction of growing columns towards growing rows."""
     psf: Psf
     deviation_px: float
     """Root mean square distance of the light from the line, without the width of the pixels."""

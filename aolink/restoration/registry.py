@@ -1,7 +1,7 @@
 """The restoration methods, one row each: those of aolink, and those of installed packages.
 
-A package adds one with an entry point of the group ``aolink.restorations`` that names a `Method`. It is loaded when it
-is asked for, so that a broken one is in nobody else's way.
+A package adds one with an entry point of the group ``aolink.restorations`` that names a `Method`. It is loaded at its
+first use, so that a broken one does not stop the others.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def find_method(name: str) -> Method:
     Raises
     ------
     RestorationError
-        There is none, or that of an installed package does not work.
+        There is no such method, or the installed package that has it is broken.
     """
     if row := _OWN.get(name):
         return row

@@ -1,4 +1,4 @@
-"""`restore`: a blurred picture and its PSF to the picture without the blur."""
+"""`restore`: from a blurred picture and its PSF to the picture without the blur."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ def restore(
     psf:
         A `Psf`; or plain numbers, which are divided by their sum and centred on tap ``n // 2``.
     method:
-        A name of `METHODS`. On lines (a motion along a straight line, at any angle), where no line knows of its
-        neighbours: ``inverse`` (exact, for pictures without noise), the Kalman ``predictor``, ``filter``, ``lag`` (by
-        the PSF's length), ``smoother``. On the plane: ``gauss_markov``, ``tv`` (keeps edges), ``pnp`` (plug and play;
-        slow). Installed packages may add others.
+        A name of `METHODS`. On lines (for a motion along a straight line, at any angle; each line by itself):
+        ``inverse`` (exact, for pictures without noise), the Kalman ``predictor``, ``filter``, ``lag`` (fixed-lag
+        smoother, by the PSF's length), ``smoother``. On the plane: ``gauss_markov``, ``tv`` (keeps edges), ``pnp``
+        (plug and play; slow). Installed packages may add others.
     noise_sd:
-        Of the picture's white noise, in its own unit; None finds it in the picture.
+        Standard deviation of the picture's white noise, in the picture's unit; estimated from the picture where None.
     mask:
         True where a pixel is good, (rows, columns); dead and saturated pixels are False and are filled in.
     **parameters:
-        What the method takes besides (`Method.parameters`); None is as if it were not given. The methods on lines take
+        Further parameters of the method (`Method.parameters`); None means not given. The methods on lines take
 
-        ``boundary``: what the scene is before the first pixel of each line: a value, or (rows, taps - 1) pixels in
-        their order on the line. The inverse takes it for the taps - 1 pixels before the one that c_0 meets. None:
-        unknown, estimated.
+        ``boundary``: the scene before the first pixel of each line: a value, or (rows, taps - 1) pixels in their order
+        on the line. For the inverse these are the taps - 1 pixels before the first that tap c_0 brings into the frame.
+        None: unknown, estimated.
 
         ``scanner``: model of the scene, see `first_order`, `from_correlation`; None fits a first-order one.
 
@@ -63,8 +63,8 @@ def restore(
     Raises
     ------
     RestorationError
-        A picture or PSF that is empty, of the wrong shape or not finite; a PSF that is negative or wider than the
-        picture; a method that there is not, or that cannot restore this picture or does not take a parameter.
+        The picture or PSF is empty, of the wrong shape or not finite; the PSF is negative or wider than the picture;
+        the method does not exist, cannot restore this picture, or does not take a parameter.
 
     Examples
     --------

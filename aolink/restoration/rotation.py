@@ -25,11 +25,11 @@ def to_lines(
     good:
         True where a pixel was measured, (rows, columns).
     angle_rad:
-        From growing columns towards growing rows.
+        Angle from growing columns towards growing rows.
 
     Returns
     -------
-    The turned pictures, in a frame that holds all of theirs; where they have something measured; and the way back.
+    The turned pictures, in a frame that holds all of them; where they are measured; and a function that turns back.
     """
     rows, columns = planes.shape[1:]
     c, s = math.cos(angle_rad), math.sin(angle_rad)

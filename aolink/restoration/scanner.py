@@ -27,7 +27,7 @@ class Scanner:
 
     @property
     def covariance(self) -> FloatArray:
-        """Of the stationary state, (states, states)."""
+        """Covariance of the stationary state, (states, states)."""
         return np.asarray(linalg.solve_discrete_lyapunov(self.alpha, self.noise))
 
     def correlation(self, lags: int) -> FloatArray:
@@ -40,7 +40,13 @@ class Scanner:
 
 
 def first_order(correlation: float, variance: float) -> Scanner:
-    """A line whose neighbours correlate by ``correlation``; 0 is a scanner that is just a delay."""
+    """A first-order Gauss-Markov line: neighbours correlate by ``correlation``; 0 is the delay of Shahin, V.
+
+    Raises
+    ------
+    RestorationError
+        The correlation is not from 0 to below 1, or the variance not above 0.
+    """
     if not 0 <= correlation < 1 or not (variance > 0 and math.isfinite(variance)):
         raise RestorationError(
             f"a first-order scanner needs a correlation from 0 to below 1 and a variance above 0,"
@@ -59,6 +65,11 @@ def from_correlation(correlation: ArrayLike) -> Scanner:
     correlation:
         Covariance of the zero-mean line with itself 0, 1, .. p pixels on, p >= 1: given, or as `measured_correlation`
         finds it on a sharp picture of the same kind, (p + 1,).
+
+    Raises
+    ------
+    RestorationError
+        No line can have this correlation function.
     """
     r = np.asarray(correlation, dtype=np.float64)
     if r.ndim != 1 or len(r) < 2 or not np.isfinite(r).all() or np.linalg.eigvalsh(linalg.toeplitz(r)).min() <= 0:

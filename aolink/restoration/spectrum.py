@@ -1,7 +1,7 @@
-"""Noise and weights from the blurred picture itself, by the likelihood of its spectrum (Whittle's).
+"""Noise and weights estimated from the blurred picture itself, by Whittle's likelihood of its periodogram.
 
-The picture is tapered, so that what crosses its border does not leak over all frequencies; the periodogram at each
-frequency is then nearly exponential about what the model expects there, independently of the others.
+The picture is tapered, so that the jump at its border does not leak over all frequencies; the periodogram at each
+frequency then has nearly an exponential distribution with the mean that the model expects, independently of the others.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from aolink.errors import RestorationError
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# Share of the frequencies, those where blur and scene leave least, that hold nothing but noise.
+# Share of the frequencies, those where the blurred scene is weakest, that are taken to hold noise only.
 _DARK_SHARE = 0.02
-# Frequencies below this many periods an image are the taper's, not the scene's.
+# Frequencies below this many periods an image are left out, since the taper dominates them.
 _LOWEST = 2.5
 _FEWEST = 6
 _SMALLEST_RATIO, _LARGEST_RATIO = 1e-7, 1e2
@@ -28,7 +28,7 @@ _SMALLEST_RATIO, _LARGEST_RATIO = 1e-7, 1e2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spectrum:
-    """A picture's periodogram, and what blur and scene do at each of its frequencies."""
+    """A picture's periodogram, and the spectra of blur and differences at the same frequencies."""
 
     power: FloatArray
     """Squared magnitude per pixel; all colours' mean, (frequencies,)."""
@@ -51,7 +51,7 @@ def _check_enough(usable: BoolArray, rows: int, columns: int, where: str) -> Non
 
 
 def plane_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
-    """Of pictures (batch, rows, columns), for a scene whose differences along both axes are white."""
+    """The periodogram of pictures (batch, rows, columns), for a scene whose differences along both axes are white."""
     _, rows, columns = images.shape
     taper = _taper(rows)[:, None] * _taper(columns)
     centred = images - (images * taper**2).mean(axis=(1, 2), keepdims=True)
@@ -65,7 +65,7 @@ def plane_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
 
 
 def line_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
-    """Of the rows of pictures (batch, rows, columns), each a line of its own."""
+    """The periodogram of the rows of pictures (batch, rows, columns), each a line of its own."""
     columns = images.shape[-1]
     taper = _taper(columns)
     centred = images - (images * taper**2).mean(axis=-1, keepdims=True)
@@ -78,7 +78,7 @@ def line_spectrum(images: FloatArray, psf: FloatArray) -> Spectrum:
 
 
 def noise_variance(spectrum: Spectrum) -> float:
-    """Variance of white noise, from the frequencies where least of the scene is left: never below it but by chance."""
+    """Variance of white noise, from the frequencies where least of the scene is left: too small only by chance."""
     left = spectrum.transfer / np.maximum(spectrum.roughness, 1e-12)
     count = min(max(8, math.ceil(_DARK_SHARE * left.size)), left.size)
     # All that are alike are in: a mirrored picture has the same noise.

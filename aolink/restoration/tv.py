@@ -1,4 +1,4 @@
-"""Edges kept: total variation by the alternating direction method, whose linear step is the exact Gauss-Markov one."""
+"""Total variation by ADMM (alternating direction method of multipliers), with the exact Gauss-Markov linear step."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from aolink.restoration.markov import Solver, differences_transposed
 
 FloatArray = NDArray[np.floating[Any]]
 
-# Weight of total variation in square roots of lambda: differences that are Laplacian instead of Gaussian, of like size.
+# Weight of total variation in square roots of lambda, for Laplacian differences about as large as Gaussian ones.
 WEIGHT = 1.2
-# Penalty on the split differences, in lambdas, and over-relaxation: what six iterations converge with.
+# Penalty on the split differences, in lambdas, and over-relaxation: with these, six iterations converge.
 PENALTY = 3.0
 _RELAXATION = 1.7
 ITERATIONS = 6
@@ -51,7 +51,7 @@ def total_variation(
     solver = make_solver(kappa)
     seen = solver.project(images)
     x = solver.solve(seen, solver.guess(images), _TOLERANCE)
-    # Differences plus what the dual variables are short of them: the kept ones are this times f, the duals the rest.
+    # Differences plus scaled dual variables: times the shrinkage f they are the split differences, the rest the duals.
     along, down = np.diff(x, axis=-1), np.diff(x, axis=-2)
     for _ in range(iterations):
         f = _shrinkage(along, down, threshold)

@@ -1,4 +1,4 @@
-"""What a PSF's error does to the picture: noise that grows with the scene's own contrast.
+"""A PSF's error as additional noise of the picture, which grows with the scene's contrast.
 
 With the scene's covariance R and an error of the PSF of covariance sum_i m_i m_i', the blurred picture has an error of
 variance sum_i m_i' R m_i that no restoration with the expected PSF can explain. It is treated as white.
@@ -18,7 +18,7 @@ _GRID = 256
 
 
 def line_variance(modes: FloatArray, scanner: Scanner) -> float:
-    """For lines of a scanner; a mean over pixels where each has its own PSF. Modes (modes, .., taps)."""
+    """Added variance for lines of a scanner, a mean over pixels where each has its own PSF; modes (modes, .., taps)."""
     if not len(modes):
         return 0.0
     R = linalg.toeplitz(scanner.correlation(modes.shape[-1] - 1))
@@ -26,7 +26,7 @@ def line_variance(modes: FloatArray, scanner: Scanner) -> float:
 
 
 def plane_variance(modes: FloatArray, difference_weight: float) -> float:
-    """For a scene whose differences are white; modes (modes, taps) or (modes, rows, columns), each of zero sum.
+    """Added variance for a scene of white differences; modes (modes, taps) or (modes, rows, columns), each of zero sum.
 
     The mean over all frequencies of |m|^2 / (lambda roughness).
     """

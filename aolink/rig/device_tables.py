@@ -10,7 +10,7 @@ from aolink.rig.toml_table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class DeviceTable:
-    """What a rig file says about one device."""
+    """The driver of one device and its options."""
 
     driver: str
     """Name of the driver: ``native``, or one that another package brings."""
@@ -19,7 +19,7 @@ class DeviceTable:
 
 
 def read_devices(table: Table) -> dict[str, DeviceTable]:
-    """The table ``[devices]``: by ``camera`` and ``mirror``, those of the two that it has. Raises `RigError`."""
+    """The table ``[devices]``: by the names ``camera`` and ``mirror``, where it has them. Raises `RigError`."""
     devices = {}
     for kind in ("camera", "mirror"):
         if table.has(kind):

@@ -1,4 +1,4 @@
-"""What disturbs a rig beside its plant's own noise, as a rig file's ``[disturbance]`` says; simulated rigs play it."""
+"""A rig file's ``[disturbance]``: slopes that a simulated rig adds to those of its plant."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Vibration:
-    """A line in the spectrum of all spots' slopes; its phase is by the seed."""
+    """A sinusoidal vibration of all spots' slopes; its phase depends on the seed."""
 
     frequency_hz: float
     amplitude: tuple[float, float]
@@ -28,17 +28,17 @@ class Disturbance:
     """Slopes that are added to the plant's outputs."""
 
     plant_noise: bool
-    """Whether the plant makes its own process noise as well. Where not, ``plant.process_noise`` is only what
-    estimators expect of the disturbance."""
+    """Whether the plant makes its own process noise as well. If not, ``plant.process_noise`` is only what
+    estimators expect the disturbance to be."""
     layers: tuple[Layer, ...]
-    """Turbulence."""
+    """Layers of turbulence."""
     pupil_m: float
-    """Width of the turbulence that the lenslets' columns see together, m."""
+    """Width of the turbulence that all columns of lenslets cover together, m."""
     vibrations: tuple[Vibration, ...]
     zernike_m: FloatArray
     """Static aberration: Noll's index and metres rms over the circle about the lenslets, (k, 2)."""
     recorded: str
-    """A file with slopes at each fast step, slope units, (steps, outputs), played round and round; empty for none."""
+    """A file with slopes at each fast step, slope units, (steps, outputs), played in a loop; empty for none."""
 
 
 def read_disturbance(table: Table) -> Disturbance:

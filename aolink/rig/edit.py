@@ -1,4 +1,4 @@
-"""New values in the text of a rig file; every other character, comments and layout, stays."""
+"""Edit values in the text of a rig file; every other character, comments and layout, stays."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from aolink.rig.toml_table import did_you_mean
 
 
 def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False) -> str:
-    """Another value for a key such as ``plant.process_noise``.
+    """The text with another value for a key such as ``plant.process_noise``.
 
     Parameters
     ----------
     value:
         Anything that TOML has, or a `tomlkit.value`, which keeps its digits.
     may_be_new:
-        Whether the key may be missing. The new one stands behind the last value of its table.
+        Whether the key may be missing; it is added behind the last value of its table.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def with_value(text: str, key: str, value: Any, *, may_be_new: bool = False) -> 
 
 
 def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) -> str:
-    """These values in a table at the top of the file; where there is none yet, in a new one at its end."""
+    """The text with these values in a top-level table, which is added at the end if there is none yet."""
 
     def edit(document: tomlkit.TOMLDocument) -> None:
         if name not in document:

@@ -29,7 +29,7 @@ _TABLES = (
     "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
     "lenslets", "disturbance", "scene", "calibration", "devices",
 )  # fmt: skip
-"""What a rig file may hold at its top."""
+"""The top-level keys of a rig file."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,9 +52,9 @@ class Rig:
     scene: SceneSensor | None
     """The picture sensor that shares the exposure, where the rig has one."""
     devices: dict[str, DeviceTable]
-    """What drives the camera and the mirror, by these names, where the file says it."""
+    """Drivers of the devices, by the names ``camera`` and ``mirror``, where the file names them."""
     folder: Path
-    """Of the file; where a file is named in it, its path is relative to this."""
+    """Folder of the rig file, which paths in the file are relative to."""
     toml: str
     """The file's text, as read."""
 
@@ -65,12 +65,12 @@ class Rig:
 
     @property
     def n_inputs(self) -> int:
-        """Inputs of the whole rig: a row of a command."""
+        """Number of inputs of the whole rig, the length of a command's row."""
         return self.plant.axes * self.plant.n_inputs
 
     @property
     def n_outputs(self) -> int:
-        """Outputs of the whole rig: rows of a path."""
+        """Number of outputs of the whole rig, the rows of a path."""
         return self.plant.axes * self.plant.n_outputs
 
 

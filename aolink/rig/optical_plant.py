@@ -1,4 +1,4 @@
-"""The parts of a rig file that are optics: lenslets, and the plant of a mirror that is described, not written out."""
+"""The optical parts of a rig file: lenslets, and mirrors whose plant follows from a description."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Optics:
     lenslets: Lenslets
     slope_unit_rad: float
     least_light: float
-    """A lenslet of which less is lit has no spot that is used."""
+    """Least lit share of a lenslet whose spot is used."""
 
     @cached_property
     def lit(self) -> NDArray[np.bool_]:
@@ -35,7 +35,7 @@ class Optics:
 
     @property
     def light(self) -> tuple[float, ...] | None:
-        """`SpotSensor.light`; None without a pupil."""
+        """Lit share of each lenslet as in `SpotSensor.light`; None without a pupil."""
         if self.lenslets.pupil_diameter_m is None:
             return None
         return tuple(np.where(self.lit, self.lenslets.light, 0.0).tolist())
@@ -47,14 +47,14 @@ class Optics:
         return -half, half
 
     def seen(self, width_m: float) -> Lenslets:
-        """The lenslets as they lie on a surface of which their columns together see ``width_m``."""
+        """The lenslets imaged onto a surface, of which all columns together cover ``width_m``."""
         ours = self.lenslets
         pitch = width_m / ours.grid[1]
         pupil = ours.pupil_diameter_m and ours.pupil_diameter_m * pitch / ours.pitch_m
         return replace(ours, pitch_m=pitch, focal_length_m=1.0, pupil_diameter_m=pupil)
 
     def slopes(self, surface_slopes: FloatArray, width_m: float) -> FloatArray:
-        """Slope units behind the lenslets for gradients of the path over a surface that is imaged onto them."""
+        """Slopes behind the lenslets, slope units, for gradients of the path over a surface imaged onto them."""
         shrink = width_m / (self.lenslets.grid[1] * self.lenslets.pitch_m)
         return surface_slopes * (shrink / self.slope_unit_rad)
 

@@ -25,7 +25,7 @@ class UnmodelledSlopes:
 
     The mean of v over an exposure is one coefficient of each output in the exposure's model. Estimators that model the
     noise inside an exposure estimate it from that exposure alone: between exposures this model remembers nothing of v.
-    What v does about its mean widens the spot.
+    The variation of v about its mean widens the spot.
     """
 
     sd: float
@@ -93,7 +93,7 @@ class Timing:
     frame_period_steps: int
     """Fast steps from the start of one exposure to the start of the next; at least N."""
     exposure_offset: float = 0.0
-    """How far into its first fast step an exposure starts, in fast steps, below one; it ends as far into a step."""
+    """How far into its first fast step an exposure starts, in fast steps, below one; it ends equally far into one."""
 
     @property
     def fast_step_ns(self) -> int:
@@ -121,9 +121,9 @@ class MirrorDriver:
     queue_steps: int
     """Fast steps that the device can hold."""
     watchdog_s: float
-    """The mirror parks itself when no valid packet has come for so long, s."""
+    """The mirror parks itself when no valid packet has come for this time, s."""
     voltage: VoltageLaw | None = None
-    """Where the driver makes voltages whose square pulls: they, not the inputs, are in equal steps."""
+    """The law of electrostatic actuators: the converter's equal steps are then those of the voltage, not the input."""
 
     def quantise(self, u: FloatArray) -> FloatArray:
         """The input that the converter puts out for ``u``, (..., axes * n_inputs)."""

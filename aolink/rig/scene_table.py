@@ -46,17 +46,17 @@ def read_scene(table: Table) -> SceneSensor:
 
 
 def read_scene_picture(sensor: SceneSensor, folder: Path) -> FloatArray:
-    """The picture that a simulated rig shows, in its own, finer pixels; grey, 0 to 1 where it holds whole numbers.
+    """The picture that a simulated rig shows, in its own, finer pixels, (rows, columns); grey, integers scaled to 0..1.
 
     Parameters
     ----------
     folder:
-        Of the rig file; what is not in it may come with aolink.
+        Folder of the rig file; a picture that is not there may be one that comes with aolink.
 
     Raises
     ------
     RigError
-        There is none, it cannot be read, or it is smaller than the sensor's frame.
+        The rig names no picture, it cannot be read, or it is smaller than the sensor's frame.
     """
     if not sensor.picture:
         raise RigError("scene.picture is missing: a simulated rig needs a picture to show")

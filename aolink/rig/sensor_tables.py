@@ -15,7 +15,7 @@ from aolink.rig.toml_table import Table
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrationTable:
-    """How well the sensor's values are known, as `aolink calibrate` wrote it: standard deviations, and from what.
+    """Standard deviations of the sensor's values, as `aolink calibrate` wrote them, and what they were measured from.
 
     A standard deviation is None where its value was not measured.
     """

@@ -16,10 +16,10 @@ from aolink.rig.toml_table import Table, shape_text
 
 FloatArray = NDArray[np.float64]
 
-# A row of them, and their limits, in one message of the protocol.
+# One row of inputs, and their limits, must fit into a message of the protocol.
 _MOST_INPUTS = 10_000
 # Each output has a coefficient of its own for the slopes that the model leaves out, and estimators keep the covariance
-# of all of them: of 512 it is 2 MB an exposure.
+# of all coefficients: for 512 it is 2 MB an exposure.
 _MOST_UNMODELLED = 512
 
 

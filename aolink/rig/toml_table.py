@@ -1,4 +1,4 @@
-"""One TOML table while it is read: what is missing, unknown or of the wrong kind is one error that names the key."""
+"""One TOML table while it is read: a missing or unknown key, or one of the wrong kind, is an error that names it."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ still_frames summary tension_n_per_m timing turbulence unmodelled vibration volt
 window zernike_m
 """
 KEYS = frozenset(_KEYS.split())
-"""Every key of every table of a rig file, kept by hand, and held to what the readers ask for by a test.
+"""Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.
 
-Where a key is missing, a key of the file that is not among these is a misspelling of it if the two look alike. The
-readers alone could not say so: they have not asked yet for the keys that come after the missing one.
+Where a key is missing, a key of the file that is not among these is taken for a misspelling of it if the two look
+alike. What the readers have asked for cannot tell: they have not asked yet for the keys after the missing one.
 """
 
 
@@ -46,7 +46,7 @@ def did_you_mean(written: Iterable[str], known: Iterable[str]) -> str:
 
 
 class Table:
-    """One TOML table while it is read: every key must be asked for, and those that were not are errors."""
+    """One TOML table while it is read; keys that no reader asks for are errors (`finish`)."""
 
     def __init__(self, values: Any, path: str) -> None:
         if not isinstance(values, dict):
@@ -177,13 +177,13 @@ class Table:
         return array
 
     def others(self) -> dict[str, Any]:
-        """The keys that nobody has asked for, for somebody who checks them elsewhere."""
+        """The keys that no reader has asked for, to be checked elsewhere."""
         others = {name: value for name, value in self._values.items() if name not in self._asked}
         self._asked.update(others)
         return others
 
     def finish(self, *optional: str) -> None:
-        """Raise RigError if the table has a key that nobody asked for, and that is not one of ``optional`` either."""
+        """Raise RigError if the table has a key that no reader asked for and that is not one of ``optional``."""
         self._asked.update(optional)
         unknown = [name for name in self._values if name not in self._asked]
         # Misspelt keys first: another key may only have no use because of them.

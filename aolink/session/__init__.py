@@ -40,7 +40,7 @@ _ASIDE_S = 2.0
 
 
 def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
-    """The scene at rest as an attachment, where the camera was made from this rig file: a simulated one shows it."""
+    """The scene at rest as an attachment, if the camera is simulated from this rig file and shows it."""
     if rig.scene is None or not rig.scene.picture or camera.rig_digest != rig.digest:
         return {}
     data = io.BytesIO()
@@ -49,7 +49,7 @@ def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
 
 
 def _saved(report: Report, paths: Sequence[Path]) -> str:
-    """What a session that an error ended has left, in words."""
+    """What a session has saved that an error ended, in words."""
     where = str(paths[-1]) if len(paths) == 1 else f"{len(paths)} files, the last of them {paths[-1]}"
     if not report.exposures:
         return f"no exposure had come by then, {where} holds none"
@@ -83,22 +83,22 @@ def record(
     Parameters
     ----------
     rig:
-        What the devices are; checked against what they say of themselves.
+        The rig file's description of the devices; compared with the identity that they report.
     camera_port, mirror_port:
         Anything that pyserial opens: a device path, or an address such as socket://host:port. Where None, the rig
-        file's table ``[devices]`` says what drives the device.
+        file's table ``[devices]`` names the device's driver.
     path:
         The recording; must not exist unless ``overwrite``.
     estimators:
         Names of estimators to run online; their results go into the recording.
     exposures:
-        How many; 0 means until ``stop()``.
+        Number of exposures; 0 means until ``stop()``.
     calibration:
-        What the camera is shown, of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
+        What the camera is shown, one of `aolink.calibration.KINDS`, if the frames are for `aolink calibrate`: the
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
-        What to command, instead of the rig's drive. It is called by the loop: the mirror gets its next commands when it
-        returns.
+        Function that gives the inputs to command, instead of the rig's drive. The loop calls it, and sends the next
+        commands when it returns.
     watch:
         Called with each exposure and its estimates. An estimate that is not there when the next exposure comes is given
         with that one or a later one. In real time it is called on a thread of its own and may take its time:
@@ -109,13 +109,13 @@ def record(
         Called at least ten times a second: ``stop()`` says whether the session is to end, ``progress(exposures)`` is
         given the number of exposures so far. In real time the latter is called on a thread of its own.
     report:
-        What is filled in while the session goes on, and given back in the end; a new one if None.
+        The report to fill in during the session, which is also returned; a new one if None.
 
     Raises
     ------
     AolinkError
-        Its class says what kind of thing went wrong. The mirror is parked if it can be reached, and the
-        recording is closed with what there is.
+        A device, a port, the disk or an estimator failed, by the error's class. The mirror is parked if it can be
+        reached, and the recording is closed with what there is.
     """
     estimators = list(dict.fromkeys(estimators))
     driver = Driver(rig, estimators)
@@ -149,7 +149,7 @@ def record(
         report.warnings += warnings
         show, beside = _shown(rig, watch), None
         if not clock.virtual:
-            progress = aside.enter_context(_told_aside(progress, report))
+            progress = aside.enter_context(_progress_aside(progress, report))
             show = aside.enter_context(_shown_aside(show, rig, report)) if show else None
             beside = aside.enter_context(BesideTheLoop(rig, estimators))
             clock.beside = beside.processes
@@ -172,7 +172,7 @@ def record(
                 if isinstance(error, PortError | DeviceError):
                     raise type(error)(f"{error}; {_saved(report, writer.paths)}") from None
                 raise
-            # It was to end anyway: that a device no longer answers is a warning.
+            # The session was to end anyway, so a device that no longer answers is only a warning.
             report.ended = "interrupted"
             report.warnings.append(str(error))
         writer.close(report.counts())
@@ -194,27 +194,27 @@ def _shown_aside(show: Show, rig: Rig, report: Report) -> Iterator[Show]:
         yield lambda exposure, outcomes: watching.give((exposure, outcomes))
     finally:
         if not watching.close(_ASIDE_S):
-            report.warnings.append(f"who watches this session is not done with an exposure after {_ASIDE_S:g} s")
+            report.warnings.append(f"the watcher of this session is not done with an exposure after {_ASIDE_S:g} s")
         if watching.failed is not None:
-            report.warnings.append(f"who watches this session failed: {watching.failed}")
+            report.warnings.append(f"the watcher of this session failed: {watching.failed}")
         report.unwatched = watching.skipped
 
 
 @contextlib.contextmanager
-def _told_aside(progress: Callable[[int], None], report: Report) -> Iterator[Callable[[int], None]]:
-    """Tell the progress on a thread of its own: a terminal that takes nothing would hold up the loop."""
-    telling, next_s = Aside[int](progress, 1), 0.0
+def _progress_aside(progress: Callable[[int], None], report: Report) -> Iterator[Callable[[int], None]]:
+    """Report the progress on a thread of its own: a terminal that takes no output would hold up the loop."""
+    aside, next_s = Aside[int](progress, 1), 0.0
 
-    def tell(exposures: int) -> None:
+    def report_progress(exposures: int) -> None:
         nonlocal next_s
         if (now_s := time.monotonic()) >= next_s:
             next_s = now_s + _PROGRESS_S
-            telling.give(exposures)
+            aside.give(exposures)
 
     try:
-        yield tell
+        yield report_progress
     finally:
-        telling.give(report.exposures)
-        telling.close(_ASIDE_S)
-        if telling.failed is not None:
-            report.warnings.append(f"the progress of this session could not be told: {telling.failed}")
+        aside.give(report.exposures)
+        aside.close(_ASIDE_S)
+        if aside.failed is not None:
+            report.warnings.append(f"the progress of this session could not be shown: {aside.failed}")

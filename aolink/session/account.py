@@ -11,9 +11,9 @@ from aolink.session.report import Report
 from aolink.wire import messages_pb2 as wire
 
 _OPEN, _PASSED, _UNKNOWN, _ENDED = range(4)
-"""What is known of a commanded step: not reported yet; reported without the command; held input unknown; counted."""
+"""State of a commanded step: not reported yet; reported without the command; held input unknown; counted."""
 REFUSALS = (wire.OUT_OF_RANGE, wire.WRONG_SHAPE, wire.NOT_SUPPORTED, wire.LATCHED)
-"""Answers to a block that is not taken at all."""
+"""Answers to a block of which the mirror takes no step."""
 
 
 @dataclass(slots=True)
@@ -22,7 +22,7 @@ class _Block:
 
     first: int
     steps: NDArray[np.int8]
-    """What is known of each step: one of the four above."""
+    """State of each step: one of the four above."""
     ack: wire.CommandAck | None = None
 
     @property
@@ -34,17 +34,16 @@ class Account:
     """Counts, in a `Report`, how each commanded step of a session ended.
 
     A step is *applied* where the mirror reports it with the command's block. Where it reports something else, or
-    nobody knows what it held, the mirror's answer to the block decides. The step was *refused*; or *late*, where it had
-    gone by when the block came, and where the block was never answered; otherwise it was queued, and is *superseded*
-    (by a later command, or by parking, which empties the queue) if something else is reported, and *not reported* if
-    nothing is.
+    no report comes, the mirror's answer to the block decides. The step was *refused*; or *late*, if it had gone by when
+    the block came, or if the block was never answered; otherwise it was queued, and is *superseded* (by a later
+    command, or by parking, which empties the queue) if something else is reported, and *not reported* if nothing is.
     """
 
     def __init__(self, report: Report) -> None:
         self._report = report
         self._blocks: dict[int, _Block] = {}
         self._reported_until = 0
-        """First step of which no report has been seen."""
+        """First step for which no report has come."""
 
     def commanded(self, block: wire.CommandBlock) -> None:
         """A block is sent for the first time."""
@@ -60,7 +59,7 @@ class Account:
             self._settle(ack.block_id, block)
 
     def reported(self, applied: wire.Applied) -> None:
-        """What the mirror held in some steps is known, or will never be; must come once for each step."""
+        """Take a report of what the mirror held in some steps, or that there is none; must come once for each step."""
         first, end = applied.first_step, applied.first_step + applied.n_steps
         self._reported_until = max(self._reported_until, end)
         for block_id, block in list(self._blocks.items()):
@@ -75,14 +74,14 @@ class Account:
             self._settle(block_id, block)
 
     def parked_from(self, step: int) -> None:
-        """The mirror was told to park: what was queued for ``step`` and later is dropped."""
+        """The mirror was sent a request to park: what was queued for ``step`` and later is dropped."""
         for block_id, block in list(self._blocks.items()):
             part = block.steps[max(step - block.first, 0) :]
             self._count("steps_superseded", part, part == _OPEN)
             self._settle(block_id, block)
 
     def close(self) -> None:
-        """Nothing more will be heard: every step that is still open ends now."""
+        """No more answers or reports will come: every step that is still open ends now."""
         for block_id, block in list(self._blocks.items()):
             block.steps[block.steps == _OPEN] = _UNKNOWN
             self._settle(block_id, block)

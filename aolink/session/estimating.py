@@ -1,9 +1,9 @@
-"""Who estimates the exposures of a session: its loop, on virtual time, or processes beside it, in real time.
+"""Estimators in a session: within its loop on virtual time, in processes beside it in real time.
 
 In real time nothing may stand between the wire and the file. Each estimator runs in a process of its own and gets
 exposures from a bounded queue (`aolink.session.waiting.Waiting`); those that it has no time for it skips, each
-estimator by itself. It predicts over what it has skipped with the inputs that the mirror applied, so that
-`aolink.estimation.Driver` gives the same bits when it is told which exposures these were.
+estimator by itself. It predicts over skipped exposures with the inputs that the mirror applied, so
+`aolink.estimation.Driver` gives the same bits if it skips the same exposures.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from aolink.session.estimator_process import LENGTH, READY, packed
 from aolink.session.waiting import Waiting, most_waiting
 
 _SLICE_S = 0.1
-"""Longest wait for processes that begin: a request to stop is seen that soon."""
+"""Longest single wait for processes that start, so that a request to stop is noticed within it."""
 _READ_BYTES = 1 << 20
 _END_S = 1.0
-"""For a process that was told to end."""
+"""Longest wait for a process that was asked to end."""
 _REAP_S = 0.01
-"""For one whose end of the socket is closed: the loop waits for it."""
+"""Longest wait for one whose end of the socket is closed: the loop stands still meanwhile."""
 NO_TIME = "no time: the estimator was busy with earlier exposures"
 _OVER = "no time: the session was over before its estimate was there"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """What became of an exposure with one estimator."""
+    """The result of one estimator for one exposure: an estimate, or why it was skipped."""
 
     estimator: str
     exposure: Exposure
@@ -57,7 +57,7 @@ class Outcome:
     """How long the estimate took, ns; 0 on virtual time."""
 
     def account(self) -> pb.Estimation:
-        """What is recorded of it, besides the estimate."""
+        """The message that is recorded besides the estimate."""
         return pb.Estimation(
             estimator=self.estimator,
             frame_id=self.exposure.frame_id,
@@ -67,7 +67,7 @@ class Outcome:
         )
 
     def estimate(self, rig: Rig) -> Estimate:
-        """The estimate. Only for an outcome that has one."""
+        """The estimate as plain data. Only for an outcome that has one."""
         assert self.message is not None
         model = exposure_model(rig.plant, rig.timing.exposure_steps)
         return convert.estimate_from_message(self.message, model, self.exposure)
@@ -85,23 +85,23 @@ class Estimating(Protocol):
         """Why an estimator has failed and skips all exposures from now on, by its name."""
 
     def get_ready(self, stop: Callable[[], bool]) -> None:
-        """Have everything computed, compiled and loaded that a session must not wait for, or ``stop()``.
+        """Load, compile and compute beforehand all that a session must not wait for, until done or ``stop()``.
 
-        Raises EstimatorError where an estimator cannot do it.
+        Raises EstimatorError if an estimator does not start.
         """
 
     def offer(self, exposure: Exposure) -> list[Outcome]:
-        """Take the next exposure, without waiting; gives what is known at once."""
+        """Take the next exposure, without waiting; gives the outcomes that are known at once."""
 
     def outcomes(self) -> list[Outcome]:
-        """What has become known since."""
+        """The outcomes that have become known since the last call."""
 
     def finish(self, patience_s: float) -> list[Outcome]:
-        """Wait up to ``patience_s`` for what is under way, give up the rest, and give the outcomes of both."""
+        """Wait up to ``patience_s`` for estimates under way and give up the rest; gives the outcomes of both."""
 
 
 class InTheLoop:
-    """Estimates when an exposure is offered: for virtual time, which waits meanwhile."""
+    """Estimates each exposure when it is offered: for virtual time, which stands still meanwhile."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
@@ -125,7 +125,7 @@ class InTheLoop:
 
 
 class BesideTheLoop:
-    """One process for each estimator; they are made and get ready meanwhile."""
+    """One process for each estimator. Processes start and get ready while the session is prepared."""
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
         self.names = names
@@ -192,9 +192,9 @@ class EstimatorProcess:
         self.ready = False
         """Whether it has computed and loaded what it needs."""
         self.failed = ""
-        """Why it will estimate no more."""
+        """Why it will estimate no more; empty while it works."""
         self._exposure: Exposure | None = None
-        """The one that it has."""
+        """The exposure that the process has."""
         self._waiting = Waiting[Exposure](most_waiting(rig.timing))
         self._skipped = SkippedInputs()
         self._outcomes: list[Outcome] = []
@@ -221,7 +221,7 @@ class EstimatorProcess:
 
     @property
     def busy(self) -> bool:
-        """Whether an exposure of its waits for its outcome."""
+        """Whether it has an exposure whose outcome is not known."""
         return self._exposure is not None
 
     @property
@@ -240,7 +240,7 @@ class EstimatorProcess:
         self._go_on()
 
     def take_outcomes(self) -> list[Outcome]:
-        """What has become known."""
+        """The outcomes that have become known; each is given once."""
         outcomes, self._outcomes = self._outcomes, []
         return outcomes
 
@@ -268,13 +268,13 @@ class EstimatorProcess:
             self._fail(f"its process ended{_how(self._process)}")
 
     def give_up(self, reason: str) -> None:
-        """Skip what it has and what waits for it."""
+        """Skip the exposure that the process has and those that wait."""
         had = [] if self._exposure is None else [self._exposure]
         self._exposure = None
         self._skip([*had, *self._waiting.clear()], reason)
 
     def end(self) -> None:
-        """Have the process end, whatever it does."""
+        """End the process, whatever it is doing."""
         self._connection.close()
         self._process.kill()
 

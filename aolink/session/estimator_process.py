@@ -35,8 +35,8 @@ _PARENT_DEATH_SIGNAL = 1
 
 
 READY = None
-"""What comes first; then of each exposure the bytes of its estimate's message and the time that it took, ns. A text
-that comes in their place says why there will be no more."""
+"""The first message; then, for each exposure, the bytes of its estimate's message and the time that it took, ns. A text
+in their place says why there will be no more."""
 
 
 def packed(message: object) -> bytes:
@@ -46,7 +46,7 @@ def packed(message: object) -> bytes:
 
 
 def main(fileno: int, parent: int) -> None:
-    """Estimate what comes until the socket is closed."""
+    """Estimate the exposures that come over the socket until it is closed."""
     _end_with(parent)
     if sys.platform == "linux":  # a session that runs at real-time priority is one for its loop's sake
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
@@ -64,7 +64,7 @@ def main(fileno: int, parent: int) -> None:
 
 def _serve(connection: socket.socket, stream: Any) -> None:
     rig, name = _received(stream)
-    # What an estimator of this rig computes or loads once, a session must not wait for.
+    # A session must not wait for what an estimator of this rig computes or loads once.
     make_estimator(rig, name).step(_dark(rig))
     estimator = make_estimator(rig, name)
     connection.sendall(packed(READY))

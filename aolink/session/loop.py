@@ -1,7 +1,7 @@
 """The live loop: joins devices, recorder and estimators.
 
-One thread waits for both devices; what comes is recorded, made into exposures and handed to the estimators, which in
-real time run beside the loop. Commands go out in blocks ahead of time, so the loop's own jitter does not reach the
+One thread waits for both devices; their messages are recorded, made into exposures and handed to the estimators, which
+in real time run beside the loop. Commands go out in blocks ahead of time, so the loop's own jitter does not reach the
 mirror. The same loop runs in real time and on virtual time; on virtual time it sends whenever the rig waits.
 """
 
@@ -32,7 +32,7 @@ from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
 
 LEAD_BLOCKS = 3
-"""Command blocks that are queued on the device ahead of time; of a queue of more than eight, all but five."""
+"""Command blocks that are queued on the device ahead of time; all but five in a queue of more than eight."""
 _ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
 """Real time: from the first command to its first step."""
@@ -43,9 +43,9 @@ _ANSWER_NS = 200_000_000
 _GRACE_S = 1.5
 """Real time: how long a frame may take after its exposure's end before it counts as lost."""
 _KEEP_ALIVES = 3
-"""What a mirror is sent in the time of its watchdog, at least."""
+"""Least number of messages that a mirror is sent in the time of its watchdog."""
 _OUTAGE_WATCHDOGS = 2.0
-"""A mirror that was out of reach for more than so many times its watchdog is not told to go on."""
+"""A mirror that was out of reach for more than this many times its watchdog is not re-armed."""
 ESTIMATES_S = 5.0
 """Real time: how long the session's end waits for estimates that are under way."""
 _NOT_YET = 1 << 63
@@ -53,7 +53,7 @@ _NOT_YET = 1 << 63
 
 
 Inputs = Callable[[int, int], NDArray[np.float64]]
-"""First fast step since the session's start and number of steps -> what to command, (n_steps, n_inputs)."""
+"""First fast step since the session's start and number of steps -> inputs to command, (n_steps, n_inputs)."""
 
 Show = Callable[[Exposure, Sequence[Outcome]], None]
 """Given each exposure, with the estimates that have come since the one before; must not take time."""
@@ -62,7 +62,7 @@ Show = Callable[[Exposure, Sequence[Outcome]], None]
 def lead_steps(mirror: MirrorDriver) -> int:
     """How far ahead of the device commands are sent, fast steps.
 
-    A queue of more than eight blocks is time for estimators that take longer than three.
+    With a queue of more than eight blocks, estimators may take longer than three blocks last.
     """
     return max(LEAD_BLOCKS * mirror.block_steps, mirror.queue_steps - _ROOM_BLOCKS * mirror.block_steps)
 
@@ -90,21 +90,21 @@ class SessionLoop:
         if beside is not None:
             self.report.estimation |= {name: EstimatorReport() for name in beside.names}
         self._unsettled: dict[int, list[Outcome]] = {}
-        """What is known of the exposures that not all estimators are done with, by frame."""
+        """Outcomes so far of the exposures that not all estimators are done with, by frame."""
         self._show = show
         self._unseen: Exposure | None = None
-        """The exposure that its watcher has not been given yet, ..."""
+        """The exposure that has not been given to the session's watcher yet, ..."""
         self._unseen_estimates: list[Outcome] = []
-        """... and the estimates that it has not been given."""
+        """... and the estimates that have not."""
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
         self._first_step = _NOT_YET
         self._queued_until = 0
-        """First fast step that no command was sent for."""
+        """First fast step for which no command was sent."""
         self._newest_frame = 0
         self._asked: Camera | Mirror = camera
-        """Whose clock is asked next."""
+        """Device whose clock is queried next."""
         self._last_query_ns = self._next_statistics_ns = 0
         self._last_frame_ns = 0
         self._end_step: int | None = None
@@ -153,7 +153,7 @@ class SessionLoop:
             self._camera.stop()
 
     def close_account(self) -> None:
-        """Nothing more will be heard of the mirror: each commanded step that is still open ends now."""
+        """No more reports of the mirror will come: each commanded step that is still open ends now."""
         if self._parked_from is not None:
             self._account.parked_from(self._parked_from)
         self._account.close()
@@ -167,7 +167,7 @@ class SessionLoop:
         self._show_unseen(ready=True)
 
     def _receive(self, timeout_s: float) -> int:
-        """Deal with what comes within ``timeout_s``; gives the number of clock queries that were answered."""
+        """Handle the events of the next ``timeout_s``; gives the number of clock queries that were answered."""
         answers = 0
         for device, events, receive_ns in self._time.events(timeout_s):
             answers += sum(isinstance(event, ClockSampled) for event in events)
@@ -208,8 +208,8 @@ class SessionLoop:
             if self._camera.start(first_step, exposures):
                 return first_step
         raise DeviceError(
-            f"the camera was told {_START_TRIES} times to start {_START_DELAY_S:g} s later, and each time it heard that"
-            " too late: is the line or this machine so slow, do both devices count the same fast steps?"
+            f"the camera was asked {_START_TRIES} times to start {_START_DELAY_S:g} s later, and each time the request"
+            " came too late: is the line or this machine so slow, do both devices count the same fast steps?"
         )
 
     def _device_step(self) -> int:
@@ -219,7 +219,7 @@ class SessionLoop:
         return self._mirror.since_zero_ns(self._time.now_ns()) // self._step_ns
 
     def _send_due(self) -> float:
-        """Send what is due; gives the time until the next thing is, s."""
+        """Send what is due; gives the time until something is due again, s."""
         time = self._time
         if self._mirror.latched:
             self._rearm("in this session")
@@ -249,21 +249,21 @@ class SessionLoop:
         return max(0, min(due)) / 1e9
 
     def _keep_alive_ns(self) -> int:
-        """Host time at which the mirror has to hear something, whether there is a command or not."""
+        """Host time by which the mirror must be sent something, command or not."""
         return self._mirror.last_sent_ns + round(self._rig.mirror.watchdog_s * 1e9 / _KEEP_ALIVES)
 
     def _rearm(self, when: str) -> None:
-        """The watchdog has parked the mirror: tell it to go on, unless it was out of reach for too long."""
+        """Re-arm a mirror that its watchdog has parked, unless it was out of reach for too long."""
         watchdog_s, outage_s = self._rig.mirror.watchdog_s, self._mirror.outage_s
         if outage_s > _OUTAGE_WATCHDOGS * watchdog_s:
             raise DeviceError(
                 f"the mirror was parked by its watchdog: it took no command for {outage_s:.1f} s, more than twice the"
-                f" {watchdog_s:g} s of its watchdog; look why (a slow host, the line), and begin a new session"
+                f" {watchdog_s:g} s of its watchdog; find out why (a slow host, the line), and begin a new session"
             )
         step = self._mirror.rearm()
         self.report.rearmed += 1
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
-        self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: told to go on at fast step {step}{out}")
+        self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: re-armed at fast step {step}{out}")
         self._queued_until = min(self._queued_until, step)  # what was queued is dropped
 
     def _send_commands(self, device_step: int) -> None:
@@ -299,7 +299,7 @@ class SessionLoop:
         return False
 
     def _finish(self, exposures: int) -> None:
-        """What is still on its way when the last command has been applied."""
+        """Take what is still on its way when the last command has been applied, and end the session."""
         self._receive(0.0)
         self._collect_reports()
         now = self._time.now_ns()
@@ -372,10 +372,10 @@ class SessionLoop:
         self._show_unseen(frame)
 
     def _show_unseen(self, scene: Frame | None = None, *, ready: bool = False) -> None:
-        """Give the exposure that waits to who watches: when all that belongs to it is there, or ``ready`` as it is.
+        """Give the waiting exposure to the watcher when it is complete, or, if ``ready``, as it is.
 
         With a picture sensor, its scene belongs to it. It does not wait for estimates that are not there when the next
-        exposure is; they come with that one.
+        exposure comes; they are given with that one.
         """
         exposure = self._unseen
         if self._show is None or exposure is None:
@@ -388,7 +388,7 @@ class SessionLoop:
             self._unseen, self._unseen_estimates = None, []
 
     def _record_picture(self, frame: Frame, exposure_topic: str, topic: str, receive_ns: int) -> Frame:
-        """Record a picture and what is known about it; gives it with the host's time of its start."""
+        """Record a picture with its facts; gives the frame with the host's time of its start."""
         since_zero_ns, camera = frame.first_step * self._step_ns + frame.exposure_offset_ns, self._camera
         length_ns = (frame.last_step + 1 - frame.first_step) * self._step_ns
         camera.host_ns(
@@ -447,7 +447,7 @@ class SessionLoop:
         self._show_unseen()
 
     def _know(self, frame_id: int, estimated_ns: int) -> None:
-        """From now on commands know a frame: its first estimate is there, or there will be none."""
+        """Note that commands from now on know a frame: its first estimate is there, or there will be none."""
         self._newest_frame = max(self._newest_frame, frame_id)
         self._latencies.estimated(frame_id, estimated_ns)
 

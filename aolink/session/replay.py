@@ -1,4 +1,4 @@
-"""A recording again: through the driver that ran live, at its own pace or another, or through a rig."""
+"""Replay of a recording: its exposures through estimators, at any pace, or its commands through a rig."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aolink.recording.reestimate import skipped_by
 from aolink.wire import messages_pb2 as wire
 
 _NAP_S = 0.1
-"""How long one sleeps at most before asking whether to stop."""
+"""Longest sleep between two questions whether to stop."""
 
 
 def replay(
@@ -32,16 +32,16 @@ def replay(
     now_s: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[tuple[Exposure, list[Estimate]]]:
-    """Run estimators over a recording, exposure by exposure, as the session did: what it had no time for is skipped.
+    """Run estimators over a recording, exposure by exposure; each skips the exposures that it skipped in the session.
 
     Parameters
     ----------
     rate:
-        How much faster than it was recorded; 0 for as fast as it goes.
+        Pace relative to that of the recording; 0 for as fast as possible.
     start_s, end_s:
         Exposures that began before or after these times, in s from the first one, are left out.
     now_s, sleep:
-        The clock that the pace is kept by.
+        The clock for the pace, in s, and a function that waits for some seconds.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def replay(
 
 
 class RecordedCommands:
-    """The inputs that a session commanded, for a rig to be given again.
+    """The inputs that a session commanded, to send them to a rig again.
 
     Raises
     ------
@@ -90,7 +90,7 @@ class RecordedCommands:
         self._first: int | None = None
         self._rows: dict[int, NDArray[np.float64]] = {}
         self._known = 0
-        """First step, since the start, that no block read so far covers."""
+        """First step since the start that no block read so far covers."""
         if not self._read():
             raise RecordingError(f"{recording.path} holds no commands to send again")
         first = last = None
@@ -99,7 +99,7 @@ class RecordedCommands:
             first = last if first is None else first
         period = recording.rig.timing.frame_period_steps
         self.exposures = 0 if first is None or last is None else 1 + (last - first) // period
-        """How many the session had, lost ones too."""
+        """Number of exposures of the session, lost ones included."""
 
     def inputs(self, first_step: int, n_steps: int) -> NDArray[np.float64]:
         """Inputs of fast steps counted from the session's first, (n_steps, n_inputs); must be asked for in order."""

@@ -1,4 +1,4 @@
-"""What a session did: counts, and how long each frame took on its way."""
+"""The report of a session: its counts, and the latency of each frame."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _KEPT_LATENCIES = 10_000
 
 @dataclass(kw_only=True)
 class EstimatorReport:
-    """What an estimator had time for in a session in real time."""
+    """Counts of one estimator in a session in real time."""
 
     estimated: int = 0
     skipped: int = 0
@@ -23,10 +23,10 @@ class EstimatorReport:
     failed: str = ""
     """Why it gave up; empty where it did not."""
     took_ms: list[float] = field(default_factory=list)
-    """How long its estimates took, one after the other; the newest ones, `_KEPT_LATENCIES` at most."""
+    """Durations of its estimates, one after the other; the newest ones, `_KEPT_LATENCIES` at most."""
 
     def add(self, outcome: Outcome) -> None:
-        """Count what became of the next exposure."""
+        """Count the outcome of the next exposure."""
         if outcome.message is None:
             self.skipped += 1
             return
@@ -37,17 +37,17 @@ class EstimatorReport:
 
 @dataclass(kw_only=True)
 class Report:
-    """What a session did: its counts, and its latencies where time was real."""
+    """Counts of a session, and its latencies if it ran in real time."""
 
     ended: str = "running"
-    """complete, interrupted, or error: and what it was."""
+    """``complete``, ``interrupted``, or ``error:`` and its message."""
     virtual_time: bool = False
     exposures: int = 0
     frames_received: int = 0
     frames_incomplete: int = 0
-    """Received with chunks missing; their pixels are masked."""
+    """Frames received with chunks missing; their pixels are masked."""
     frames_lost: int = 0
-    """Never received at all."""
+    """Frames never received at all."""
     scenes_received: int = 0
     """The same three counts for the picture sensor."""
     scenes_incomplete: int = 0
@@ -64,12 +64,12 @@ class Report:
     """Steps of all command blocks; at the end of the session they are the sum of the five counts that follow."""
     steps_applied: int = 0
     steps_superseded: int = 0
-    """Queued, and replaced by a later command, or dropped when the mirror parked."""
+    """Steps that were queued, and replaced by a later command, or dropped when the mirror parked."""
     steps_late: int = 0
-    """Had gone by when their block came; or the block never got an answer, and something else was applied."""
+    """Steps that had gone by when their block came, or whose block was never answered and something else applied."""
     steps_refused: int = 0
     steps_not_reported: int = 0
-    """Nobody knows what the mirror held: the reports did not come, though they were asked for again."""
+    """Steps in which the mirror held an unknown input: the reports did not come, though they were asked for again."""
     steps_clipped: int = 0
     """Applied steps whose input the device's own protection had changed."""
     steps_parked: int = 0
@@ -78,17 +78,17 @@ class Report:
     reports_asked: int = 0
     """How often missing reports of the mirror were asked for again."""
     rearmed: int = 0
-    """How often the mirror was parked by its watchdog and told to go on."""
+    """How often the mirror was parked by its watchdog and re-armed."""
     clock_offset_ns: float = float("nan")
     clock_frequency_ppm: float = float("nan")
     clock_sigma_ns: float = float("nan")
     estimation: dict[str, EstimatorReport] = field(default_factory=dict)
     """By the estimator's name. Empty on virtual time, which waits for every estimate."""
     unwatched: int = 0
-    """Exposures that who watches had no time for."""
+    """Exposures for which the watcher had no time."""
     warnings: list[str] = field(default_factory=list)
     files: list[str] = field(default_factory=list)
-    """What was written."""
+    """Files that were written."""
     latencies: list[pb.Latency] = field(default_factory=list)
     """The newest ones, `_KEPT_LATENCIES` at most; all of them are in the recording."""
 
@@ -109,7 +109,7 @@ class Report:
 
 
 class LatencyBook:
-    """The way of each frame from the end of its exposure to the command that knew it. Real time only.
+    """The latency of each frame, from the end of its exposure to the first command that knew it. Real time only.
 
     A command knows a frame when it is sent after the first estimate of the frame was there, or all estimators had
     skipped it. (What each estimator takes is in `EstimatorReport`.)
@@ -150,7 +150,7 @@ class LatencyBook:
             self._close(frame_id, receive_ns)
 
     def close(self, now_ns: int) -> None:
-        """Frames that no command followed."""
+        """Record the frames that no command followed."""
         for frame_id in list(self._open):
             self._close(frame_id, now_ns)
 

@@ -1,4 +1,4 @@
-"""What the loop hands over to somebody who may be slower: it never waits, and what is left undone is counted."""
+"""Queues from the loop to slower consumers: the loop never waits, and items that are dropped are counted."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aolink.rig import Timing
 Item = TypeVar("Item")
 
 _BEHIND_S = 0.5
-"""How far somebody may be behind the camera."""
+"""How far a consumer may be behind the camera."""
 
 
 def most_waiting(timing: Timing) -> int:
@@ -22,10 +22,10 @@ def most_waiting(timing: Timing) -> int:
 
 
 class Waiting(Generic[Item]):
-    """A bounded queue that gives up what is old.
+    """A bounded queue that drops old items.
 
-    Its items leave in order, so that short delays cost nothing. When it is full, whoever takes them is too slow: then
-    all of them are given up for the new one, so that he goes on with what is new, and without a gap for a while.
+    Items leave in order, so short delays cost nothing. When it is full, its consumer is too slow: then all items are
+    dropped for the new one, so that the consumer goes on with new ones, without a gap for a while.
     """
 
     def __init__(self, most: int) -> None:
@@ -33,7 +33,7 @@ class Waiting(Generic[Item]):
         self._items: deque[Item] = deque()
 
     def put(self, item: Item) -> list[Item]:
-        """Add an item; gives those that are given up for it."""
+        """Add an item; gives those that are dropped for it."""
         given_up = self.clear() if len(self._items) >= self._most else []
         self._items.append(item)
         return given_up
@@ -43,19 +43,19 @@ class Waiting(Generic[Item]):
         return self._items.popleft() if self._items else None
 
     def clear(self) -> list[Item]:
-        """Give up all items."""
+        """Drop all items, and give them."""
         items = list(self._items)
         self._items.clear()
         return items
 
 
 class Aside(Generic[Item]):
-    """Calls a function, item by item, on a thread of its own, so that it does not matter how long that takes.
+    """Calls a function, item by item, on a thread of its own, so that the caller never waits for it.
 
     Parameters
     ----------
     function:
-        What is called; when it raises, it is not called again.
+        Called with each item; when it raises, it is not called again.
     most:
         How many items may wait for it, as in `Waiting`.
     """
@@ -79,7 +79,7 @@ class Aside(Generic[Item]):
             self._changed.notify()
 
     def close(self, patience_s: float) -> bool:
-        """Wait until the function is through with what waits for it; gives whether it was, within ``patience_s``."""
+        """Wait up to ``patience_s`` until the function has taken all waiting items; gives whether it has."""
         with self._changed:
             self._closed = True
             self._changed.notify()

@@ -1,7 +1,7 @@
-"""The simulated camera and mirror driver as a host meets them: messages in, messages out.
+"""The simulated camera and mirror driver: messages from the host in, messages to the host out.
 
 State only: no ports and no time of its own. `aolink.simulation.server` puts it behind ports. It is the
-device's side of protocol version 1; a host never imports it, it meets it on the wire.
+device's side of protocol version 1; the host's code never imports it and meets it on the wire only.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class SimulatedDevices:
 
     @property
     def queue_end(self) -> int:
-        """The first fast step that nothing is queued for."""
+        """The first fast step for which nothing is queued."""
         return max(self._queue, default=self.step - 1) + 1
 
     @property
@@ -133,7 +133,7 @@ class SimulatedDevices:
             self._say(line, pb.Ack(sequence=sequence, code=pb.NOT_SUPPORTED, text=f"a {line} does not take {name}"))
 
     def _begin_session(self, line: Line, nonce: int) -> None:
-        """Whatever a host before left behind is over."""
+        """Drop the state that an earlier host left behind."""
         self.outbox = [o for o in self.outbox if o.line != line]
         identity = self._identity(line, nonce)
         if line == "mirror":
@@ -146,12 +146,12 @@ class SimulatedDevices:
         self._say(line, identity)
 
     def _park(self) -> None:
-        """Told to: put the mirror into its safe state, empty the queue, report no more."""
+        """Park on request: put the mirror into its safe state, empty the queue, report no more."""
         self._queue.clear()
         self.parked, self.armed, self._reporting = True, False, False
 
     def watchdog_expires(self) -> None:
-        """No valid packet has come on the mirror's line for so long that it parks itself, until it is told to go on."""
+        """Park the mirror, since no valid packet has come on its line for the watchdog's time; until a Rearm comes."""
         if not self.armed:
             return
         self._queue.clear()
@@ -365,6 +365,6 @@ class SimulatedDevices:
 
 
 def history_steps(rig: Rig) -> int:
-    """How many fast steps a simulated mirror remembers what it held in."""
+    """Number of fast steps for which a simulated mirror remembers what it held."""
     watchdogs = math.ceil(_HISTORY_WATCHDOGS * rig.mirror.watchdog_s / rig.timing.fast_step_s)
     return max(rig.mirror.queue_steps, min(watchdogs, _HISTORY_INPUTS // rig.n_inputs))

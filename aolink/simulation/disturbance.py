@@ -15,9 +15,9 @@ from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]
 
-# Steps are made in blocks that begin at multiples of this, so that no bit depends on how they are asked for.
+# Steps are made in blocks that begin at multiples of this, so that no bit depends on which steps are asked for.
 _BLOCK = 64
-# The shortest wave of turbulence in lenslets: what is shorter, their means hardly see.
+# The shortest wave of turbulence, in lenslets: the mean slope over a lenslet hardly depends on shorter ones.
 _SHORTEST = 0.5
 
 
@@ -53,7 +53,7 @@ class DisturbancePlayer:
         self._block = lru_cache(maxsize=4)(self._make)
 
     def slopes(self, first_step: int, n_steps: int) -> FloatArray:
-        """Slope units, (n_steps, n_outputs)."""
+        """Added slopes at the fast steps from ``first_step``, slope units, (n_steps, n_outputs)."""
         first, last = first_step // _BLOCK, (first_step + n_steps - 1) // _BLOCK
         blocks = np.concatenate([self._block(k) for k in range(first, last + 1)])
         return blocks[first_step - first * _BLOCK :][:n_steps]

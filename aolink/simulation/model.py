@@ -38,9 +38,9 @@ class CameraFrame:
 class RigModel:
     """Plant, mirror and camera of a rig, advanced in fast steps.
 
-    What comes out depends on the rig, the seed, the inputs and when the camera was started, and not on
-    how the steps are cut into calls of `advance`: initial state, process noise, read-out noise,
-    photo-electrons, disturbance and scene have random streams of their own, drawn in the order of time.
+    Frames depend on the rig, the seed, the inputs and the camera's start, and not on how the steps are split into calls
+    of `advance`: initial state, process noise, read-out noise, photo-electrons, disturbance and scene have random
+    streams of their own, drawn in the order of time.
     """
 
     def __init__(self, rig: Rig, seed: int | None = None) -> None:
@@ -155,9 +155,9 @@ class RigModel:
         return path, density
 
     def _held(self, path: FloatArray, end_state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where the spots rest, step by step, (n_outputs, k), and each step's share of the exposure, (k,).
+        """Positions of the spots, step by step, (n_outputs, k), and each step's share of the exposure, (k,).
 
-        With an offset so much of the first step is not in the exposure, but in the step after its last.
+        With an offset, that part of the first step is not in the exposure, but the same part of the one after its last.
         """
         n_steps, offset = path.shape[1], self.rig.timing.exposure_offset
         if not offset or self._light.kind == "still":
@@ -176,11 +176,11 @@ def simulate(
     rig:
         A rig, the name of one that comes with aolink, or a TOML file.
     n_exposures:
-        How many; the first one starts at fast step 0.
+        Number of exposures; the first one starts at fast step 0.
     seed:
-        Of the random numbers; the rig file's own where None.
+        Seed of the random numbers; the rig file's own where None.
     inputs:
-        What the mirror applies at each fast step, (steps, n_inputs); the rig's drive, as its converter
+        Inputs that the mirror applies at each fast step, (steps, n_inputs); the rig's drive, as its converter
         puts it out, where None.
 
     Examples

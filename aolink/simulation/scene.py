@@ -44,7 +44,7 @@ class SceneCamera:
         Parameters
         ----------
         path:
-            Of all spots, slope units, (n_outputs, n_steps).
+            Positions of all spots, slope units, (n_outputs, n_steps).
         weights:
             Share of the exposure in each step, (n_steps,).
         light:

@@ -53,7 +53,7 @@ class FaultInjector:
         return _hits(self._incoming, self._faults.command_loss_rate) or _hits(self._incoming, damaged)
 
     def damage(self, packet: bytes) -> bytes:
-        """What is left of a packet to the host: nothing, twice it, one with bits flipped, or itself."""
+        """The bytes that are sent for a packet to the host: none, the packet twice, with bits flipped, or as it is."""
         if _hits(self._outgoing, self._faults.packet_loss_rate):
             return b""
         bits = 8 * (len(packet) - 1)  # not those of the delimiter
@@ -168,7 +168,7 @@ class RigServer:
             self.serve()
 
     def serve(self) -> None:
-        """Deal with what has come, and with what is due."""
+        """Handle the packets that have come, and all that is due."""
         if self._real_time:
             self._catch_up(whole_reports=True)
         for line in self._lines.values():

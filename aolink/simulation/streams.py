@@ -3,7 +3,7 @@
 A serial line is one wire to one host, and what is no packet on it is noise. A TCP port can be reached by every
 program of the machine, a web page in a browser among them, which may send bytes of its choice inside a request. So
 whoever connects must begin with an Identify packet, from the very first byte: no browser sends one in the place of
-"POST /". Nothing that comes before that is looked at.
+"POST /". Nothing that comes before it is interpreted.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class TcpStream:
             return len(data)
 
     def _admit(self) -> bytes | None:
-        """Look at those who want to be served; gives what a new host has sent, from its Identify packet on."""
+        """Read from connections that are not identified yet; gives a new host's bytes, from its Identify packet on."""
         with contextlib.suppress(BlockingIOError):
             self._guests.append(_Peer(self._listener.accept()[0]))
         guests, self._guests = self._guests, []

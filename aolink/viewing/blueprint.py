@@ -20,7 +20,7 @@ PATH_WINDOW = 2
 
 @dataclass(frozen=True, kw_only=True)
 class Contents:
-    """What a session has that views depend on."""
+    """The properties of a session that views depend on."""
 
     rig: Rig
     estimators: list[str]
@@ -28,7 +28,7 @@ class Contents:
     measuring: list[str]
     """Those of them that have an innovation."""
     density_top: float
-    """Of the intensity profile's plot, one over slope units."""
+    """Top of the intensity profile's plot, one over slope units."""
     truth: bool
     scenes: list[str]
     """Entities of the scene: as it came, restored, at rest; those that there are."""

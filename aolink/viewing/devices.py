@@ -1,4 +1,4 @@
-"""What the devices and the link did: commands, latency, drops, clock, log."""
+"""Series of devices and link: commands, latency, drops, clock, log."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ def draw_session(recording: Recording, path: str | Path) -> Path:
     Parameters
     ----------
     recording:
-        What `aolink.read` gives, with estimates in it.
+        A recording, as `aolink.read` opens it, with estimates in it.
     path:
         The PNG file to write; an older one is replaced.
 

@@ -1,4 +1,4 @@
-"""How the spot moved: paths, states, their errors and their consistency, for the truth and every estimator."""
+"""Motion of the spots: paths, states, their errors and their consistency, for the truth and every estimator."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ STATUS_COLOURS: dict[str, Colour] = {
     "PARKED": (80, 80, 100),
     "CLIPPED": (190, 50, 50),
 }
-"""Of an estimate's status and of what drove the mirror."""
+"""Colours of an estimate's status and of what drove the mirror."""
 
 
 def estimator_colour(name: str) -> Colour:

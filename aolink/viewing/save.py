@@ -35,7 +35,7 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
     Parameters
     ----------
     recording:
-        What `aolink.read` gives.
+        A recording, as `aolink.read` opens it.
     path:
         The file to write; it appears only when it is whole.
     overwrite:

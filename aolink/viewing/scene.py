@@ -1,4 +1,4 @@
-"""What the picture sensor saw, without its blur, and at rest; and the spots' frames without theirs.
+"""The picture sensor's scene as it came, without its blur, and at rest; and the spots' frames without theirs.
 
 All scenes are drawn alike: black is dark, white an intensity of one.
 """

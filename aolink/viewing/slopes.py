@@ -14,11 +14,11 @@ from aolink.optics.slopes import FrameSlopes
 from aolink.viewing.rrd_file import new_rrd
 
 _ARROW = 5.0
-"""How much longer than the displacements the arrows are."""
+"""Length of an arrow over its displacement."""
 _CELL = 12
 """Points of the wavefront's picture from a lenslet to the next one."""
 _DARK = (40, 40, 40)
-"""Of a lenslet without a spot."""
+"""Colour of a lenslet without a spot."""
 
 
 def save_slopes(result: FrameSlopes, path: Path, *, overwrite: bool = False) -> None:

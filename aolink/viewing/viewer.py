@@ -34,9 +34,9 @@ from aolink.viewing.vulkan import has_vulkan
 
 HOST = "127.0.0.1"
 WEB_PORT = 9090
-"""Of the web viewer's page, where nothing else uses it."""
+"""Port of the web viewer's page, where nothing else uses it."""
 PICTURE_SIZE = (1920, 1200)
-"""Of a screenshot, pixels."""
+"""Size of a screenshot, pixels."""
 
 _START_S = 30.0
 """How long a viewer may take to answer; a software renderer on a busy machine needs a few seconds."""

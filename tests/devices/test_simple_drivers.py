@@ -217,7 +217,7 @@ def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench:
     ("wrong", "what"),
     [
         ({"pixels": np.zeros((2, 3), np.uint16)}, r"the camera gives \(2, 3\) pixels from 0 to 0, the rig file says"),
-        ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: mend"),
+        ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: correct"),
         ({"start_ns": CAMERA_ZERO_NS + 10**12}, "a frame whose exposure ends in the future"),
     ],
 )
@@ -227,6 +227,12 @@ def test_a_frame_that_is_not_of_this_rig_is_refused(
     bench.taken = [frame(100 * STEP_NS, **wrong)]
     with pytest.raises(DeviceError, match=what):
         camera.poll()
+
+
+def test_a_frame_that_comes_as_the_camera_stops_is_given_once(camera: AdaptedCamera, bench: CameraBench) -> None:
+    bench.taken = [frame(100 * STEP_NS)]
+    camera.stop()
+    assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1]
 
 
 def test_a_step_that_has_gone_by_is_too_late_to_start_at(camera: AdaptedCamera) -> None:

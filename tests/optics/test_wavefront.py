@@ -213,7 +213,7 @@ def test_modal_finds_its_own_modes_and_weights_partly_lit_lenslets():
 def test_more_modes_than_slopes_are_refused_without_a_prior_and_taken_with_one():
     few = Lenslets(grid=(3, 3), pitch_m=0.1, focal_length_m=1.0)
     modes = zernike_modes(few, 40)
-    with pytest.raises(ValueError, match="do not tell the modes apart"):
+    with pytest.raises(ValueError, match="do not determine the modes"):
         modal_reconstructor(modes.slopes, modes.light)
     prior = kolmogorov_variances(modes.indices, 0.42, 0.1)
     assert np.isfinite(modal_reconstructor(modes.slopes, modes.light, 1e-3, prior)).all()

@@ -56,7 +56,7 @@ def test_a_small_recording_is_viewed_and_estimated(name: str, tmp_path: Path) ->
         else:
             assert isinstance(error, EstimatorError)
             number = SMALL[name]["exposures"]
-            assert f"s.mcap: o3 has predicted only: none of {number} exposures gave a measurement: " in str(error)
+            assert f"s.mcap: o3 only predicted: none of {number} exposures gave a measurement: " in str(error)
             assert f"o3: {number} of {number} exposures input invalid: " in output
     assert ran("estimate", path, "-e", "open-loop")[1] is None, "it does not look, so there is nothing to complain of"
 
@@ -68,7 +68,7 @@ def test_the_reason_is_in_the_table_in_info_and_in_json(aolink: Run, tmp_path: P
     assert result.returncode == 6
     assert result.stdout.count("no spot: the brightest stretch is") == 1
     assert "(frame 1, the first)" in result.stdout
-    assert result.stderr.startswith("aolink: dark.mcap: o3 has predicted only: none of 3 exposures gave")
+    assert result.stderr.startswith("aolink: dark.mcap: o3 only predicted: none of 3 exposures gave")
     told = " ".join(aolink("info", "out.mcap").stdout.split())
     assert "o3: 3 of 3 exposures input invalid: no spot: the brightest stretch is" in told
     (unused,) = json.loads(aolink("info", "out.mcap", "--json").stdout)["estimates"]["o3"]["unused"]
@@ -85,7 +85,7 @@ def test_a_batch_in_which_nothing_was_measured_is_no_success(aolink: Run, tmp_pa
         result = aolink("estimate", "dark.mcap", "lit.mcap", "-e", "o3", "-o", "out/")
         assert result.returncode == 6
         (line,) = result.stderr.splitlines()
-        assert line.startswith("aolink: warning: dark.mcap: o3 has predicted only: none of 2 exposures gave")
+        assert line.startswith("aolink: warning: dark.mcap: o3 only predicted: none of 2 exposures gave")
 
 
 def test_without_truth_there_is_a_nis_all_the_same(tmp_path: Path) -> None:

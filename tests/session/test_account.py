@@ -208,7 +208,7 @@ def test_a_dead_mirror_line_ends_the_session_within_twice_the_watchdog(tmp_path:
     assert (again.error, again.report.ended, again.report.rearmed) == (None, "complete", 1)
     assert again.mirror.identity.mirror.latched
     assert again.report.steps_applied == 600
-    assert any("parked by its watchdog in a session before: told to go on" in text for text in log_of(again))
+    assert any("parked by its watchdog in a session before: re-armed" in text for text in log_of(again))
 
 
 @pytest.mark.parametrize("seconds", [0.9, 1.1, 1.9])
@@ -223,7 +223,7 @@ def test_a_mirror_line_that_comes_back_in_time(seconds: float, tmp_path: Path) -
     check_live_is_recorded(run)
     latched = seconds > RIG.mirror.watchdog_s
     assert run.report.rearmed == latched
-    assert any("parked by its watchdog in this session: told to go on" in text for text in log_of(run)) == latched
+    assert any("parked by its watchdog in this session: re-armed" in text for text in log_of(run)) == latched
     # The gap is in the recording as it was, though no report came while the line was cut.
     parked = recorded_steps(run, pb.Applied.WATCHDOG)
     assert parked == {step for step, (_, source) in hub.truth().items() if source == pb.Applied.WATCHDOG}

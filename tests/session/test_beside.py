@@ -341,7 +341,7 @@ def test_a_watcher_that_fails_is_a_warning(rig_file: Path, tmp_path: Path) -> No
     with simulated_rig(rig_file, "--real-time") as ports:
         report = record(parse_rig(FAST), *ports, tmp_path / "a.mcap", exposures=3, watch=watch)
     assert (report.ended, report.unwatched) == ("complete", 2)
-    assert report.warnings == ["who watches this session failed: no more paper"]
+    assert report.warnings == ["the watcher of this session failed: no more paper"]
 
 
 def test_a_queue_keeps_order_and_when_it_is_full_goes_on_with_the_newest() -> None:

@@ -146,4 +146,4 @@ def test_a_line_that_comes_back_is_told_to_go_on_and_the_gap_is_recorded(rig_fil
     held = [each.message for each in recording.messages(topics.APPLIED)]
     assert any(m.source == pb.Applied.WATCHDOG for m in held)  # type: ignore[attr-defined]
     log = [each.message.message for each in recording.messages(topics.LOG)]  # type: ignore[attr-defined]
-    assert any("parked by its watchdog in this session: told to go on" in text for text in log)
+    assert any("parked by its watchdog in this session: re-armed" in text for text in log)

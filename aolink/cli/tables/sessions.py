@@ -53,9 +53,9 @@ def session(report: Report) -> Table:
     )
     table.add_row(
         "link",
-        f"packets thrown away: {report.packets_bad_crc} for their checksum, {report.packets_bad_framing} for their"
-        f" framing, {report.packets_bad_payload} for their content; {report.packets_duplicate} came twice;"
-        f" {report.packets_missing} missing by their numbers",
+        f"packets discarded: {report.packets_bad_crc} for their checksum, {report.packets_bad_framing} for their"
+        f" framing, {report.packets_bad_payload} for their content; {report.packets_duplicate} duplicates;"
+        f" {report.packets_missing} missing by their sequence numbers",
     )
     table.add_row(
         "commands",
@@ -65,8 +65,8 @@ def session(report: Report) -> Table:
     )
     table.add_row(
         "mirror",
-        f"parked in {report.steps_parked} steps of the session, {report.rearmed} times told to go on after its watchdog"
-        f" had parked it; {report.blocks_retransmitted} blocks sent again; missing reports asked for"
+        f"parked in {report.steps_parked} steps of the session, re-armed {report.rearmed} times after its watchdog"
+        f" parked it; {report.blocks_retransmitted} blocks sent again; missing reports requested"
         f" {report.reports_asked} times",
     )
     table.add_row(
@@ -77,7 +77,7 @@ def session(report: Report) -> Table:
     for name, each in report.estimation.items():
         table.add_row("estimates", f"{name}: {_estimation(each)}")
     if report.unwatched:
-        table.add_row("view", f"no time to show {report.unwatched} exposures")
+        table.add_row("view", f"{report.unwatched} exposures not shown, for want of time")
     if report.virtual_time:
         table.add_row("latency", "n/a on virtual time")
     for name, since, until in () if report.virtual_time else _LATENCY_STEPS:
@@ -133,7 +133,7 @@ def deblurred_lines(summary: Summary, estimator: str, method: str) -> list[str]:
     lines = [f"{scenes} of {facts['exposures']} exposures restored with the path of {estimator}, {method}"]
     if facts["psnr_blurred_db"] is not None:
         lines.append(
-            f"PSNR of the scene: {facts['psnr_blurred_db']:.1f} dB as it came (its shift forgiven),"
+            f"PSNR of the scene: {facts['psnr_blurred_db']:.1f} dB as recorded (shift removed),"
             f" {facts['psnr_restored_db']:.1f} dB restored (at least {facts['psnr_restored_least_db']:.1f})"
         )
     lines += unused_lines({estimator: summary.motion.result()})

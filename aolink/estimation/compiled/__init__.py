@@ -1,11 +1,11 @@
 """Loops over axes, components and pixels, compiled by Numba: of line sensors, and of many spots of one plant.
 
-What a whole-array call would do for thousands of axes at once runs through memory again and again; these keep one axis
-in the processor's cache. Each of a line sensor has a twin in NumPy that tests hold it to: those of `pixels.modes` and
-`pixels.importance`, which spots on a plane still use; those of one plant's spots are held to the dense view of the same
-pixels. They hold no lock, so axes are shared among threads;
-what comes out for one axis does not depend on how many are beside it, bit for bit. Machine code is kept beside the
-source or in the user's cache, and made when an estimator is made, not in the session that it is made for.
+Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the processor's
+cache. Each loop for line sensors has a twin in NumPy, in `pixels.modes` and `pixels.importance`, that spots on a plane
+use and that tests compare it with; the loops for many spots of one plant are tested against the dense view of the same
+pixels. They hold no lock, so axes are shared among threads; the result for one axis does not depend on how many others
+there are, bit for bit. Machine code is kept beside the source or in the user's cache. It is made when an estimator is
+made, not during a session.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ compiles_itself = False
 def make_ready(folder: Path = _FOLDER, program: str = _COMPILE) -> None:
     """Have the loops compiled by a process of its own, once for this version and processor; all others load them.
 
-    A process that has compiled them itself would compute with other machine code than the next one, which loads what
-    was kept: their last bits may differ, and with them estimates online and offline. Where nothing can be kept, each
-    process compiles for itself.
+    A process that compiles them for itself computes with other machine code than one that loads what was kept, so the
+    last bits of estimates online and offline might differ. Where nothing can be kept, each process compiles for itself.
     """
     if compiles_itself:
         return
@@ -59,7 +58,7 @@ def make_ready(folder: Path = _FOLDER, program: str = _COMPILE) -> None:
 
 
 def _machine() -> str:
-    """What compiled code is bound to, as Numba has it: its own version, the processor and what that can do."""
+    """What compiled code depends on, as Numba sees it: Numba's version, the processor and its features."""
     import numba
     from numba.core.registry import cpu_target
 
@@ -68,9 +67,9 @@ def _machine() -> str:
 
 
 def forget_stale(folder: Path) -> None:
-    """Remove what is kept of compiled functions from before any source in their folder was changed.
+    """Remove kept machine code that is older than the newest source in the folder.
 
-    Numba looks at a function's own file only, but has the functions that it calls from the others inside it.
+    Numba checks a function's own file only, but its machine code contains the functions of other files that it calls.
     """
     with suppress(OSError, ValueError):  # nothing kept, or not to be removed by this user
         changed = max(source.stat().st_mtime for source in folder.glob("*.py"))

@@ -1,4 +1,7 @@
-"""Many spots of one plant: their pixels by the courses of their paths, and what these tell of its coefficients."""
+"""Many spots of one plant: likelihood and Fisher information of their pixels, and of the plant's coefficients.
+
+A spot's path is a sum of courses in time; ``m`` is their number (`aolink.estimation.model.joint_paths`).
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-# A product of ratios is taken further up to this.
+# A product of variance ratios is replaced by its logarithm when it exceeds this.
 _LARGE = 1e200
 
 
@@ -21,7 +24,7 @@ _LARGE = 1e200
 def informed(information: FloatArray, patterns: FloatArray, course_of: Indices, course: int, out: FloatArray) -> None:
     """A spot's information (spots, 2, m, 2, m) between one course and the patterns (outputs, size).
 
-    Of the first so many coefficients as there is room for in ``out``, (outputs, .): rows are those of the course.
+    ``out``, (outputs, k), is that between the course of each output and the first k coefficients.
     """
     for s in range(len(information)):
         for d in range(2):
@@ -33,7 +36,7 @@ def informed(information: FloatArray, patterns: FloatArray, course_of: Indices, 
 
 @compiled_sums
 def spread_of(left: FloatArray, patterns: FloatArray, starts: Indices, course: int, out: FloatArray) -> None:
-    """Covariance of shares (spots, 2, m, 2, m) between one course and those up to it.
+    """Covariance of the courses' shares, (spots, 2, m, 2, m), between one course and those up to it.
 
     Parameters
     ----------
@@ -54,7 +57,7 @@ def spread_of(left: FloatArray, patterns: FloatArray, starts: Indices, course: i
 
 @compiled
 def taken(matrix: FloatArray, places: Indices, out: FloatArray) -> None:
-    """The rows and columns at these places."""
+    """The submatrix of the rows and columns at these places."""
     for i in range(len(places)):
         for j in range(len(places)):
             out[i, j] = matrix[places[i], places[j]]
@@ -62,7 +65,7 @@ def taken(matrix: FloatArray, places: Indices, out: FloatArray) -> None:
 
 @compiled
 def spread_out(lower: FloatArray, places: Indices, out: FloatArray) -> None:
-    """A symmetric matrix by its lower half, rows and columns in their places."""
+    """A symmetric matrix from its lower half, its rows and columns put at these places."""
     for i in range(len(lower)):
         for j in range(i + 1):
             out[places[i], places[j]] = out[places[j], places[i]] = lower[i, j]
@@ -74,7 +77,7 @@ def looked_at(
     y: FloatArray, usable: BoolArray, read: FloatArray, gain: FloatArray, log_likelihood: FloatArray, score: FloatArray,
     information: FloatArray,
 ) -> None:  # fmt: skip
-    """The pixels of spots by courses of their two paths, about a point.
+    """Log-likelihood, score and Fisher information of spots' pixels by the courses of their two paths, at a point.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""The pixels of a line sensor: expected light, its slopes, likelihood and Fisher information.
+"""The pixels of a line sensor: expected light, its derivatives, likelihood and Fisher information.
 
-The share of a Gaussian spot's light that a pixel gets depends on where the spot is in its own pixel only: a short table
-of Taylor's series, right to 2e-7 of the brightest pixel, does for the error function.
+The share of a Gaussian spot's light that a pixel gets depends only on where the spot is within its own pixel: a short
+table of Taylor series, right to 2e-7 of the brightest pixel, replaces the error function.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from aolink.estimation.compiled.small import compiled, inlined
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# A product of ratios is taken further up to this.
+# A product of variance ratios is replaced by its logarithm when it exceeds this.
 _LARGE = 1e200
 
 
 class Line(NamedTuple):
-    """What frames of line sensors show, one row for each axis and start."""
+    """Frames of a line sensor and what is needed to predict them, one row for each axis and start."""
 
     y: FloatArray
     """Densities, (rows, pixels)."""
@@ -31,31 +31,31 @@ class Line(NamedTuple):
     inputs: FloatArray
     """What inputs add to the path at its nodes, (rows, nodes)."""
     basis: FloatArray
-    """(n, nodes): that of the exposure, transposed, for the loops' inner steps are the nodes."""
+    """The exposure basis at the nodes, transposed since the inner loops are over nodes, (n, nodes)."""
     weights: FloatArray
-    """(nodes,)"""
+    """Each node's share of the exposure, (nodes,)."""
     table: FloatArray
     """Taylor coefficients of the light about points of a pixel, in pixels, (points, 4, reach)."""
     low: float
     """Where the first pixel begins."""
     high: float
     pixel: float
-    """Width."""
+    """Width of a pixel, slope units."""
     per_unit: float
-    """Pixels: what is divided by often is kept as what is multiplied with."""
+    """Its inverse: multiplying is faster than dividing."""
     read_noise: float
     """Variance of a pixel's density."""
     gain: float
-    """Of that variance by the density."""
+    """Shot noise: by how much that variance grows with the density."""
     kernel_variance: float
-    """Of the sensor's kernel, without what the nodes leave out."""
+    """Variance of the sensor's kernel, without the path's variance about the nodes, slope units squared."""
 
 
 @compiled
 def _place(theta: float, low: float, per_unit: float, pixels: int, points: int, reach: int) -> tuple[int, int, float]:
-    """First pixel that a spot gives light to, in padded rows; point of the table; pixels from it. -1: no light.
+    """First pixel in a padded row that a spot lights, or -1; nearest point of the table; distance from it in pixels.
 
-    Numbers come in, not the line: to count references to its arrays would take longer than all the rest.
+    The arguments are numbers, not the `Line`: counting references to its arrays would take longer than all the rest.
     """
     v = (theta - low) * per_unit
     if not (v > -0.5 * reach and v < pixels + 0.5 * reach):
@@ -83,7 +83,7 @@ def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
 
 @inlined
 def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatArray, J: FloatArray) -> None:
-    """The same and its slope by the rows of a basis (n, nodes): J is (n, padded pixels)."""
+    """The same, and its Jacobian J (n, padded pixels) by the coefficients of a basis (n, nodes)."""
     f[:] = 0.0
     J[:] = 0.0
     points, _, reach = line.table.shape
@@ -128,7 +128,7 @@ def log_likelihood_of(line: Line, row: int, f: FloatArray) -> float:
 
 @inlined
 def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArray) -> None:
-    """Of coefficients t (n,) of a basis (n, nodes), (nodes,)."""
+    """The path at the nodes, (nodes,), of coefficients t (n,) of a basis (n, nodes)."""
     path[:] = offset
     for i in range(len(t)):
         x = t[i]
@@ -138,14 +138,14 @@ def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArr
 
 @compiled
 def log_likelihoods(line: Line, t: FloatArray, out: FloatArray) -> None:
-    """Of points (rows, points, n), (rows, points)."""
+    """Log-likelihoods (rows, points) of points t (rows, points, n)."""
     for row in range(len(t)):
         log_likelihoods_of_row(line, row, t[row], out[row])
 
 
 @compiled
 def log_likelihoods_of_row(line: Line, row: int, t: FloatArray, out: FloatArray) -> None:
-    """Of points (points, n), (points,)."""
+    """Log-likelihoods (points,) of points t (points, n) in one row."""
     path = np.empty(len(line.weights))
     f = np.empty(line.y.shape[1] + 2 * line.table.shape[2])
     for j in range(len(t)):
@@ -158,7 +158,9 @@ def log_likelihoods_of_row(line: Line, row: int, t: FloatArray, out: FloatArray)
 def fisher_information(
     line: Line, row: int, f: FloatArray, J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray
 ) -> tuple[float, float]:
-    """H = J' I J, its lower half, pull = J' score; returns the log-likelihood and the sum of score^2 / I.
+    """Lower half of H = J' I J, I each pixel's Fisher information; pull = J' score.
+
+    Returns the log-likelihood and the sum of score^2 / I over the pixels.
 
     ``scores`` is room for (3, pixels).
     """

@@ -1,4 +1,4 @@
-"""Mixtures of Gaussians, compiled: fewer components, and weighted points of the posterior of a line sensor's pixels."""
+"""Gaussian mixtures, compiled: Runnalls' reduction, and adaptive importance sampling of a line sensor's pixels."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def mapped(
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, rows: FloatArray, remainder: FloatArray,
     out_mean: FloatArray, out_covariance: FloatArray,
 ) -> None:  # fmt: skip
-    """Components of M t + e, e of covariance ``remainder``; what is not there is left as it comes."""
+    """Components of M t + e, e of covariance ``remainder``; components of weight zero are left alone."""
     axes, count, n = mean.shape
     m = len(rows)
     half = np.empty((m, n))
@@ -75,7 +75,7 @@ def mapped(
 
 @compiled
 def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most: int, free: float) -> None:
-    """Components (axes, components, ...) merged by Runnalls' bound, in place; those that are gone weigh nothing.
+    """Components (axes, components, ...) merged by Runnalls' bound, in place; merged ones get weight zero.
 
     As `GaussianMixture.reduced`: until there are no more than ``most``, and while a merger costs less than ``free``.
     """
@@ -84,7 +84,7 @@ def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most
     root, merged = np.empty((n, n)), np.empty((n, n))
     for axis in range(axes):
         w, x, P = log_weight[axis], mean[axis], covariance[axis]
-        # Those that are there come first.
+        # Components of weight above zero come first.
         begun = 0
         for j in range(count):
             if w[j] > -math.inf:
@@ -130,7 +130,7 @@ def _log_determinant(P: FloatArray, root: FloatArray) -> float:
 
 @compiled
 def _merged(w: FloatArray, x: FloatArray, P: FloatArray, i: int, j: int, out: FloatArray) -> float:
-    """Covariance of two components together, and their log-weight."""
+    """Covariance of two merged components, and their log-weight."""
     top = max(w[i], w[j])
     total = top + math.log(math.exp(w[i] - top) + math.exp(w[j] - top))
     share = math.exp(w[j] - total)
@@ -174,7 +174,10 @@ def _log_densities(
     log_weight: FloatArray, mean: FloatArray, inverse: FloatArray, constant: FloatArray, t: FloatArray, begin: int,
     end: int, white: FloatArray, logs: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Of components at points ``begin`` to ``end`` of t (n, points), (components, points), and of the mixture."""
+    """Log-densities of the components, (components, points), and of the mixture, at points ``begin`` to ``end`` of t.
+
+    t is (n, points).
+    """
     n = mean.shape[1]
     for k in range(begin, end):
         out[k] = -math.inf
@@ -219,8 +222,7 @@ def importance_corrected(
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
     As `aolink.estimation.pixels.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds,
-    points, n) are the points' random numbers. Points lie along the last dimension of every array here, for they are
-    what there are many of.
+    points, n) are the points' random numbers. Points, which are many, lie along the last dimension of every array here.
     """
     axes, count, n = mean.shape
     states = prior_mean.shape[2]
@@ -304,7 +306,7 @@ def _draw(
 def _weigh(
     target: FloatArray, drawn: FloatArray, rounds: int, end: int, most: FloatArray, log_weight: FloatArray
 ) -> float:
-    """Normalised weights of points over all the densities, (rounds, points), that they are from; how many count."""
+    """Normalised log-weights of points drawn from all densities (rounds, points); returns the effective sample size."""
     for k in range(end):
         most[k] = drawn[0, k]
     for q in range(1, rounds):
@@ -334,7 +336,7 @@ def _weigh(
 
 @compiled_sums
 def _temper(log_weight: FloatArray, end: int, effective: float, least: float, halvings: int, out: FloatArray) -> None:
-    """Weights raised to the largest power up to one at which so many points, or half of all, count."""
+    """Weights raised to the largest power up to one at which the effective sample size is ``least``, or half of all."""
     enough = min(least, end / 2)
     for k in range(end):
         out[k] = log_weight[k]
@@ -365,10 +367,10 @@ def _refit(
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, t: FloatArray, end: int, weight: FloatArray,
     logs: FloatArray, density: FloatArray, prior_points: float, negligible: float, share: FloatArray, away: FloatArray,
 ) -> None:  # fmt: skip
-    """One step of expectation and maximisation with weighted points, in place.
+    """One step of expectation-maximisation (EM) with weighted points, in place.
 
-    ``logs`` (components, points) are the components' log-densities at the points, ``density`` (points,) their sum's.
-    Of a component that is not there any more the weight is minus infinity.
+    ``logs`` (components, points) are the components' log-densities at the points, ``density`` (points,) the mixture's.
+    A component that is dropped gets the log-weight minus infinity.
     """
     count, n = mean.shape
     whole = 0.0
@@ -405,9 +407,9 @@ def _refit(
 
 @compiled
 def _normalise(weight: FloatArray, least: float) -> None:
-    """Weights become logarithms, those of no more than the least minus infinity.
+    """Normalised logarithms of weights, in place; minus infinity for weights of no more than ``least``.
 
-    Summed one after the other, so that what is not there does not change a bit.
+    Weights are summed one after the other, so that components of weight zero change no bit.
     """
     left = 0.0
     for each in weight:

@@ -1,4 +1,4 @@
-"""Modes of the posterior of a line sensor's pixels: the search, and which of them are one."""
+"""Modes of the posterior of a line sensor's pixels by Levenberg and Marquardt's method, and which of them are one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from aolink.estimation.compiled.small import cholesky, compiled, eigh, inlined, 
 
 FloatArray = NDArray[np.float64]
 
-# Squared distance from a mode, in its standard deviations, at which a search ends there.
+# A search ends where its squared distance from a known mode, in that mode's standard deviations, is below this.
 _NEXT_TO = 0.25
 
 
@@ -54,7 +54,7 @@ def innovations(
     line: Line, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float, value: FloatArray,
     information: FloatArray, nis: FloatArray, square: FloatArray,
 ) -> None:  # fmt: skip
-    """Of points t (rows, n), as `pixels.modes.innovation`, in so many directions as there is room for.
+    """Innovations at points t (rows, n) in k directions, as `pixels.modes.innovation`.
 
     ``value`` and ``information`` are (rows, k); ``square`` is the sum of score^2 / I.
     """
@@ -97,11 +97,11 @@ def find_modes(
     converged: float, out_mean: FloatArray, out_covariance: FloatArray, out_evidence: FloatArray,
     out_distance: FloatArray, out_objective: FloatArray,
 ) -> None:  # fmt: skip
-    """Where the first ``of_row`` (rows,) of starts (rows, starts, n), whitened, lead, and after them reversals.
+    """Modes that the first ``of_row`` (rows,) of the whitened starts (rows, starts, n) lead to, then their reversals.
 
-    As `pixels.modes.modes_of`; ``mean`` and ``covariance`` are the prior's. Results have room for three more
-    than there are starts if ``reversed_precision`` is not zero. Of starts that are not there, or lead where an earlier
-    one did, they are left as they come.
+    As `pixels.modes.modes_of`; ``mean`` and ``covariance`` are the prior's. If ``reversed_precision`` is not zero,
+    results have room for three more modes than there are starts. Where there is no start, or it leads to the mode of
+    an earlier one, they are left alone.
     """
     rows, n = mean.shape
     nodes, room = line.basis.shape[1], out_mean.shape[1]
@@ -202,7 +202,7 @@ def _reversals(
     weights: FloatArray, rest: FloatArray, B: FloatArray, path: FloatArray, whole: int, precision: float, H: FloatArray,
     root: FloatArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Whitened coordinates (3, n) of paths like a path's reversal, its mirror image and both, as `reversed_starts`."""
+    """Whitened coordinates (3, n) near a path's reversal, its mirror image and both, as `reversed_starts`."""
     n, total, mean = len(B), 0.0, 0.0
     for k in range(whole):
         total += weights[k]
@@ -228,7 +228,7 @@ def _reversals(
 
 @inlined
 def _near(s: FloatArray, ends: FloatArray, H: FloatArray, count: int) -> int:
-    """Which of so many modes s is next to already, or -1; their informations' lower halves are (modes, n, n)."""
+    """The first of ``count`` modes that s is near, or -1; the lower halves of their informations are (modes, n, n)."""
     n = len(s)
     for m in range(count):
         distance = 0.0
@@ -247,7 +247,7 @@ def _at(
     line: Line, row: int, rest: FloatArray, B: FloatArray, s: FloatArray, path: FloatArray, f: FloatArray,
     J: FloatArray, scores: FloatArray, H: FloatArray, pull: FloatArray,
 ) -> float:  # fmt: skip
-    """Information, downward pull and objective at whitened coordinates s."""
+    """Information H, negative gradient ``pull`` and objective (returned) at whitened coordinates s."""
     n = len(s)
     path_of(rest, B, s, path)
     linearised_light(line, path, B, f, J)
@@ -265,9 +265,9 @@ def drop_repeats(
     mean: FloatArray, covariance: FloatArray, apart: float, evidence: FloatArray, distance: FloatArray,
     objective: FloatArray,
 ) -> int:  # fmt: skip
-    """Modes (rows, modes, ...) that no earlier one is come first, the log-evidence of the rest is minus infinity.
+    """Distinct modes of (rows, modes, ...) are put first; repeats of an earlier one get log-evidence minus infinity.
 
-    Returns how many the row with the most has.
+    Returns the largest number of distinct modes in a row.
     """
     rows, count, n = mean.shape
     root, inverse = np.empty((n, n)), np.empty((n, n))

@@ -1,4 +1,4 @@
-"""Windowed moments of a line sensor, and what they make of a prior: as `aolink.estimation.moments.windowed`."""
+"""Windowed moments of a line sensor, and priors updated with them: as `aolink.estimation.moments.windowed`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def broad(
     line: Line, mean: FloatArray, covariance: FloatArray, passes: int, no_noise: float, path_reach: float,
     kernel_reach: float, out_mean: FloatArray, out_covariance: FloatArray,
 ) -> None:  # fmt: skip
-    """Priors (rows, n) and (rows, n, n) corrected with windowed moments, linearised about what came before.
+    """Priors (rows, n) and (rows, n, n) updated with windowed moments, linearised about the previous pass.
 
     As `aolink.estimation.pixels.modes.broad` with `WindowedMoments` of orders 0 to 3.
     """
@@ -107,7 +107,7 @@ def _weighted_sums(line: Line, row: int, W: FloatArray, y: FloatArray, R: FloatA
 
 @compiled
 def _responses(line: Line, W: FloatArray, path: FloatArray, spread: FloatArray, g: FloatArray) -> None:
-    """Expectations of the sums and of their derivatives by the spot's place at each node: as `expected_response`."""
+    """Expectations of the sums and of their derivatives by the spot's position at each node: as `expected_response`."""
     change, places, edges = np.empty((W.shape[1] + 1, _ORDERS)), np.empty(W.shape[1] + 1), 0
     for edge in range(W.shape[1] + 1):
         changes = False

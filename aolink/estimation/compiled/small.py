@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Decorator of a function that runs as machine code, which is kept for the next process if there is a place."""
+    """Decorator of a function that runs as machine code, which is kept for the next process where it can be."""
     return _compiled(function, {"contract", "arcp"})
 
 
@@ -23,7 +23,7 @@ def inlined(function: Callable[..., Any]) -> Any:
 
 
 def compiled_sums(function: Callable[..., Any]) -> Any:
-    """The same of a function with long sums, which may be taken in any order: several terms at a time."""
+    """The same for a function with long sums whose order does not matter: several terms are added at a time."""
     return _compiled(function, {"contract", "arcp", "reassoc", "nsz"})
 
 
@@ -36,14 +36,14 @@ def _compiled(function: Callable[..., Any], freedom: set[str]) -> Any:
 
 
 _JITTER = 1e-10
-# Of Jacobi's method at most; and squares beside the diagonal, as a share of those on it, that are rounding.
+# Most sweeps of Jacobi's method, which ends where the squares off the diagonal are this share of those on it.
 _SWEEPS = 30
 _ROUNDING = 1e-28
 
 
 @compiled
 def cholesky(a: FloatArray, root: FloatArray) -> None:
-    """A lower triangular root, (n, n), of what may be singular, from its lower half.
+    """Lower triangular root, (n, n), of a covariance that may be singular, from its lower half.
 
     As `aolink.estimation.pixels.gaussian_mixture.cholesky`.
     """
@@ -111,9 +111,9 @@ def times(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @compiled
 def decay(x: float) -> float:
-    """exp x of no more than zero, to 3e-9 of it, and 4e-18 of less than -40.
+    """exp(x) for x <= 0, to a relative 3e-9; exp(-40) = 4e-18 for x < -40.
 
-    Unlike the library's it is nothing but products, so that several are taken at a time.
+    Unlike the library's exp it is nothing but products, so that several are computed at a time.
     """
     y = (-40.0 if x < -40.0 else x) * (1.0 / 256.0)
     p = 1.0 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y * (1 / 120 + y * (1 / 720 + y * (1 / 5040)))))))
@@ -141,7 +141,7 @@ def lower_solve(root: FloatArray, x: FloatArray) -> None:
 def eigh(a: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
     """Eigenvalues of a symmetric matrix (n, n), the largest first, and its eigenvectors as rows, by Jacobi's method.
 
-    The matrix is made diagonal in its place.
+    The matrix itself is made diagonal.
     """
     n = len(a)
     for i in range(n):

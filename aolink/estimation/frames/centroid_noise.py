@@ -1,4 +1,4 @@
-"""How well a rig's frames will tell the centroids of its spots, by what the rig file says of noise and light."""
+"""The covariance to expect of centroids that are measured in a rig's frames, from the rig file's noise and light."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def centroid_covariance(rig: Rig) -> FloatArray:
 
     Returns
     -------
-    Blocks along the diagonal of each copy of the plant, a spot's slopes in each, (axes, blocks, size, size); of one
-    copy, (1, blocks, size, size), where all have as much light.
+    Blocks along the diagonal for each copy of the plant, one block a spot, (axes, blocks, size, size), slope units
+    squared; for one copy, (1, blocks, size, size), where all have the same light.
     """
     sensor, plant = rig.sensor, rig.plant
     own = _of_whole_spot(sensor, plant.n_outputs)

@@ -1,4 +1,4 @@
-"""What can be taken of a frame, and how an estimator says which of it it needs."""
+"""What can be measured of a frame (moments, profiles, windows), and how an estimator says what it needs."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ BoolArray = NDArray[np.bool_]
 Flux = Literal["known", "measured"]
 
 HALF = 0.5
-"""Share of a spot's pixels that estimators of windows and of pixels can do with; and share of the spots, where
-hundreds of states hang together."""
+"""Least share of a spot's pixels that estimators which take windows or profiles can use; and least share of the spots,
+on a plant with hundreds of states."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,12 +22,12 @@ class Needs:
     """What an estimator takes of each frame, and how much of the frame must be usable."""
 
     what: Literal["moments", "profile", "windows"]
-    """"moments": a `Measurement`; "profile": a `Profile`; "windows": `SpotWindows`, which there are where one copy of
-    the plant moves whole spots."""
+    """"moments": a `Measurement`; "profile": a `Profile`; "windows": `SpotWindows`, only where one copy of the plant
+    moves whole spots."""
     orders: tuple[int, ...] = ()
     """Which moments, from 1."""
     flux: Flux = "known"
-    """Whether the light of a frame is known to sum to one, or moments are divided by what it sums to."""
+    """"known": the light of a frame sums to one; "measured": moments are divided by the light that is measured."""
     least_usable: float = 1.0
     """Share of a spot's pixels that must be usable. Moments need all of them: whole spots."""
     least_spots: float = 1.0
@@ -47,7 +47,7 @@ class Measurement:
     covariance: FloatArray
     """(axes, n_measurements, n_measurements), or blocks along its diagonal, (axes, blocks, size, size)."""
     usable: BoolArray | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
+    """False for axes of which nothing was measured, (axes,); None if all were measured."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -59,9 +59,9 @@ class Profile:
     mask: BoolArray
     """True where the pixel can be used, (axes, pixels)."""
     light: FloatArray | None = None
-    """Light of each spot, of a whole one, which densities are divided by, (axes,); one where None."""
+    """Light of each spot as a share of a whole one's, which densities are divided by, (axes,); one where None."""
     usable: BoolArray | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
+    """False for axes of which nothing was measured, (axes,); None if all were measured."""
 
     def part(self, axes: slice) -> Profile:
         """The part of these axes."""
@@ -78,9 +78,9 @@ class SpotWindows:
     mask: BoolArray
     """True where the pixel can be used, (axes, spots, rows, columns)."""
     light: FloatArray | None = None
-    """Light of each spot, of a whole one, which densities are divided by, (axes, spots); one where None."""
+    """Light of each spot as a share of a whole one's, which densities are divided by, (axes, spots); one where None."""
     usable: BoolArray | None = None
-    """False for axes of which nothing was measured, (axes,); None if there are none."""
+    """False for axes of which nothing was measured, (axes,); None if all were measured."""
 
     def per_light(self, light: FloatArray | None) -> SpotWindows:
         """The same with densities divided by the light of each spot in the rig's order, (axes * spots,)."""

@@ -1,4 +1,4 @@
-"""What an estimator takes of exposures: their moments, profiles or windows; it does not matter what came before."""
+"""Measures exposures for an estimator: their moments, profiles or windows, each whatever came before."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from aolink.rig import Rig
 
 FloatArray = NDArray[np.float64]
 Measured = tuple[FrameData | None, str]
-"""What is taken of an exposure, or nothing; and what there is to say about it."""
+"""What was measured of an exposure, or None; and a remark about what could not be used, or an empty text."""
 
 
 class Measurements:
-    """What an estimator needs of each of some exposures, each to the same bits as alone.
+    """What an estimator needs of each of some exposures, the same bits as for each alone.
 
-    Frames of a line sensor without a flaw are measured all at once, the others when they are asked for.
+    Frames of a line sensor without a flaw are measured all at once, the others one by one on demand.
     """
 
     def __init__(self, rig: Rig, exposures: Sequence[Exposure], needs: Needs | None) -> None:
@@ -49,7 +49,7 @@ class Measurements:
                 self.rows[sized[k]] = row
 
     def __getitem__(self, k: int) -> Measured:
-        """What is taken of exposure k, or nothing; and what there is to say about it."""
+        """What was measured of exposure k, or None; and a remark."""
         row = self.rows[k]
         if self.moments is None or row < 0:
             return measure(self._rig, self._exposures[k], self._needs)
@@ -62,7 +62,7 @@ class Measurements:
 
 
 def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:
-    """What an estimator needs of an exposure, or nothing; and what there is to say about it."""
+    """What an estimator needs of an exposure, or None; and a remark about what could not be used."""
     if needs is None:
         return None, ""
     sensor, pixels = rig.sensor, exposure.pixels

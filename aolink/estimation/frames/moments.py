@@ -107,7 +107,7 @@ def measure_moments(
     flux:
         "known": the total is one, as Mishra & Wen (9) to (11) take it; "measured": divide by it, as (7) does.
     light:
-        Light of each spot, of the sensor's whole one, (axes,); one where None.
+        Light of each spot as a share of a whole one's, (axes,); one where None.
 
     Returns
     -------
@@ -133,9 +133,9 @@ def with_shot_noise(
     Parameters
     ----------
     read:
-        The same by read-out alone, (2 highest + 1,).
+        The same by read-out noise alone, (2 highest + 1,).
     sums:
-        From counts above the black level, (axes, pixels), what shot noise adds.
+        What shot noise adds, from counts above the black level (axes, pixels).
     """
     light = counts.astype(np.float64) - black_level
     noise = read + sums(light)
@@ -217,11 +217,11 @@ def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
 
 
 def least_significance(sensor: Sensor, light: FloatArray | float = 1.0) -> FloatArray:
-    """What `spot_significance` is to reach in a frame with a spot, however widely it is smeared.
+    """The least `spot_significance` of a frame that has a spot, however widely it is smeared.
 
     Light as wide as the field stands out by its total over the total's noise, one less by chance. Where that is
-    much, a frame without a spot hardly ever gets there; where it is little, most do, and their noise speaks for itself.
-    ``light`` is the spot's, of the sensor's whole one.
+    large, a frame without a spot hardly ever reaches it; where it is small, most do, but their moments' covariance is
+    large. ``light`` is the spot's as a share of a whole one's.
     """
     total = light / math.sqrt(effective_noise_density(sensor) * (sensor.field[1] - sensor.field[0]))
     return np.clip(total - 1, _LEAST, _ENOUGH)

@@ -52,9 +52,9 @@ def measure_moments_2d(
     flux:
         As in `aolink.estimation.frames.moments.measure_moments`.
     light:
-        Light of each spot, of a whole one, (axes,); one where None.
+        Light of each spot as a share of a whole one's, (axes,); one where None.
     photoelectrons:
-        Photoelectrons of a whole spot; 0 for so many that shot noise does not matter.
+        Photoelectrons of a whole spot; 0 where shot noise does not matter.
 
     Returns
     -------

@@ -33,7 +33,7 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Profiles:
-    """What the frame shows of each output of the rig, as counts of `SpotSensor.profile`."""
+    """A profile for each output of the rig, as counts of `SpotSensor.profile`."""
 
     counts: FloatArray
     """Whole numbers, zero where the mask is, (n_outputs, pixels); contiguous in memory along the outputs."""
@@ -68,14 +68,14 @@ def measure_spots(
     sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], arrived: BoolArray, needs: Needs,
     least_significance: FloatArray | float,
 ) -> tuple[FrameData | None, str]:  # fmt: skip
-    """What a frame says of each axis, or nothing; and how many axes it says nothing of, and why.
+    """What is measured of each axis in a frame, or None; and a remark on how many axes are not measured, and why.
 
     Parameters
     ----------
     pixels, arrived:
-        The frame and which of it there is, (rows, columns).
+        The frame and which of its pixels arrived, (rows, columns).
     needs:
-        What is to be taken of it.
+        What is to be measured.
     least_significance:
         By how many standard deviations of noise a spot must stand out, (n_outputs,) or one for all.
     """
@@ -178,7 +178,7 @@ def _coupled_moments(
 
 
 def _spread(measured: FrameData, usable: BoolArray) -> FrameData:
-    """Moments of the usable axes in the places of these; the others get zero with unit covariance."""
+    """Moments of the usable axes spread over all axes; the others get zero with unit covariance."""
     if not isinstance(measured, Measurement):
         return measured
     value = np.zeros((len(usable), measured.value.shape[1]))

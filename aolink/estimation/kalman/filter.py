@@ -34,7 +34,7 @@ _SETTLED = 1e-13
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Posterior:
-    """What one exposure came to."""
+    """The posterior of one exposure, and what became of its measurement."""
 
     coefficients: Gaussian
     """Coefficients of the exposure basis; the start state comes first."""
@@ -44,11 +44,12 @@ class Posterior:
     innovation: FloatArray
     """(axes, n_measurements)"""
     innovation_covariance: FloatArray
-    """(axes, n_measurements, n_measurements), or of many measurements its diagonal, (axes, n_measurements)."""
+    """(axes, n_measurements, n_measurements), or its diagonal for many measurements, (axes, n_measurements)."""
     nis: FloatArray
     """(axes,)"""
     several: NDArray[np.bool_] | None = None
-    """Whether the blur was seen to have more than one reading, (axes,); None where nobody looked for it."""
+    """Whether several modes of the posterior were found (the blur has more than one reading), (axes,); None where they
+    are not searched."""
 
     @property
     def start(self) -> Gaussian:
@@ -58,12 +59,12 @@ class Posterior:
 
 
 class Filter(ABC):
-    """A filter of one rig: it is given what it needs of exposure after exposure, and says what each came to."""
+    """A recursive filter for one rig: it is given what it needs of each exposure and gives that one's posterior."""
 
     @property
     @abstractmethod
     def needs(self) -> Needs | None:
-        """What it needs of each frame; None if it does not look at the camera."""
+        """What it needs of each frame; None if it takes no measurements."""
 
     @abstractmethod
     def bridge(self, inputs: FloatArray) -> None:
@@ -71,10 +72,10 @@ class Filter(ABC):
 
     @abstractmethod
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
-        """One exposure, with what was needed of its frame, or without."""
+        """Predict over one exposure and update with what was measured of it; only predict where that is None."""
 
     def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
-        """`step` for several exposures at once, where the filter can; None where it cannot."""
+        """`step` for several exposures at once where the filter can, otherwise None."""
         return None
 
 
@@ -87,7 +88,7 @@ class BlurFilter(Filter):
     Parameters
     ----------
     observation:
-        How it looks at an exposure; None for prediction only.
+        What it measures of an exposure, and the update with that; None for prediction only.
     process_noise:
         Covariance that one exposure adds: "lifted", what N fast steps do, or "printed", the paper's B_w W B_w'.
     gate:
@@ -107,9 +108,9 @@ class BlurFilter(Filter):
         )
         self.prior = prior
         """The state after the last exposure or bridge: the next exposure starts there."""
-        # The same without what the camera said; its covariance is that of every axis, (1, n_states, n_states).
+        # The prediction without any measurement; its covariance is that of every axis, (1, n_states, n_states).
         self._unseen = Gaussian(prior.mean, prior.covariance[:1])
-        # The transition that no longer changes it.
+        # The transition that no longer changes that covariance; None until it has settled.
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
@@ -157,7 +158,7 @@ class BlurFilter(Filter):
         )
 
     def _predict_unseen(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> None:
-        """Carry on what would be believed without a camera; a covariance that has settled is not computed again."""
+        """Predict `_unseen`; a covariance that has settled is not computed again."""
         before = self._unseen
         if transition is self._settled_under:
             self._unseen = Gaussian(predicted_mean(before.mean, transition, kick), before.covariance)
@@ -170,7 +171,7 @@ class BlurFilter(Filter):
     def _trusted(
         self, prior: Gaussian, done: Update, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
     ) -> tuple[Gaussian, NDArray[np.int64]]:
-        """The correction where there is one that can be believed, the prior elsewhere; and the status of each axis."""
+        """The updated Gaussian where it is finite and not gated, otherwise the prior; and the status of each axis."""
         after, missed = done.posterior, self._missed
         used = done.nis <= self._gate
         # Sums are finite where all is; those that overflow are checked again, axis by axis.
@@ -200,8 +201,8 @@ class TwoStateFilter(BlurFilter):
         return (plant.axes, plant.n_states, plant.n_outputs) == (1, 2, 1)
 
     def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
-        """`step` for exposures without a gap between them, all at once and to the same bits, as far as they can be
-        believed; None where that is none.
+        """`step` for exposures without a gap between them, all at once and to the same bits, up to the first that is
+        gated or not finite; None if that is the first of all.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""The paper's filters on filterpy, for one axis: where a user's own small filter and ours meet.
+"""The paper's filters on filterpy, for one axis: to check ours against, and for users to start their own from.
 
 filterpy takes a second to import and does one axis at a time, so it is imported only where it is asked for.
 """

@@ -1,4 +1,4 @@
-"""A Gaussian for each axis, and what an update made of one."""
+"""A Gaussian for each axis, and the result of an update."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 
 
 MOST_COVARIANCES = 32
-"""Measurements of which an estimate has the whole innovation covariance; of more it has the diagonal."""
+"""Most measurements for which an estimate keeps the whole innovation covariance; for more it keeps the diagonal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Gaussian:
 
 @dataclass(frozen=True, eq=False)
 class Update:
-    """What a measurement made of a prior."""
+    """A prior updated with a measurement."""
 
     posterior: Gaussian
     innovation: FloatArray

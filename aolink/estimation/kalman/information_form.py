@@ -14,7 +14,7 @@ from aolink.numerics.information import information, inverse_root
 
 FloatArray = NDArray[np.float64]
 
-# Exposures in which a gain has settled, or there is none; and the relative change of a covariance that is rounding.
+# A gain settles within this many exposures, or there is none; relative changes of a covariance below this are rounding.
 _MOST_EXPOSURES = 1000
 _SETTLED = 1e-11
 

@@ -1,4 +1,4 @@
-"""What an exposure shows of its coefficients: the observations of a Kalman filter, and those of the paper."""
+"""Observation models of an exposure for a Kalman filter, and that of the paper: moments of the path."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Data = TypeVar("Data", contravariant=True)
 
 
 class Observation(Protocol[Data]):
-    """A way to look at an exposure."""
+    """What a filter measures of an exposure, and its update with that."""
 
     needs: Needs
     models_noise: bool
@@ -41,7 +41,7 @@ class Observation(Protocol[Data]):
     n_measurements: int
 
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Data) -> Update:
-        """The exposure's coefficients with what was measured."""
+        """Update the prior of the exposure's coefficients with what was measured."""
 
 
 class PathMoments:
@@ -58,7 +58,7 @@ class PathMoments:
     crosses:
         Whether the cross moments of each two outputs follow, y_11 of a lenslet's x and y.
     flux:
-        As of `Needs`.
+        As in `Needs`.
     """
 
     models_noise = False
@@ -73,7 +73,7 @@ class PathMoments:
         self._form = self._chosen_form(plant)
 
     def _chosen_form(self, plant: Plant) -> Form:
-        """The form of the update by numbers of states and measurements."""
+        """The form of the update for these numbers of states and measurements."""
         if plant.n_outputs > 2 and not self.crosses:  # many spots, of which each has noise of its own
             return self._many if plant.n_states > MANY_STATES else self._blocked
         if max(self.n_measurements, plant.n_states) > entrywise.MOST_ROWS:
@@ -117,7 +117,7 @@ class PathMoments:
         return [y - expected for y, expected in zip(entrywise.columns(measured.value), h, strict=True)], H
 
     def _noise(self, measured: Measurement) -> FloatArray:
-        """Whole, (axes, n_measurements, n_measurements): that of one spot may come as its only block."""
+        """Covariance of the measurements, (axes, n_measurements, n_measurements); a single block may stand for it."""
         R = measured.covariance
         return R[:, 0] if R.ndim == 4 else R
 

@@ -19,13 +19,21 @@ Predict = Callable[[Gaussian, FloatArray, FloatArray, FloatArray], Gaussian]
 
 
 def added_noise(model: ExposureModel, kind: Noise) -> FloatArray:
-    """What the process noise of one exposure adds to the state's covariance, (n_states, n_states)."""
+    """Q, what the process noise of one exposure adds to the state's covariance, (n_states, n_states)."""
     plant = model.plant
     return model.process_noise if kind == "lifted" else plant.B_w @ plant.process_noise @ plant.B_w.T
 
 
 def predict(state: Gaussian, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
-    """x -> A x + d, P -> A P A' + Q. Mishra & Wen (16) and (17), with the inputs."""
+    """x -> A x + d, P -> A P A' + Q: Mishra & Wen (16) and (17), with the inputs.
+
+    Parameters
+    ----------
+    transition, noise:
+        A and Q, both (n_states, n_states).
+    kick:
+        d, the state's response to the inputs, (axes, n_states).
+    """
     mean = predicted_mean(state.mean, transition, kick)
     if max(transition.shape) > entrywise.MOST_ROWS:
         spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence

@@ -1,4 +1,4 @@
-"""Two states, the mean and the mean square of one output: o3 of a spot's axis, written out line by line.
+"""o3 for one axis with two states, the extended Kalman filter with y_1 and y_2, written out number by number.
 
 The same lines take arrays with a value for each axis, or plain numbers of a single one, to the same bits. For a single
 axis a series of exposures is one loop over numbers (`run`): as arrays they would take thirty times as long.
@@ -78,7 +78,7 @@ def update(
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What exposures one after the other came to, those of one axis; as `Posterior`, (exposures, 1, ...)."""
+    """Posteriors of consecutive exposures of one axis, as in `Posterior`; arrays are (exposures, 1, ...)."""
 
     coefficients: FloatArray
     covariance: FloatArray
@@ -93,7 +93,7 @@ def run(
     model: ExposureModel, process_noise: FloatArray, state: FloatArray, covariance: FloatArray,
     responses: InputResponse, values: FloatArray, noises: FloatArray, gate: float,
 ) -> Run:  # fmt: skip
-    """Correct and predict exposure by exposure, until one is not to be believed: so many rows has what is returned.
+    """Update and predict exposure by exposure, up to the first that is gated or not finite.
 
     Parameters
     ----------
@@ -102,11 +102,15 @@ def run(
     state, covariance:
         At the start of the first exposure, (2,) and (2, 2).
     responses:
-        To the inputs of each, (exposures, ...).
+        Responses to the inputs of each exposure, (exposures, ...).
     values, noises:
         Measured moments, (exposures, 2), and their covariance, (exposures, 2, 2).
     gate:
-        The largest NIS that is believed.
+        The largest NIS of a measurement that is used.
+
+    Returns
+    -------
+    One row for each exposure before that one.
     """
     (f0, f1), ((m00, m01), (m10, m11)) = model.mean_row[0].tolist(), model.quadratic[0].tolist()
     (a, b), (c, d) = model.transition.tolist()
@@ -126,7 +130,7 @@ def run(
             (x, v), (p, q, r), (z1, z2), ((f0, f1), (2 * half0, 2 * half1)), (noise, shared, rest),
             together=shared != 0.0,
         )  # fmt: skip
-        # The caller takes what is not a number, or too large, or gated, step by step, and says why.
+        # The caller takes an exposure that is gated or not finite step by step, and says why.
         if not (after[8] <= gate and math.isfinite(sum(after) + z1 + z2)):
             break
         x0, v0, p0, q0_, r0 = after[:5]
@@ -155,9 +159,9 @@ def unseen(
     Parameters
     ----------
     kicks:
-        What the inputs of each do to the state, (exposures, 2).
+        The state's response to the inputs of each exposure, (exposures, 2).
     settled:
-        Relative change of a covariance that is none; None if it is settled already.
+        Relative change below which the covariance has settled; None if it has settled already.
     """
     (a, b), (c, d) = model.transition.tolist()
     x, v = state.tolist()
@@ -182,7 +186,7 @@ _SQUARE = np.array([[0, 1], [1, 2]])
 
 
 def _weights(transition: FloatArray) -> tuple[Weights, Weights, Weights]:
-    """Shares of P's upper half in the upper half of A P A'."""
+    """Coefficients of P's upper half in the upper half of A P A'."""
     (a, b), (c, d) = transition.tolist()
     return (a * a, a * b + b * a, b * b), (c * a, c * b + d * a, d * b), (c * c, c * d + d * c, d * d)
 

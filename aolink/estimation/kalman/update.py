@@ -19,10 +19,18 @@ FloatArray = NDArray[np.float64]
 def joseph_update(
     prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None = None
 ) -> Update:
-    """The update of a Kalman filter in Joseph form.
+    """The update of a Kalman filter in Joseph form: Mishra & Wen (18) to (20), with the innovation y - h(x).
 
-    Mishra & Wen (18) to (20), with the innovation y - h(x). ``gain`` (n_states, n_measurements) stands in
-    for the optimal one; Joseph's form gives the covariance that it really has.
+    Parameters
+    ----------
+    innovation:
+        (axes, n_measurements)
+    H:
+        Jacobian of h, (axes or 1, n_measurements, n); also (n_measurements, n), the same for all axes.
+    R:
+        Covariance of the measurement, (axes or 1, n_measurements, n_measurements).
+    gain:
+        Used in the place of the optimal gain, (n, n_measurements): the covariance is that which it really gives.
     """
     R = batched.batch_last(R)
     PH = batched.matmul(prior.covariance, batched.transpose(H))
@@ -42,7 +50,7 @@ def blocked_update(
     """`joseph_update` for few states and many measurements, whose noise is shared within blocks only.
 
     With G = H' R^-1 H and M = (I + P G)^-1 P, the optimal gain is M H' R^-1 and S^-1 y = R^-1 (y - H K y): nothing
-    has more rows than there are states, and P may be singular. Of S there is the diagonal where it is large.
+    has more rows than there are states, and P may be singular. Where S is large, only its diagonal is computed.
 
     Parameters
     ----------
@@ -83,7 +91,7 @@ def blocked_update(
 def information_update(
     prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
 ) -> Update:
-    """`blocked_update` for many states, in information form; of the innovation covariance there is the diagonal."""
+    """`blocked_update` for many states, in information form; only the innovation covariance's diagonal is computed."""
     axes = len(innovation)
     gains = [None] * axes if gain is None else np.broadcast_to(gain, (axes, *gain.shape[-2:]))
     every = zip(prior.mean, prior.covariance, innovation, H, R, gains, strict=True)

@@ -11,10 +11,9 @@ of the slopes v that the plant does not make, in their standard deviations. It m
 and leaves the end state alone. What v does about its mean has no coefficient; it widens spots by its variance, and the
 standard deviation of a path contains it.
 
-The spot rests where theta(k) has it for the whole of a fast step, as the sum in Mishra & Wen (3) takes it. An exposure
-that starts a part f of a step late loses as much of its first step and gains as much of the one after its last:
-a mean over it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end state and path stay those
-of whole steps.
+The spot rests at theta(k) for the whole of fast step k, as in the sum of Mishra & Wen (12). An exposure that starts a
+part f of a step late loses that part of its first step and gains the same part of the one after its last: a mean over
+it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end state and path stay those of whole steps.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class InputResponse:
-    """What the inputs of one exposure do, and what the moments need of it."""
+    """The response of outputs and end state to the inputs of one exposure, and the means over it that moments need."""
 
     path: FloatArray
     """c, response of the outputs, (axes, n_outputs, n_steps)."""
@@ -51,7 +50,7 @@ class InputResponse:
     """s, mean of c squared, (axes, n_outputs)."""
 
     def of(self, some: slice) -> InputResponse:
-        """That of some of the axes."""
+        """The response of some of the axes."""
         return InputResponse(
             path=self.path[some], end=self.end[some], mean=self.mean[some], slope=self.slope[some],
             square=self.square[some],
@@ -114,9 +113,9 @@ class ExposureModel(ABC):
 
     @abstractmethod
     def responses(self, inputs: FloatArray) -> InputResponse:
-        """`response` of many exposures, (exposures, n_steps, axes * n_inputs), the axes of one after those of another.
+        """`response` for many exposures, inputs (exposures, n_steps, axes * n_inputs), in a fraction of the calls.
 
-        Each is to the same bits as alone, for a fraction of the calls.
+        The first axis has all axes of the first exposure, then of the second, with the same bits as for each alone.
         """
 
     @abstractmethod
@@ -132,7 +131,7 @@ class ExposureModel(ABC):
         """Standard deviation of the path, (axes, n_outputs, n_steps), from (axes, n_coefficients, n_coefficients)."""
 
     def starting(self, offset: float) -> Self:
-        """The same for exposures that start so far into their first fast step, in fast steps, 0 <= offset < 1."""
+        """The same for exposures that start ``offset`` of a fast step into their first one, 0 <= offset < 1."""
         if not 0 <= offset < 1:
             raise ValueError(f"an exposure starts from 0 to 1 fast step into its first one, not {offset:g}")
         _ = self.factors, self.end_rows  # made once, for all offsets
@@ -140,7 +139,7 @@ class ExposureModel(ABC):
         model.moved = offset / self.n_steps
         first, last = self.plant.C, self.last_rows
         model.mean_row = self.mean_row + model.moved * (last - first)
-        model.__dict__.pop("quadratic", None)  # it is another
+        model.__dict__.pop("quadratic", None)  # it depends on the offset
         return model
 
     @cached_property
@@ -160,7 +159,7 @@ class ExposureModel(ABC):
 
     @property
     def rows_after(self) -> FloatArray:
-        """What the coefficients make of the outputs in the step after the last, (n_outputs, n_coefficients)."""
+        """Basis of the outputs in the step after the last, (n_outputs, n_coefficients)."""
         rows = np.asarray(self.plant.C @ self.end_rows)
         n = self.plant.n_states
         rows[:, n : n + self.n_unmodelled] = self.unmodelled_sd * np.eye(len(rows), self.n_unmodelled)
@@ -188,7 +187,7 @@ class ExposureModel(ABC):
         return np.asarray((product + product.T) / 2)
 
     def cross_response(self, response: InputResponse, first: int, second: int) -> tuple[FloatArray, FloatArray]:
-        """What inputs add to the mean product of two outputs: slope (axes, n_states) and constant (axes,)."""
+        """Inputs add slope' x + constant to the mean product of two outputs: (axes, n_states) and (axes,)."""
         c, rows = response.path, self.state_rows
         both = c[:, first, None] * rows[second].T + c[:, second, None] * rows[first].T
         slope, product = batched.mean_over_path(both), batched.mean_over_path(c[:, first] * c[:, second])

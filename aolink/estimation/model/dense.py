@@ -16,7 +16,7 @@ from aolink.rig import Plant
 
 FloatArray = NDArray[np.float64]
 
-# Noise slower than this many half periods an exposure is modelled, per noise channel; fewer where fewer do.
+# Most cosines for each noise channel, of 0, 1, 2, ... half periods in an exposure; fewer where fewer do.
 _MOST_NOISE_MODES = 24
 # Share of the noise path (rms) that may be left out.
 _NOISE_LEFT_OUT = 0.02
@@ -29,8 +29,8 @@ class DenseModel(ExposureModel):
     def __init__(self, plant: Plant, n_steps: int) -> None:
         self._state_rows = output_rows(plant, n_steps)
         super().__init__(plant, n_steps, self._state_rows.mean(axis=1))
-        # Many outputs are sums of few states, unless each has a slope of its own: what is computed then are paths of
-        # the states.
+        # Where outputs are more than states, and each has no unmodelled slope of its own, they are sums of the states:
+        # paths of the states are computed then.
         few = plant.n_outputs > plant.n_states and not self.n_unmodelled
         self._few = replace(plant, C=np.eye(plant.n_states)) if few else plant
 
@@ -89,7 +89,7 @@ class DenseModel(ExposureModel):
         return np.concatenate(paths, axis=2), np.concatenate(ends, axis=1)
 
     def _squares(self, paths: FloatArray) -> FloatArray:
-        """What sums up to the sum of squares over outputs, from `_few` plant's paths, (., n_steps, n)."""
+        """Terms whose sum is the sum of squares over outputs, from paths of the `_few` plant, (., n_steps, n)."""
         if self._few is self.plant:
             return paths**2
         C = self.plant.C

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 
 
 def exposure_model(plant: Plant, n_steps: int, offset: float = 0.0) -> ExposureModel:
-    """The model of exposures of so many fast steps that start ``offset`` of a step into their first, made once."""
+    """The model of exposures of ``n_steps`` fast steps that start ``offset`` of a step into their first, made once."""
     return _made_once(plant, n_steps, float(offset))
 
 

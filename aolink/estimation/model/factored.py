@@ -1,15 +1,15 @@
 """The exposure model of a plant of many alike systems, such as a membrane's actuators, without its dense arrays.
 
 Column j of the basis is a pattern over the outputs times a course in time: path[o, k] = sum_j P[o, j] z[j] f[k, j].
-Start states have the pattern of their actuator and one of few courses, C_1 A_1^k. The noise of all actuators within
-the exposure is a Kronecker product of what the outputs make of the actuators and of what the fast steps make of an
-actuator's noise; the singular values of it are the products of theirs, and the largest are kept.
+Start states have the pattern of their actuator and one of few courses, C_1 A_1^k. The path of all actuators' noise is
+a Kronecker product of two matrices, actuators to outputs and an actuator's noise to its path; its singular values are
+the products of theirs, and the largest are kept.
 
-What is left out of the noise path is at most `NOISE_LEFT_OUT` of it, rms over outputs and steps, the patterns being
-orthogonal; what cosines leave out of it is counted in. It is added back: to the end covariance as a whole, to the
-path's variance for each output, spread over the steps. With 2 % instead of 5 % left out, half as many coefficients
-again, `profile` on the rig membrane-12x12 gets no better. The dense basis of 144 actuators, 200 outputs and 200 steps
-would take 0.6 GB, this takes 2 MB.
+At most `NOISE_LEFT_OUT` of the noise path is left out, rms over outputs and steps, the patterns being orthogonal; what
+the cosines leave out is included. It is added back: to the end covariance in full, to the variance of each output's
+path as a mean over the steps. With 2 % instead of 5 % left out and half as many coefficients again, `profile` on the
+rig membrane-12x12 gets no better. The dense basis of 144 actuators, 200 outputs and 200 steps would take 0.6 GB, this
+takes 2 MB.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ class NoiseFactors:
     ends: FloatArray
     """End states of the coefficients, (n_states, k)."""
     end_remainder: FloatArray
-    """Covariance of the end state that they leave out, (n_states, n_states)."""
+    """Covariance of the end state that the coefficients leave out, (n_states, n_states)."""
     left_out: FloatArray
-    """Variance of the path that they leave out, mean over the steps, slope units squared, (n_outputs,)."""
+    """Variance of the path that the coefficients leave out, mean over the steps, slope units squared, (n_outputs,)."""
 
 
 def noise_factors(systems: AlikeSystems, n_steps: int) -> NoiseFactors:
-    """Factors of which all but `NOISE_LEFT_OUT` of the noise path consists."""
+    """The largest factors of the noise path, which leave out at most `NOISE_LEFT_OUT` of it."""
     one, sd = systems.one, systems.noise_sd
     m = np.arange(min(_COSINES, n_steps))
     phase = np.pi * (np.arange(n_steps) + 0.5) / n_steps

@@ -1,12 +1,12 @@
 """All spots of one plant with hundreds of states, as a function of the coefficients of a factored model.
 
-A spot's pixels depend on its own two paths, and these, but for what inputs do, on few numbers each: the shares of the
-courses. So the Jacobian of its pixels is small, (pixels, 2 m), and what the frame tells of all coefficients,
-the information J' R^-1 J, is a sum over spots of small blocks between the rows of two patterns: nothing is as large
-as pixels times coefficients.
+A spot's pixels depend on its own two paths, and each path, apart from its response to the inputs, on the shares of m
+courses in it. So the Jacobian of its pixels is small, (pixels, 2 m), and the information J' R^-1 J that the frame has
+on all coefficients is a sum over spots of small blocks between the rows of two patterns: nothing is as large as pixels
+times coefficients.
 
-Of the noise coefficients, which come with the largest first, those are kept that move the spots by something that the
-kernel does not hide, as in `aolink.estimation.pixels.likelihood`; the rest widens the kernel.
+The noise coefficients are ordered, the largest first. Those are kept that move the spots visibly, given the width of
+the kernel, as in `aolink.estimation.pixels.likelihood`; the rest widens the kernel.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ _DRAWS = 4
 
 
 class JointPaths:
-    """Paths of all spots at nodes, of the first ``size`` coefficients.
+    """Paths of all spots at quadrature nodes, from the first ``size`` coefficients.
 
     Parameters
     ----------
     sensor:
-        Says how finely the path is to be known.
+        Its kernel, pixels and noise set the number of nodes and of coefficients.
     """
 
     def __init__(self, model: FactoredModel, sensor: SpotSensor) -> None:
@@ -56,7 +56,7 @@ class JointPaths:
         self.widening = float(rest[kept]) / model.plant.n_outputs + model.unmodelled_rest
         """Mean variance of the path that is left out, which the kernel is to be widened by."""
         self.size = n + kept
-        """Coefficients."""
+        """Number of coefficients."""
         course_of = model.course_of[: self.size]
         used = int(course_of.max()) + 1
         self.order = np.argsort(course_of, kind="stable")
@@ -79,7 +79,7 @@ class JointPaths:
         """The response to the inputs, (n_outputs, nodes)."""
 
     def _resolution(self, variance: float, sensor: SpotSensor) -> Resolution:
-        """The same whenever in a step an exposure starts."""
+        """How many nodes there are; the same whenever in a step an exposure starts."""
         if not self.model.moved:
             return resolution(self._unseen(), variance, sensor.profile)
         model = exposure_model(self.model.plant, self.model.n_steps)
@@ -87,7 +87,7 @@ class JointPaths:
         return joint_paths(model, sensor).resolution
 
     def _unseen(self) -> FloatArray:
-        """Paths of the outputs of a plant without a camera, (paths, n_steps)."""
+        """Random paths of the outputs by the plant's prior, (paths, n_steps)."""
         z = np.random.default_rng(0).standard_normal((_DRAWS, self.size))
         n = self.model.plant.n_states
         z[:, :n] = z[:, :n] @ psd_root(self.model.plant.initial_covariance).T
@@ -98,12 +98,12 @@ class JointPaths:
         functions, weights, moved = np.ascontiguousarray(q.at(self._functions.T).T), q.weights, self.model.moved
         if not moved:
             return functions, weights
-        # So much of the first step is not in the exposure, but in the step after its last.
+        # This share of the exposure is not in its first step but in the one after its last.
         after = self.model.after[: functions.shape[1]]
         return np.vstack([functions, self._functions[0], after]), np.append(weights, [-moved, moved])
 
     def foreseen(self, mean: FloatArray, response: InputResponse, axis: int) -> JointPaths:
-        """The same with what the inputs of an exposure do, as fine as paths about this mean ask for.
+        """The same with the response to an exposure's inputs, and as many nodes as a path about this mean needs.
 
         Parameters
         ----------
@@ -208,7 +208,7 @@ class JointPaths:
 
 @lru_cache(maxsize=1)
 def compiled_loops() -> ModuleType:
-    """Loaded when a plant of many alike systems is there: Numba alone takes half a second."""
+    """The compiled loops, loaded at the first plant of many alike systems: Numba alone takes half a second."""
     from aolink.estimation.compiled import joint
 
     return joint

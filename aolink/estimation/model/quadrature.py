@@ -4,8 +4,8 @@ Blur is a mean over the steps, and paths are smooth: so it is a mean over few no
 little, the nodes are those of Gauss's quadrature for a sum over equal steps, exact for polynomials in time of degree
 2 n - 1 (zeros of Gram's polynomials: Golub & Welsch, Calculation of Gauss quadrature rules, Math. Comp. 23 (1969));
 between two steps the path is a straight line. For a spot that goes back and forth, the nodes are means over equal
-blocks of steps. There are so many nodes that the light of paths like the plant's is right to a share of the camera's
-noise; and more for an axis whose path is expected to go further from one node to the next than a spot is wide.
+blocks of steps. There are enough nodes for the light of the plant's typical paths to be right to a share of the
+camera's noise; and more for an axis whose predicted path moves further between two nodes than a spot is wide.
 """
 
 from __future__ import annotations
@@ -25,29 +25,30 @@ from aolink.optics.sensor import Sensor
 
 FloatArray = NDArray[np.float64]
 
-# The light of a path at the nodes differs from that at all steps by so many standard deviations of noise, rms.
+# Largest rms difference between the light of a path at the nodes and at all steps, in standard deviations of noise.
 _WRONG = 0.05
 _LEAST = 3
-# More than these bring the path no nearer to what all steps say, of a spot that swings by ten widths of the kernel.
+# For a spot that swings by ten widths of the kernel, more nodes than these bring the path no nearer to that of all
+# steps.
 _MOST = 100
 # Paths whose light is seen in the mean by less than this say nothing of how many there should be.
 _LEAST_LIGHT = 0.01
-# From node to node a path that is foreseen goes no further than so many standard deviations of kernel and pixel: a mean
-# over Gaussians at such distances has hardly any ripple, exp(-2 pi^2 / 1.2^2).
+# Longest way of the predicted path from node to node, in standard deviations of kernel and pixel: a mean over Gaussians
+# at such distances has hardly any ripple, exp(-2 pi^2 / 1.2^2).
 _STRIDE = 1.2
 
 
 @dataclass(frozen=True, eq=False)
 class QuadratureRule:
-    """What the nodes are of the steps, and what each counts."""
+    """Nodes in time as means over fast steps, and their weights."""
 
     rows: FloatArray
-    """(nodes, n_steps)"""
+    """Weights of the steps in each node, (nodes, n_steps)."""
     weights: FloatArray
     """(nodes,), one in sum."""
 
     def at(self, steps: FloatArray) -> FloatArray:
-        """At the nodes, what is known at all steps, along the last axis."""
+        """Values at the nodes from values at all steps, along the last axis."""
         return batched.long_matmul(steps.reshape(-1, 1, steps.shape[-1]), self.rows.T).reshape(*steps.shape[:-1], -1)
 
 
@@ -64,7 +65,7 @@ def blocks(n_steps: int, most: int) -> QuadratureRule:
 
 @lru_cache(maxsize=64)
 def gauss(n_steps: int, count: int) -> QuadratureRule:
-    """Gauss's, of fewer nodes than steps."""
+    """Gauss's quadrature for a sum over equal steps, with ``count`` nodes, fewer than steps."""
     k = np.arange(1, count)
     beside = np.sqrt(k**2 * (n_steps**2 - k**2) / (4 * (4 * k**2 - 1.0)))
     values, vectors = np.linalg.eigh(np.diag(beside, 1) + np.diag(beside, -1))
@@ -100,7 +101,7 @@ def quadrature_paths(model: ExposureModel, response: InputResponse, q: Quadratur
     basis, weights = np.ascontiguousarray(q.at(model.basis.swapaxes(1, 2)).swapaxes(1, 2)), q.weights
     inputs = q.at(response.path)
     if model.moved:
-        # So much of the first step is not in the exposure, but in the step after its last.
+        # This share of the exposure is not in its first step but in the one after its last.
         ends = (model.basis[:, 0], model.rows_after)
         late = (response.path[:, :, 0], model.last_response(response.end))
         basis = np.concatenate([basis, np.stack(ends, axis=1)], axis=1)
@@ -111,15 +112,15 @@ def quadrature_paths(model: ExposureModel, response: InputResponse, q: Quadratur
 
 @dataclass(frozen=True, eq=False)
 class Resolution:
-    """How finely the time of an exposure is to be resolved: the coarser, the less a path moves."""
+    """Quadrature rules for an exposure, and which of them a path needs: the more it moves, the more nodes."""
 
     levels: tuple[QuadratureRule, ...]
-    """From what does for paths about rest to all steps."""
+    """From the rule for typical paths of the plant at rest up to all steps."""
     stride: float
-    """How far a path may go from node to node, slope units."""
+    """Longest way of a path from node to node, slope units."""
 
     def of(self, path: FloatArray) -> NDArray[np.intp]:
-        """The level of each axis by the path that is foreseen, (axes, n_outputs, n_steps) -> (axes,)."""
+        """The level of each axis for its predicted path, (axes, n_outputs, n_steps) -> (axes,)."""
         level = np.zeros(len(path), dtype=np.intp)
         far = np.arange(len(path))
         for k, q in enumerate(self.levels[:-1]):
@@ -137,12 +138,12 @@ def all_steps(n_steps: int) -> Resolution:
 
 
 def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution:
-    """The coarsest that shows a spot's light as right as the noise of the pixels asks for.
+    """The coarsest resolution whose error in a spot's light stays below a share of the pixels' noise.
 
     Parameters
     ----------
     paths:
-        Like the plant's about rest, of one spot each, (paths, n_steps).
+        Typical paths of the plant at rest, of one spot each, (paths, n_steps).
     variance:
         Variance of the kernel, slope units squared.
     sensor:

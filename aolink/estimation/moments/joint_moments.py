@@ -1,10 +1,10 @@
 """Windowed moments of all spots of one large plant, in information form.
 
-Each spot by itself is what `WindowedSpots` makes of one spot; its coefficients are the courses' shares of its two
-paths. What its sums tell of these is summed over spots (`JointPaths.information`). What a regression leaves out is
-taken as each spot's own: spots that move alike have errors alike, which the dense form knows and this does not, for it
-would take seconds a frame. Where that can be afforded, 36 actuators before 16 lenslets, it makes no difference to be
-seen: path RMSE 0.119 here and 0.121 there, NEES 73 and 74 for 72 states.
+Each spot by itself is treated as by `WindowedSpots`, with the courses' shares of its two paths as coefficients. The
+information on these is summed over spots (`JointPaths.information`). The remainders of the spots' regressions are taken
+as independent: spots that move alike have errors alike, which the dense form includes and this one does not, since it
+would take seconds a frame. Where the dense form is affordable, 36 actuators before 16 lenslets, there is no difference:
+path RMSE 0.119 here and 0.121 there, NEES 73 and 74 for 72 states.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class JointMoments:
     Parameters
     ----------
     orders, basis, flux:
-        As of `WindowedSpots`.
+        As in `WindowedSpots`.
     """
 
     needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
@@ -70,7 +70,7 @@ class JointMoments:
     def corrected(
         self, model: FactoredModel, paths: JointPaths, prior: Gaussian, windows: SpotWindows
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """The update of one copy, with a prior of the coefficients' mean and of the state's covariance.
+        """The update of one copy; the prior has the mean of all coefficients and the covariance of the state alone.
 
         Returns
         -------
@@ -79,7 +79,7 @@ class JointMoments:
         nodes = paths.of_one_spot()
         precision = paths.prior_information(prior.covariance)
         wide = paths.prior_covariance(prior.covariance)
-        # The frames hardly show some of hundreds of states, whose errors last as long as the plant remembers.
+        # Frames say hardly anything about some of hundreds of states, whose errors last as long as the plant remembers.
         memory = error_memory(slowest(model.transition_of_one[None]))[0]
         t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
         spread = first = paths.spread_of_spots(wide)
@@ -96,7 +96,7 @@ class JointMoments:
             t = prior.mean + single_thread.matvec(P, score)
             if to_come:
                 spread = paths.spread_of_spots(P)
-        # The spread to expect of this one innovation is without the memory.
+        # The covariance of this one innovation is without the memory.
         own = noise + fit.remainder
         H, score = _told(paths, fit, own, new)
         weighted = np.linalg.solve(own, new[..., None])[..., 0]
@@ -108,13 +108,13 @@ class JointMoments:
 
 
 def by_spot(measured: SpotWindows, axis: int) -> SpotWindows:
-    """One copy's spots as if they were copies of a plant with one spot each."""
+    """The spots of one copy of the plant, as if each were a copy of its own."""
     light = None if measured.light is None else measured.light[axis, :, None]
     return SpotWindows(density=measured.density[axis, :, None], mask=measured.mask[axis, :, None], light=light)
 
 
 def _told(paths: JointPaths, fit: Regression, R: FloatArray, new: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What the sums of all spots tell of the coefficients: information and score."""
+    """Information and score of the coefficients from the sums of all spots."""
     weighted = np.linalg.solve(R, np.concatenate([fit.slope, new[..., None]], axis=2))
     told = batched.transpose(fit.slope) @ weighted
     shape = (len(told), 2, len(paths.groups))

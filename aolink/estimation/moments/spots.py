@@ -28,7 +28,7 @@ from aolink.optics.sensor import SpotSensor
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# Each two of them meet, in two directions of each two spots: fewer than of a line sensor's one path.
+# Covariances are between every two nodes, directions and spots: so there are fewer nodes than for a line sensor.
 _MOST_NODES = 40
 # Terms of Mehler's series: what the fifth adds is in the rounding unless the two directions are one.
 _TERMS = 5
@@ -49,7 +49,7 @@ class WindowedSpots(Windowed[SpotWindows]):
     crosses:
         Whether the product of both directions' first functions belongs to the sums, y_11.
     basis, flux:
-        As of `Windowed`.
+        As in `Windowed`.
     """
 
     most_nodes = _MOST_NODES
@@ -113,7 +113,7 @@ class WindowedSpots(Windowed[SpotWindows]):
     def expectations(
         self, along: FloatArray, across: FloatArray, mean: FloatArray, own: FloatArray
     ) -> list[FloatArray]:
-        """Expectations of the sums and of their derivatives by where the spot is, under the prior.
+        """Expectations of the sums and of their derivatives by the spot's position, under the prior.
 
         Parameters
         ----------
@@ -159,7 +159,7 @@ class WindowedSpots(Windowed[SpotWindows]):
         weights:
             Weights of the nodes, (nodes,).
         widening:
-            Variance of the path about its nodes that no coefficient has.
+            Variance of the path about its nodes that no coefficient covers, slope units squared.
         """
         axes, spots = mean.shape[:2]
         own = np.einsum("askdske->askde", spread)
@@ -198,7 +198,7 @@ class WindowedSpots(Windowed[SpotWindows]):
 
 
 def _meetings(C: FloatArray, order: int) -> FloatArray:
-    """Mehler between two spots at each two nodes: how the n-th derivatives of the one meet those of the other.
+    """Terms of Mehler's series between two spots at every two nodes: weights of products of their n-th derivatives.
 
     Cov(f, f') has, for each n, the sum over all ways to pair n derivatives by x or y of f with n of f', of the
     product of the pairs' covariances, over n!.

@@ -1,4 +1,4 @@
-"""Moments in a window about the spot, with what noise and motion inside the exposure do to them.
+"""Moments in a window about the spot, used by iterated statistical linearisation.
 
 A moment, in any basis and with any window or mask, is a weighted sum of pixels, y = sum_i W_i Y_i D. A
 spot resting at theta makes g(theta) = sum_i W_i (kernel integrated over pixel i) of it, so that
@@ -52,12 +52,12 @@ _MOST_NODES = 100
 _MOST_MEMORY = 1e3
 # Axes together: more of them do not fit into the processor's cache.
 _AT_ONCE = 8
-# NIS of a ratio to light that is lost in its noise.
+# NIS of moments that are divided by a light that its noise hides: they are gated.
 NOT_BELIEVED = 1e12
 
 
 class Seen(Protocol):
-    """What an exposure shows of each axis; its parts can be taken."""
+    """The data of all axes of an exposure, of which a part can be taken."""
 
     def part(self: Self, axes: slice) -> Self:
         """The part of these axes."""
@@ -92,7 +92,7 @@ class Windowed(ABC, Generic[Data]):
     lights:
         Which of the sums are the light in a window.
     light_of:
-        The light that belongs to each sum, (sums,).
+        Index of the light that each sum is divided by, (sums,).
     """
 
     models_noise = True
@@ -129,7 +129,7 @@ class Windowed(ABC, Generic[Data]):
             about = done.posterior
             if to_come:
                 memory = error_memory(np.sqrt(rho * slowest(_closed_loop(model, prior, fit.slope, R))))
-        # The spread to expect of this one innovation is without the memory.
+        # The covariance of this one innovation is without the memory.
         HP = batched.matmul(fit.slope, prior.covariance)
         S = batched.symmetric(batched.matmul(HP, batched.transpose(fit.slope)) + noise + fit.remainder)
         nis = batched.dot(innovation, batched.matvec(batched.inverse(S), innovation))
@@ -206,7 +206,7 @@ class WindowedMoments(Windowed[Profile]):
     orders:
         Which functions of the basis; 0 is the light in the window.
     basis, flux:
-        As of `Windowed`.
+        As in `Windowed`.
     """
 
     def __init__(
@@ -250,7 +250,7 @@ class WindowedMoments(Windowed[Profile]):
         basis, weights:
             Rows of the exposure basis at the nodes, (nodes, n_coefficients), and the nodes' weights, (nodes,).
         widening:
-            Variance of the path about its nodes that no coefficient has.
+            Variance of the path about its nodes that no coefficient covers, slope units squared.
         """
         variance = np.maximum(np.einsum("akk->ak", spread), 0.0)
         if widening:
@@ -285,7 +285,7 @@ def weighted_sums(
     density:
         (..., pixels), zero where a pixel cannot be used; its weights are zero as well.
     light:
-        Light of the spot, of a whole one, that the density was divided by, (...); one where None.
+        Light of the spot, as a share of a whole one's, that the density was divided by, (...); one where None.
 
     Returns
     -------
@@ -300,7 +300,7 @@ def weighted_sums(
     if light is not None:
         variance /= light[..., None] ** 2
     noise = batched.matmul(W * variance[..., None, :], batched.transpose(W))
-    # Where a window has too few pixels for its functions, their sums hang together.
+    # Where a window has fewer pixels than functions, their sums are linearly dependent.
     noise += 1e-12 * np.eye(W.shape[-2]) * noise.max(axis=(-2, -1), keepdims=True)
     return y, noise
 
@@ -332,14 +332,14 @@ def _arrays(correction: Update) -> tuple[FloatArray, ...]:
 
 
 def slowest(transition: FloatArray) -> FloatArray:
-    """Modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
+    """Spectral radius: the modulus of the largest eigenvalue, (axes, n, n) -> (axes,)."""
     finite = np.isfinite(transition).all(axis=(1, 2), keepdims=True)
     # What is not finite is refused by the filter; here it must only not stop the others.
     return np.asarray(np.abs(np.linalg.eigvals(np.where(finite, transition, 0.0))).max(axis=1))
 
 
 def error_memory(rho: FloatArray) -> FloatArray:
-    """Variance of a mean of errors with this correlation from frame to frame, over that of independent ones."""
+    """(1 + rho) / (1 - rho), bounded: variance of a mean of errors correlated by rho, over that of independent ones."""
     return np.asarray(np.minimum(_MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
 
 

@@ -1,8 +1,7 @@
-"""The recursion from exposure to exposure for posteriors that are not Gaussian: a mixture is carried, not one Gaussian.
+"""A Gaussian-sum filter: the recursion from exposure to exposure carries a Gaussian mixture.
 
-Timing, trust and words are those of `BlurFilter`: an exposure corrects the state at its start, a measurement that
-cannot be believed leaves the prediction, after several of them the filter starts again from what the plant would be
-without a camera.
+Timing, gate and status are those of `BlurFilter`: an exposure corrects the state at its start, a gated measurement
+leaves the prediction, and after several of them the filter starts again from the prediction without any measurement.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _PATIENCE = 3
-# Times the plant's own uncertainty.
+# Largest variance of the prediction without measurements, relative to that of the plant's prior and noise.
 _WIDEST = 1e6
 # Chunks of axes: what NumPy computes for them together fits into the cache; compiled code has fewer calls to pay for.
 _AT_ONCE = 32
@@ -43,7 +42,7 @@ _AT_ONCE_COMPILED = 450
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """What is new in the pixels, in the directions in which the prior lets them move most."""
+    """Innovation of the pixels, in the directions in which the prior lets them vary most."""
 
     value: FloatArray
     """(axes, k)"""
@@ -52,20 +51,20 @@ class Innovation:
     nis: FloatArray
     """(axes,)"""
     believed: BoolArray
-    """Whether pixels and prior together have a chi-square that can be, (axes,)."""
+    """Whether the chi-square of pixels and prior together passes the gate, (axes,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureUpdate:
-    """What a frame made of a prior."""
+    """The posterior after a frame."""
 
     coefficients: Gaussian
     """The posterior of the reduced coefficients t."""
     end: GaussianMixture
-    """The posterior of the state at the exposure's end, without what inputs do."""
+    """The posterior of the state at the exposure's end, without the response to the inputs."""
     innovation: Innovation
     several: BoolArray
-    """Whether it saw more than one reading of the blur, (axes,)."""
+    """Whether the posterior has several modes (the blur has more than one reading), (axes,)."""
 
 
 class MixtureUpdater(Protocol):
@@ -77,7 +76,7 @@ class MixtureUpdater(Protocol):
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
         """The posterior of axes with a prior of their start states, in the exposure of this number.
 
-        ``unseen`` is what the start states would be without a camera.
+        ``unseen`` is the prediction of the start states without any measurement.
         """
 
 
@@ -87,9 +86,9 @@ class MixtureFilter(Filter):
     Parameters
     ----------
     updater:
-        How a frame corrects it.
+        Updates it with a frame.
     gate:
-        Whether frames that cannot be believed are left out.
+        Whether frames that are too far from their prediction are left out.
     """
 
     def __init__(self, plant: Plant, sensor: BaseSensor, updater: MixtureUpdater, *, gate: bool = True) -> None:
@@ -101,13 +100,13 @@ class MixtureFilter(Filter):
                 np.broadcast_to(plant.initial_covariance, (axes, n, n)).copy(),
             )
         )
-        # The same without what the camera said.
+        # The prediction without any measurement.
         self._unseen = self.prior.gaussian
         self._missed = np.zeros(axes, dtype=np.int64)
         self._number = 0
 
     def warm_up(self, updater: MixtureUpdater) -> None:
-        """Have an exposure of one axis updated by these: what they compile, a session need not wait for."""
+        """Update one axis with a dark exposure, so that what this compiles is compiled before the session."""
         one = slice(0, 1)
         twice = joined(self.prior.part(one), self.prior.part(one))
         n = self.plant.n_states
@@ -134,7 +133,7 @@ class MixtureFilter(Filter):
             self._unseen = self._unwatched(transition, noise, kick)
 
     def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
-        """The next of `_unseen`; that of an unstable plant stays where it is so wide that it says nothing."""
+        """The prediction of `_unseen`; on an unstable plant it stops where it is so wide that it says nothing."""
         now, later = self._unseen, predict(self._unseen, transition, noise, kick)
         widest = _WIDEST * (np.trace(self.plant.initial_covariance) + np.trace(noise))
         grows = np.isfinite(later.mean).all(axis=1) & (np.einsum("aii->a", later.covariance) <= widest)
@@ -155,7 +154,7 @@ class MixtureFilter(Filter):
         took = np.zeros(0, dtype=np.intp)
         if measured is not None:
             usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
-            # Each axis is looked at as finely as its own path asks for, whatever is beside it.
+            # Each axis gets the nodes that its own path needs, whatever the other axes need.
             level = reduced.resolution.of(model.path(prior.gaussian.mean, response.path))
             views, parts = {}, []
             for k in np.unique(level[usable]).tolist():

@@ -1,4 +1,4 @@
-"""Mixtures of Gaussians, many at once: the batch axis first, the components second."""
+"""Gaussian mixtures, one for each axis: the batch axis first, the components second."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class GaussianMixture:
         return out
 
     def mapped(self, rows: FloatArray, remainder: FloatArray) -> GaussianMixture:
-        """Of M t + e instead of t, M being ``rows`` (m, n) and the independent e's covariance ``remainder`` (m, m)."""
+        """The mixture of M t + e: M is ``rows`` (m, n), e independent of t with covariance ``remainder`` (m, m)."""
         (axes, count, _), m = self.mean.shape, len(rows)
         out = GaussianMixture(self.log_weight, np.zeros((axes, count, m)), np.zeros((axes, count, m, m)))
         compiled_mixtures.mapped(
@@ -53,7 +53,7 @@ class GaussianMixture:
         return out
 
     def log_density(self, points: FloatArray) -> FloatArray:
-        """At points (axes, points, n), (axes, points)."""
+        """Log-density of the mixture, (axes, points, n) -> (axes, points)."""
         return log_sum(self.component_log_densities(points), axis=1)
 
     def component_log_densities(self, points: FloatArray) -> FloatArray:
@@ -68,7 +68,7 @@ class GaussianMixture:
 
     @property
     def contiguous(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Its arrays as compiled code takes them."""
+        """Log-weights, means and covariances, each contiguous in memory, as compiled code takes them."""
         return (
             np.ascontiguousarray(self.log_weight),
             np.ascontiguousarray(self.mean),
@@ -78,16 +78,16 @@ class GaussianMixture:
     def reduced(self, most: int, free: float = 0.0) -> GaussianMixture:
         """The same with ``most`` components, or fewer if mergers cost less than ``free``.
 
-        Those two are merged, again and again, whose merger costs least. The cost is Runnalls' bound on the
-        Kullback-Leibler divergence; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to
-        Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
+        Again and again, the two components are merged that cost least. The cost is Runnalls' bound on the
+        Kullback-Leibler divergence, in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach
+        to Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
         """
         merged = GaussianMixture(self.log_weight.copy(), self.mean.copy(), self.covariance.copy())
         compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
     def with_components(self, count: int) -> GaussianMixture:
-        """The same with components that are not there after its own."""
+        """The same with ``count`` components, those after its own of weight zero."""
         more = count - self.mean.shape[1]
         if more <= 0:
             return self
@@ -107,7 +107,7 @@ class GaussianMixture:
         return out
 
     def ordered(self, most: int | None = None) -> GaussianMixture:
-        """The heaviest components first, without columns of which none is there."""
+        """The same with the heaviest components first, and without columns in which all weights are zero."""
         order = np.argsort(-self.log_weight, axis=1, kind="stable")[:, :most]
         rows = np.arange(len(order))[:, None]
         kept = self.log_weight[rows, order]
@@ -153,13 +153,13 @@ def log_sum(values: FloatArray, axis: int) -> FloatArray:
     top = np.maximum.reduce(values, axis=axis, keepdims=True)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
-        # One after the other, so that what is not there does not change a bit.
+        # One after the other, so that terms of weight zero change no bit.
         total = np.take(np.add.accumulate(np.exp(values - top), axis=axis), -1, axis=axis)
         return np.asarray(np.log(total) + np.squeeze(top, axis=axis))
 
 
 def cholesky(covariance: FloatArray) -> FloatArray:
-    """A root, lower triangular, of what may be singular."""
+    """Lower triangular root of covariances (..., n, n) that may be singular."""
     diagonal = np.einsum("...ii->...i", covariance)
     largest = np.maximum.reduce(diagonal, axis=-1, keepdims=True)
     lifted = covariance + (_JITTER * diagonal + 1e-14 * largest + 1e-300)[..., None] * np.eye(covariance.shape[-1])

@@ -1,12 +1,14 @@
-"""Points drawn from a mixture of Gaussians, weighted by the posterior over the density that they were drawn from.
+"""Adaptive multiple importance sampling: points drawn from a Gaussian mixture, weighted by posterior over proposal.
 
-After a round the mixture is fitted to the weighted points, and the next round is drawn from that, until enough points
-count: a mode where none was looked for is found by the few points that fall there. The points of all rounds are
-weighted against all densities together (Veach's balance heuristic; in this use Cornuet et al., Adaptive multiple
-importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random and the same for every axis and frame.
+After a round the mixture is fitted to the weighted points (one EM step), and the next round is drawn from that, until
+the effective sample size is enough: a mode that no search started near is found by the few points that fall there. The
+points of all rounds are weighted against all their densities together (Veach's balance heuristic; in this use Cornuet
+et al., Adaptive multiple importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random (Sobol) and the
+same for every axis and frame.
 
-Some posteriors no such mixture comes near: of a spot that hardly moves, seen through little noise, the blur fixes the
-sum of many squares, and the posterior is a shell. There points are tempered (`aolink.estimation.pixels.tempering`).
+No such mixture comes near some posteriors: where a spot hardly moves and there is little noise, the blur fixes the sum
+of many squares, and the posterior is a shell. There tempered sequential Monte Carlo draws the points
+(`aolink.estimation.pixels.tempering`).
 """
 
 from __future__ import annotations
@@ -36,34 +38,34 @@ from aolink.numerics import batched
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-# Rounds at most, where fewer points than these count.
+# Most rounds, and the effective sample size that is enough.
 _ROUNDS = 4
 _ENOUGH = 100.0
-# If it is fewer still, so many are tempered, and their end states described by so many Gaussians.
+# If it is not reached: number of tempered points, and of the components that are fitted to their end states.
 _TEMPERED = 600
 _COMPONENTS = 6
-# Points that count at least when a mixture is fitted, weights being flattened if fewer do: a fit to a handful of points
-# is too sure. And steps of the search for the power.
+# Least effective sample size when a mixture is fitted; weights are raised to a power below one to reach it, since a fit
+# to a handful of points is too sure. And steps of the search for that power.
 _LEAST_EFFECTIVE = 128.0
 _HALVINGS = 6
-# Points of a round for each pair of coefficients; as many as the next power of two. For one or two coefficients that
-# would be fewer than are to count.
+# Points of a round for each pair of coefficients, rounded up to a power of two. For one or two coefficients that would
+# be too few.
 _POINTS = 14
 _FEWEST_POINTS = 128
 _MOST_POINTS = 2048
-# Share of the points that come from the wide Gaussians.
+# Share of the points that are drawn from the wide Gaussians.
 _WIDE = 0.3
-# Modes are flattened by this much: tails that are too thin cost more than ones that are too thick. And of how much
-# better one is than another so much is believed, in logarithms, for Laplace's evidence of what is bent is rough.
+# The modes' covariances are multiplied by this: tails that are too thin cost more than ones that are too thick. And
+# their log-evidence by this: Laplace's evidence of a mode that is bent is rough.
 _INFLATION = 1.5
 _EVIDENCE = 0.5
-# A component's covariance counts as so many points for each coefficient beside those that it is fitted to. From round
-# to round few, so that it finds its place soon; at last many, and those of a mixture that was fitted already as so much
-# wider: a covariance of few points is too narrow, and all that comes after it too sure.
+# In a fit, a component's old covariance counts as this many points for each coefficient. Between rounds few, so that a
+# component soon finds its place; in the last fit more, with old covariances that a fit has made widened by the third
+# number: a covariance of few points is too narrow, and all later estimates would be too sure.
 _PRIOR_POINTS = 2.0
 _LAST_PRIOR_POINTS = 3.0
 _LOOSENED = 2.0
-# A component of less than this share is not drawn from any more.
+# A component of less than this weight is dropped.
 _NEGLIGIBLE = 1e-3
 
 
@@ -82,10 +84,10 @@ def posterior(
     view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, number: int, believed: BoolArray, share: float,
     several: BoolArray,
 ) -> GaussianMixture:  # fmt: skip
-    """The posterior of t in the exposure of this number as the mixture that fits it.
+    """A mixture that fits the posterior of t in the exposure of this number.
 
-    Each round has this ``share`` of the usual number of points, and so many are to count, but for axes with ``several``
-    modes. Axes that are not ``believed`` are not worth tempering.
+    Each round has this ``share`` of the usual number of points. The effective sample size to reach is the same share of
+    the usual one, except on axes with ``several`` modes, which need all of it. Only ``believed`` axes are tempered.
     """
     fit, effective = importance_corrected(view, prior, proposal, share, np.where(several, _ENOUGH, share * _ENOUGH))
     few = np.flatnonzero(believed & ~(effective >= share * _ENOUGH))
@@ -104,7 +106,7 @@ def posterior(
 def importance_corrected(
     view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float, enough: FloatArray
 ) -> tuple[GaussianMixture, FloatArray]:
-    """The mixture that fits weighted points, and how many of them count, (axes,): ``enough``, if so many do."""
+    """A mixture fitted to weighted points, and their effective sample size, (axes,), which is to reach ``enough``."""
     n = view.reduced.size
     points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
     if (line := view.line) is not None:
@@ -151,7 +153,7 @@ def _where(which: NDArray[np.bool_], first: GaussianMixture, second: GaussianMix
 
 
 def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Weights raised to the largest power up to one at which so many points, or half of all, count."""
+    """Weights raised to the largest power up to one at which the effective sample size is ``least``, or half of all."""
     least = min(least, log_weight.shape[1] / 2)
     low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
     power = high
@@ -189,7 +191,7 @@ def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArr
 def _refitted(
     mixture: GaussianMixture, points: FloatArray, log_weight: FloatArray, beside: GaussianMixture, prior_points: float
 ) -> GaussianMixture:
-    """One step of expectation and maximisation with weighted points, and the covariances of ``beside`` as some more."""
+    """One EM step with weighted points; the covariances of ``beside`` count as ``prior_points`` more."""
     logs = mixture.component_log_densities(points)
     share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
     mass = np.add.reduce(share, axis=2)

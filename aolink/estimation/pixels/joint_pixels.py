@@ -4,17 +4,16 @@ As `aolink.estimation.pixels.modes`, but for hundreds of coefficients and in inf
 (t - m)' P^-1 (t - m) / 2 minus the pixels' log-likelihood, Fisher's information in the place of the Hessian. At the
 mode its inverse is the covariance.
 
-It starts from where the prior has it, and from nowhere else. A spot by itself does not tell its path from its
-reversal; spots that one membrane moves do, once the states are known a little: on the rig membrane-12x12 paths run
-backwards or mirrored and backwards were worse by 200 and more (in log posterior) in every exposure but the first, and a
-start from the truth found nothing better in nine of ten. Where the prior leaves paths uncertain by more than two fifths
-of what a spot is wide there are many modes, and one of them says little: there, as in the first exposures of a
-recording, windowed moments of all spots (`JointMoments`) are taken instead, whose covariance says what they cannot
-tell apart.
+The search starts at the prior's mean only. One spot does not distinguish a path from its reversal; the spots that one
+membrane moves do, once the states are roughly known: on the rig membrane-12x12, reversed paths, mirrored or not, were
+worse by 200 and more (in log posterior) in every exposure but the first, and a start from the truth found nothing
+better in nine of ten. Where the prior's standard deviation of paths is more than two fifths of the kernel's there are
+many modes, and one of them says little: there, as in the first exposures of a recording, windowed moments of all spots
+(`JointMoments`) are taken instead, whose covariance includes what the blur leaves ambiguous.
 
 36 actuators before 16 lenslets are few enough for the dense `profile` with all its starts: path RMSE 0.090 there, 0.088
-here, 3 s and 20 ms a frame. The covariance at a mode is a little small: NEES of the start state 330 for 288 states, of
-the end state 285, and no better with more coefficients or nodes.
+here; 3 s a frame there, 20 ms here. The covariance at a mode is a little small: NEES of the start state 330 for 288
+states, of the end state 285, and no better with more coefficients or nodes.
 """
 
 from __future__ import annotations
@@ -49,12 +48,12 @@ _NO_LIGHT = 1e-9
 
 
 class JointPixels:
-    """What the pixels of one frame say of the coefficients of all spots together.
+    """The pixels of one frame as a function of the coefficients of all spots together.
 
     Parameters
     ----------
     density, mask, light:
-        Data of one copy of the plant: (spots, rows, columns) twice, and (spots,) or None, as of `SpotWindows`.
+        Data of one copy of the plant: (spots, rows, columns) twice, and (spots,) or None, as in `SpotWindows`.
     """
 
     def __init__(
@@ -78,7 +77,7 @@ class JointPixels:
         return float(np.linalg.eigvalsh(self._kernel)[0])
 
     def at(self, t: FloatArray) -> Linearised:
-        """All that is known of the neighbourhood of a point."""
+        """Log-likelihood, score and information at a point (size,)."""
         path, highest = self.paths.positions(t), len(self._terms)
         X, Y = (np.stack(pixel_masses(self._kernel[d, d], self._edges, path[:, d], highest)) for d in (0, 1))
         # A displacement is one more course.
@@ -120,7 +119,7 @@ class Linearised:
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """Where the posterior is largest."""
+    """A mode of the posterior."""
 
     t: FloatArray
     """(size,)"""
@@ -136,7 +135,7 @@ class Mode:
 def find_mode(
     view: JointPixels, mean: FloatArray, precision: FloatArray, start: FloatArray, passes: int = _PASSES
 ) -> Mode:
-    """Where a start leads, for a prior with this mean and information."""
+    """The mode that a start leads to, for a prior with this mean and precision, by Levenberg and Marquardt's method."""
     paths = view.paths
 
     def at(t: FloatArray, _: Indices) -> Points:
@@ -161,8 +160,8 @@ def _solve(a: FloatArray, x: FloatArray) -> FloatArray:
 class JointProfile:
     """The estimator `profile` of a plant with hundreds of states, as an observation of `BlurFilter`.
 
-    Its innovation is what the pixels, linearised at the mode, tell of each spot's displacement beyond the prediction:
-    one number for each output, chi-square together if all is well.
+    Its innovation is each spot's displacement from its prediction, as the pixels linearised at the mode give it: one
+    number for each output. Its NIS is chi-square distributed where model and covariances are right.
     """
 
     needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
@@ -199,7 +198,7 @@ class JointProfile:
 def innovation(
     paths: JointPaths, mean: FloatArray, state_covariance: FloatArray, t: FloatArray, at: Linearised
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Displacement of each spot from its prediction as the pixels tell it, linearised at a point.
+    """Displacement of each spot from its prediction, as the pixels linearised at a point give it.
 
     Returns
     -------

@@ -19,9 +19,9 @@ Indices = NDArray[np.intp]
 
 FIRST_DAMPING = 0.01
 LARGEST_DAMPING = 1e6
-"""With more than this no step leads anywhere: the search is over."""
+"""With more than this no step makes the objective smaller: the search is over."""
 FREE_DAMPING = 0.1
-"""Up to this a short step says that a mode is near; with more it is the damping that makes it short."""
+"""Up to this damping a short step means that a mode is near; with more it is the damping that makes it short."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,12 @@
 """The pixels of an exposure as a function of few coefficients, for the estimators that use the blur whole.
 
 A pixel is E[Y | path] = (1/N) sum_k (kernel integrated over it, the spot resting at theta_k) / D, and theta is linear
-in the coefficients z = (x(k0), xi) of the exposure. Only those directions of xi are kept that move the spot by
-something that the kernel does not hide: of the singular vectors of the noise path those whose
-remainder is a tenth of the kernel's standard deviation, rms. What is left out keeps its prior and widens the kernel by
-its variance, which is right to second order. Start states are kept whole.
+in the coefficients z = (x(k0), xi) of the exposure. Only as many directions of xi are kept as move the spot visibly:
+the first singular vectors of the noise path, until the rest is a tenth of the kernel's standard deviation, rms. What is
+left out keeps its prior and widens the kernel by its variance, which is right to second order. Start states are kept
+whole.
 
-The path is looked at at few nodes (`aolink.estimation.model.quadrature`).
+The mean over the fast steps is taken by quadrature with few nodes (`aolink.estimation.model.quadrature`).
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ BoolArray = NDArray[np.bool_]
 
 # Rms of the noise path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.1
-# Paths by which the number of nodes is found.
+# Random paths from which the number of nodes is found.
 _PATHS = 64
 # Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
 _SERIES = 1e-6
 _MOST_TERMS = 30
-# The table of a pixel's light by the spot's place: points in one standard deviation of the kernel, and where it ends.
+# The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
 _POINTS = 16
 _REACH = 5.0
 
@@ -83,7 +83,7 @@ class Reduction:
         return Gaussian(mean, covariance)
 
     def end(self, t: Gaussian) -> Gaussian:
-        """The Gaussian of the state at the exposure's end, without what inputs do; leading axes as they come."""
+        """The Gaussian of the end state, without the response to the inputs; leading axes as they come."""
         spread = batched.congruence(self.end_rows, t.covariance) + self.end_remainder
         return Gaussian(batched.matvec(self.end_rows, t.mean), batched.symmetric(spread))
 
@@ -138,7 +138,7 @@ def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_st
 
 
 def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
-    """Paths of the outputs of a plant without a camera, (paths, n_steps)."""
+    """Random paths of the outputs by the plant's prior, (paths, n_steps)."""
     t = np.random.default_rng(0).standard_normal((_PATHS, expand.shape[1]))
     n = model.plant.n_states
     t[:, :n] = t[:, :n] @ psd_root(model.plant.initial_covariance).T
@@ -146,7 +146,7 @@ def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
 
 
 class PixelView:
-    """What one frame shows, as a function of the reduced coefficients of each axis.
+    """The pixels of one frame as a function of the reduced coefficients t of each axis: prediction and likelihood.
 
     Points of each axis lie along the second dimension of every argument, (axes, k, ...). ``level`` is that
     of the reduction's resolution.
@@ -173,7 +173,7 @@ class PixelView:
         self.gain = shot_gain(self._optics)
         self._line = line
         self.compiled = line
-        """Whether compiled code does what it can; its twins in NumPy do all."""
+        """Whether compiled code is used where there is some; NumPy can do all."""
         self._kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
         self._measured, self._windowed = measured, _windowed(sensor, line, model.plant.n_outputs)
 
@@ -197,7 +197,7 @@ class PixelView:
 
     @property
     def weights(self) -> FloatArray:
-        """What each node counts, (nodes,)."""
+        """Each node's share of the exposure, (nodes,)."""
         return self._weights
 
     @property
@@ -212,7 +212,7 @@ class PixelView:
 
     @property
     def gram(self) -> FloatArray:
-        """Their squares, the mean over the exposure and the sum over outputs, (n, n)."""
+        """R'R for these rows R, as a mean over the exposure and a sum over outputs, (n, n)."""
         return np.asarray((self.rows * np.tile(self._weights, self.outputs)[:, None]).T @ self.rows)
 
     def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
@@ -253,7 +253,7 @@ class PixelView:
 
     @property
     def line(self) -> Line | None:
-        """What compiled code needs of line sensors."""
+        """The frame of a line sensor for compiled code; None where that is not used."""
         if not self.compiled:
             return None
         from aolink.estimation.compiled.line import Line
@@ -268,7 +268,7 @@ class PixelView:
         )  # fmt: skip
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The same and their Jacobian, (axes, k, pixels, n)."""
+        """`predicted`, and its Jacobian (axes, k, pixels, n)."""
         path, w = self.paths(t), self._weights[:, None]
         edges, D = self._optics.profile.edges, self._optics.pixel_size
         lead, size = t.shape[:2], t.shape[2]
@@ -298,7 +298,7 @@ class PixelView:
         return light.reshape(*lead, -1) / D, slopes.reshape(*lead, -1, size) / D
 
     def log_likelihood(self, f: FloatArray) -> FloatArray:
-        """Log-likelihood of the usable pixels where these are expected, up to a constant, (axes, k)."""
+        """Log-likelihood of the usable pixels, up to a constant, (axes, k), if f (axes, k, pixels) is expected."""
         R = self._variance(f)
         e = self.y[:, None] - f
         terms = e * e / R
@@ -307,9 +307,9 @@ class PixelView:
         return np.asarray(-0.5 * np.add.reduce(np.where(self.mask[:, None], terms, 0.0), axis=-1))
 
     def information(self, f: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Score and Fisher information of each pixel by what is expected of it, (axes, k, pixels).
+        """Score and Fisher information of each pixel by its expected density f, all (axes, k, pixels).
 
-        The variance grows with what is expected (shot noise), which is information of its own.
+        The variance grows with f (shot noise), which is information of its own.
         """
         R = self._variance(f)
         e = self.y[:, None] - f
@@ -329,7 +329,7 @@ class PixelView:
 
 
 def mehler_series(kernel: FloatArray) -> list[float]:
-    """c^j / j!, c the kernel's covariance of the two directions, (2, 2), as far as terms matter."""
+    """Terms c^j / j! of Mehler's series that matter, c the covariance of the two directions in ``kernel`` (2, 2)."""
     (xx, xy), (_, yy) = kernel
     rho = abs(xy) / math.sqrt(xx * yy)
     count = 1 if rho == 0 else min(_MOST_TERMS, math.ceil(math.log(_SERIES) / math.log(rho)))
@@ -343,9 +343,9 @@ def _windowed(sensor: BaseSensor, line: bool, outputs: int) -> Windowed[Any]:
 
 @lru_cache(maxsize=16)
 def _light_table(variance: float, pixel: float) -> FloatArray:
-    """Taylor coefficients of the densities of pixels about a spot, by its place in its own, (points, 4, pixels).
+    """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
-    By powers of its distance in pixels.
+    They are those of powers of its distance from the point, in pixels.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1

@@ -1,12 +1,13 @@
-"""The pixels themselves: the modes of the posterior by Levenberg and Marquardt's method, from several starts.
+"""Modes of the posterior of all pixels by Levenberg and Marquardt's method, from several starts; Laplace's evidence.
 
 The objective is -log p(t | pixels) with t whitened by its prior, s = L^-1 (t - m): |s|^2 / 2 minus the pixels'
 log-likelihood, Fisher's information in the place of the Hessian. At a mode its inverse is the covariance, and
 (Laplace) the log-evidence is log p(y | s) - |s|^2 / 2 - log |H| / 2.
 
-It starts where windowed moments have it, and from there along the directions in which they leave the path most
-uncertain: a path and its reversal in time give the same blur. A mode is not Gaussian, where the path moves by more than
-the kernel is wide: so mean and covariance are those of points drawn about the modes (`importance`).
+A search starts at the posterior of windowed moments, and others start from there along the directions in which that
+leaves the path most uncertain: a path and its reversal in time give the same blur. Where the path moves by more than
+the kernel is wide a mode is not Gaussian, so mean and covariance are those of points drawn about the modes
+(`importance`).
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ _NO_NOISE = 1e-14
 _CONVERGED = 0.03
 # Modes that are nearer to each other than so many standard deviations are one.
 _APART = 0.7
-# Starts lie on both sides along the most uncertain direction of the path; where that is wider than so many variances of
-# the kernel, along so many.
+# Starts lie on both sides along the most uncertain direction of the path; along more directions where its variance is
+# larger than this many variances of the kernel.
 _WIDE_PATH = 0.5
 _DIRECTIONS = 3
 _START_REACH = 1.3
-# A reversed path is met to so many standard deviations of the kernel, if the prior allows.
+# A start for a reversed path fits it to this many standard deviations of the kernel, if the prior allows.
 _REVERSED_TO = 0.2
-# Directions of the pixels, for each output, in which an innovation is given; the rest is noise next to nothing else.
+# Directions of the pixels, for each output, in which an innovation is given; in the others there is hardly but noise.
 _NEW_DIRECTIONS = 4
 _GATE_PROBABILITY = 1e-9
 # Information of a direction, as a share of the largest, that is rounding.
@@ -67,7 +68,7 @@ class Modes:
     mean: FloatArray
     covariance: FloatArray
     log_evidence: FloatArray
-    """Laplace's, without the prior weight; minus infinity of a mode that is not there."""
+    """Laplace's log-evidence, without the prior weight, (axes, starts); minus infinity for a mode that is not there."""
     distance: FloatArray
     """|s|^2, squared distance from the prior, (axes, starts)."""
     objective: FloatArray
@@ -75,14 +76,14 @@ class Modes:
 
     @property
     def best(self) -> NDArray[np.intp]:
-        """The one of least objective, (axes,)."""
+        """Index of the mode of least objective, (axes,)."""
         return np.asarray(np.argmin(self.objective, axis=1))
 
 
 def find_modes(
     view: PixelView, prior: Gaussian, starts: FloatArray, passes: int = _PASSES, converged: float = _CONVERGED
 ) -> Modes:
-    """Where each start leads.
+    """The mode that each start leads to.
 
     Parameters
     ----------
@@ -135,11 +136,10 @@ def _found_compiled(
 
 
 def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
-    """The modes of a posterior, looked for from what windowed moments make of the prior.
+    """The modes of a posterior; ``wide`` is the posterior of windowed moments, from which searches start.
 
-    Starts lie there and on both sides along the most uncertain direction of the path; where that is wider than so many
-    variances of the kernel, along so many. After them come those that the best mode's reversal and mirror images lead
-    to.
+    Starts are its mean and points on both sides of it (`spread_starts`). After their modes come those that the best
+    mode's reversal and mirror images lead to.
     """
     starts, squares = spread_starts(view, prior, wide)
     many = squares[:, 0] > _WIDE_PATH * view.kernel_variance
@@ -164,7 +164,7 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
 
 
 def without_repeats(modes: Modes) -> Modes:
-    """The same without modes that an earlier start led to as well, those that are there first."""
+    """The same without modes that an earlier start has led to; modes that remain come first."""
     kept = [getattr(modes, f.name).copy() for f in fields(Modes)]
     mean, covariance, evidence, distance, objective = kept
     most = compiled_modes.drop_repeats(mean, covariance, _APART, evidence, distance, objective)
@@ -172,7 +172,7 @@ def without_repeats(modes: Modes) -> Modes:
 
 
 def broad(view: PixelView, prior: Gaussian) -> Gaussian:
-    """What windowed moments make of the prior of t: wide where the blur has several readings."""
+    """The prior of t updated with windowed moments: wide where the posterior has several modes."""
     if (line := view.line) is not None:
         after = Gaussian(np.empty_like(prior.mean), np.empty_like(prior.covariance))
         compiled_moments.broad(
@@ -221,7 +221,7 @@ def _reversed_precision(view: PixelView) -> float:
 
 
 def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> FloatArray:
-    """Whitened coordinates of paths that blur like those of points (axes, k, n), (axes, 3 k, n).
+    """Whitened coordinates of paths with the same blur as those of points, (axes, k, n) -> (axes, 3 k, n).
 
     Run backwards, which gives the same blur; mirrored about their mean, which gives the same where the blur is
     symmetric, as that of a vibration is; and both.

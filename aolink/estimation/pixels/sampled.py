@@ -1,6 +1,6 @@
-"""The posterior by sampling (`tempering`): offline and slow; the limit for all other estimators.
+"""The estimator `sampled`: tempered sequential Monte Carlo. Slow, for offline use; the limit of all other estimators.
 
-All fast steps are looked at, and less of the path is left out.
+All fast steps are nodes, and less of the path is left out.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class TemperedUpdater:
         prior:
             Prior of the start state; the noise coefficients have N(0, I).
         number:
-            Number of the exposure: with the seed and the axis it makes the random numbers.
+            Number of the exposure: with the estimator's seed and the axis it seeds the random numbers.
         """
         each = [np.array([axis]) for axis in range(len(prior.mean))]
         keys = [(self.seed, number, int(axis)) for axis in view.axes]

@@ -1,9 +1,9 @@
-"""Points of a posterior that no Gaussians describe: tempered sequential Monte Carlo.
+"""Tempered sequential Monte Carlo: particles of a posterior that no Gaussian mixture describes.
 
-Particles are drawn from the prior, and the pixels' likelihood is let in by and by, raised to a power that grows from
-zero to one: each time so far that the effective sample size falls to one half. Particles are then drawn anew by their
-weights and moved by Metropolis' rule: differences of two others (ter Braak's differential evolution), which go from
-mode to mode, and random walks of the particles' own covariance.
+Particles are drawn from the prior and weighted with the pixels' likelihood, raised to a power that grows from zero to
+one, each time so far that the effective sample size falls to one half. They are then resampled and moved by Metropolis'
+rule: by differences of two others (differential evolution MCMC: ter Braak, Stat. Comput. 16 (2006)), which go from mode
+to mode, and by random walks with the particles' own covariance.
 
 Del Moral, Doucet, Jasra, Sequential Monte Carlo samplers, J. R. Stat. Soc. B 68 (2006), section 3.
 """
@@ -24,9 +24,9 @@ FloatArray = NDArray[np.float64]
 _MOVES = 16
 _EFFECTIVE = 0.5
 _EM_PASSES = 25
-# Part of the covariance of all that a component of the fit has at least.
+# Least covariance of a component of the fit, as a share of that of all particles.
 _LEAST_SPREAD = 1e-3
-# Every so many moves a difference is taken whole, which leads from one mode to another.
+# Every fourth move takes a difference in full, which leads from one mode to another.
 _WHOLE = 4
 
 
@@ -38,7 +38,7 @@ def tempered_points(view: PixelView, prior: GaussianMixture, count: int, key: tu
     prior:
         Prior of the start state; the noise coefficients have N(0, I).
     key:
-        The same one gives the same points.
+        Seed: the same key gives the same points.
     """
     rng, n = np.random.default_rng(key), view.reduced.size
     t = _drawn(prior, rng, count, n)
@@ -63,7 +63,7 @@ def tempered_points(view: PixelView, prior: GaussianMixture, count: int, key: tu
             taken = np.log(rng.random(count)) < gain
             t[taken], log_prior[taken], log_likelihood[taken] = there[taken], its_prior[taken], its_likelihood[taken]
             if move % _WHOLE:
-                # Towards a quarter of the moves taken.
+                # Towards an acceptance rate of one quarter.
                 size *= math.exp(taken.mean() - 0.25)
     return t
 
@@ -76,7 +76,7 @@ def fitted(points: FloatArray, rows: FloatArray, components: int, seed: int) -> 
     points:
         (points, n)
     rows:
-        It is their projections whose density is fitted, (k, n): few numbers, of which so many points say much.
+        Their projections rows @ point are what the mixture is fitted to, (k, n): few dimensions, so points suffice.
 
     Returns
     -------
@@ -135,7 +135,7 @@ def _log_likelihood(view: PixelView, t: FloatArray) -> FloatArray:
 
 
 def _next_power(log_likelihood: FloatArray, power: float) -> float:
-    """The largest one up to 1 that leaves the effective sample size that is wanted."""
+    """The largest power up to 1 that leaves the effective sample size that is wanted."""
     away = log_likelihood - log_likelihood.max()
 
     def excess(more: float) -> float:

@@ -1,11 +1,11 @@
-"""The posterior of the pixels as Gaussians: few of them are carried from exposure to exposure.
+"""The estimators `profile` and `mixture`: the posterior of the pixels as a Gaussian mixture that is carried on.
 
 Modes are not Gaussian: the blur fixes how much a path moves and leaves open which way, and such a posterior is
-bent. So the modes, and the wide Gaussians of windowed moments about them, are where points are drawn from only;
-what counts is the points' weights (`aolink.estimation.pixels.importance`).
+bent. So the modes, and the wide Gaussians of windowed moments about them, only make the proposal density; the
+posterior comes from importance weights (`aolink.estimation.pixels.importance`).
 
-A mode that was lost is found again: a thousandth of the prior is what the plant would be without a camera. It is
-searched where the best mode is further from the rest than chance brings it.
+A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
+searched where the NIS is larger than chance makes it.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from aolink.optics.sensor import BaseSensor
 
 FloatArray = NDArray[np.float64]
 
-# Share of the prior that is what the plant would be without a camera; and how rarely chance makes it searched.
+# Share of the prior that is the prediction without any measurement; and how rarely chance makes it searched.
 _DOUBT = 1e-3
 _DOUBTED = 1e-3
-# A second mode is one if the posterior gives it this much. Many points are worth the while from a tenth of it, for the
-# evidence of modes is rough.
+# A posterior has several modes if a second one has this share of it. From a tenth of that many points are drawn, since
+# the evidence of modes is rough.
 _LEAST_SHARE = 0.05
 _LEAST_DOUBTED_SHARE = 0.005
 
 
 @dataclass(frozen=True)
 class ImportanceUpdater:
-    """A mixture in, a mixture out."""
+    """Updates a Gaussian mixture by importance sampling about the modes of the posterior."""
 
     carried: int
-    """Gaussians from exposure to exposure, at most."""
+    """Most components that are carried from exposure to exposure."""
     free: float
-    """Fewer, where mergers lose less than this, in nats."""
+    """Components are merged further while a merger costs less than this, in nats."""
     share: float
-    """Share of the usual number of points; and of those that are to count, where there is one mode."""
+    """Share of the usual number of points; and, where there is one mode, of the usual effective sample size."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
@@ -76,15 +76,15 @@ MIXTURE = ImportanceUpdater(carried=6, free=1e-3, share=1.0)
 
 
 def has_several(modes: Modes, least: float = _LEAST_SHARE) -> NDArray[np.bool_]:
-    """Whether there is a second mode that the posterior gives so much, (axes,)."""
+    """Whether a second mode has at least this share of the posterior, (axes,)."""
     share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
     return np.asarray((share > least).sum(axis=1) > 1)
 
 
 def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMixture]:
-    """The modes that each component of a prior of the start state leads to, and a mixture to draw points from.
+    """The modes for each component of the start state's prior, and the proposal density: a mixture to draw points from.
 
-    The modes' log-evidence has the weights of the components in it.
+    The modes' log-evidence includes the weights of the components.
     """
     before = view.reduced.prior(Gaussian(prior.mean, prior.covariance))
     axes, count, _ = before.mean.shape
