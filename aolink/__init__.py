@@ -9,12 +9,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from aolink.estimation import Estimate
     from aolink.exposure import Exposures
     from aolink.recording.reader import Recording
@@ -22,7 +25,7 @@ if TYPE_CHECKING:
 
     __version__: str
 
-__all__ = ["AolinkError", "Rig", "estimate", "load_rig", "read", "simulate", "smooth"]
+__all__ = ["AolinkError", "Rig", "estimate", "exposures", "load_rig", "read", "simulate", "smooth"]
 
 
 if not TYPE_CHECKING:  # the type checker would believe in any name
@@ -76,6 +79,36 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
 
     rig = rig if isinstance(rig, Rig) else load_rig(rig)
     return Exposures(rig, tuple(simulate_exposures(rig, n_exposures, seed)))
+
+
+def exposures(
+    frames: NDArray[Any], rig: Rig | str | Path, inputs: NDArray[Any] | None = None,
+    start_steps: Sequence[int] | None = None,
+) -> Exposures:  # fmt: skip
+    """Exposures of frames in memory, to `estimate` and `smooth` them.
+
+    Parameters
+    ----------
+    frames:
+        Counts of the rig's camera, (exposures, rows, columns).
+    rig:
+        A rig, a rig file, or the name of one that comes with aolink.
+    inputs:
+        What the mirror held in each fast step from step 0 on, (steps, n_inputs); None: its parked input.
+    start_steps:
+        Fast step at which each exposure starts; None: each begins a frame period after the one before.
+
+    Raises
+    ------
+    ImportingError
+        They do not fit to the rig or to each other; the message says what was expected.
+    RigError
+        The rig file cannot be read or cannot work.
+    """
+    from aolink.importing.exposures import exposures as made
+    from aolink.rig import Rig, load_rig
+
+    return made(frames, rig if isinstance(rig, Rig) else load_rig(rig), inputs, start_steps)
 
 
 def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> list[Estimate]:

@@ -20,9 +20,9 @@ from aolink.rig import Rig
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """What really happened in one exposure: a simulated rig knows it, or single frames of a film. No estimator reads it.
+    """What really happened in one exposure, as a simulated rig or the single frames of a film tell it.
 
-    States that nobody knows are NaN.
+    No estimator reads it. States that nobody knows are NaN.
     """
 
     start_state: NDArray[np.float64]

@@ -30,6 +30,16 @@ from aolink.cli.common import (
     stderr,
     stdout,
 )
+from aolink.cli.films import (
+    AtOption,
+    GammaOption,
+    InvertOption,
+    RateOption,
+    SumOption,
+    TopicOption,
+    TrackOption,
+    film_settings,
+)
 from aolink.cli.terminal import ask, input_ended, progress_bar
 from aolink.errors import AolinkError, EstimatorError, RigError
 from aolink.files import check_target, writing
@@ -40,6 +50,7 @@ if TYPE_CHECKING:
 
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
+    from aolink.importing.exposures import Settings
     from aolink.recording.reader import Recording
     from aolink.rig import Rig
     from aolink.session import Report
@@ -55,7 +66,10 @@ class Light(StrEnum):
     STILL = "still"
 
 
-@app.command(epilog="Example: aolink rig section-vi --check")
+@app.command(
+    epilog="Example: aolink rig section-vi --check"
+    "  |  aolink rig my.toml --from film.tif --rate 500 --track 3 --sum 8 (writes my.toml)"
+)
 def rig(
     rig: RigArgument,
     check: Annotated[bool, typer.Option("--check", help="Check the rig file, print the findings, and end.")] = False,
@@ -79,11 +93,26 @@ def rig(
         ),
     ] = None,
     tied: Annotated[bool, typer.Option("--tied", help="End when standard input ends, for a parent process.")] = False,
+    film: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FILM", help="Write a first rig file for the objects of a film, and end."),
+    ] = None,
+    rate: RateOption = None,
+    frames: SumOption = 1,
+    track: TrackOption = 0,
+    at: AtOption = None,
+    invert: InvertOption = False,
+    gamma: GammaOption = 1.0,
+    topic: TopicOption = None,
+    overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
     from aolink.rig import load_rig, parse_light
 
+    if film is not None:
+        _write_first_rig(Path(rig), film, topic, film_settings(rate, frames, track, at, invert, gamma), overwrite)
+        return
     if check:
         _print_findings(load_rig(rig), as_json)
         return
@@ -115,6 +144,19 @@ def rig(
         for stream in streams.values():
             stream.close()
     stop.raise_if_asked()
+
+
+def _write_first_rig(path: Path, source: Path, topic: str | None, settings: Settings, overwrite: bool) -> None:
+    from aolink.importing.first_rig import first_rig
+    from aolink.importing.readers import open_film
+
+    check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
+    film = open_film(source, topic)
+    with progress_bar(stderr, film.count) as tell:
+        text = first_rig(film, settings, path.stem, lambda done: tell("follow", done))
+    with writing(path, overwrite=overwrite, error=RigError) as partial:
+        partial.write_text(text, encoding="utf-8")
+    stdout.print(f"{path}: written from {film.name}; read it, then: {program()} rig {path} --check", markup=False)
 
 
 def _print_scan(loaded: Rig, as_json: bool) -> None:

@@ -7,7 +7,7 @@ were followed in the single frames, the true path.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,7 +88,7 @@ class Light:
     def __init__(self, film: Film, settings: Settings) -> None:
         self._settings = settings
         kind = film.dtype.kind
-        self.full_scale = float(np.iinfo(film.dtype).max) if kind in "iu" else 1.0
+        self.full_scale = float(np.iinfo(film.dtype.name).max) if kind in "iu" else 1.0
         """The largest value that a pixel can hold."""
         self._is_integer = kind in "iu"
 
@@ -125,7 +125,7 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
         period = float(np.median(gaps))
         if period <= 0 or (gaps <= 0).any():
             late = int(np.argmax(gaps <= 0)) + 1
-            raise ImportingError(f"{film.name}: frame {late} is not later than the one before it: its times are damaged")
+            raise ImportingError(f"{film.name}: frame {late} is not later than the one before: its times are damaged")
         if rate is not None and abs(rate * period - 1) > _CLOSE:
             raise ImportingError(
                 f"{film.name}: {rate:g} frames/s contradict its times, which say {1 / period:.6g}: give --rate"
@@ -136,7 +136,7 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
         if (counts < 1).any() or (off > _IRREGULAR).any():
             worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
             raise ImportingError(
-                f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before it, at a frame period of"
+                f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
                 f" {period:.4g} s: exposures must follow at a steady rate, only whole frames may be missing"
             )
         periods[1:] = np.cumsum(counts)
@@ -304,7 +304,7 @@ def rig_frame(
 
 
 def exposures(
-    frames: NDArray[Any], rig: Rig, inputs: FloatArray | None = None, start_steps: NDArray[np.int64] | None = None
+    frames: NDArray[Any], rig: Rig, inputs: NDArray[Any] | None = None, start_steps: Sequence[int] | None = None
 ) -> Exposures:
     """Exposures of frames in memory, as `aolink.exposures` gives them."""
     count = len(frames)

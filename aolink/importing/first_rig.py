@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,8 +47,8 @@ class Motion:
 def fit_motion(places: FloatArray) -> Motion:
     """Fit series of places along one direction each, (frames, series), pixels; NaN where nothing was seen.
 
-    Of a random walk and an Ornstein-Uhlenbeck process (a < 1) the latter is taken where it explains the series better by
-    more than its parameters account for (Bayesian information criterion).
+    A random walk is fitted and an Ornstein-Uhlenbeck process (a < 1). The latter is taken where it explains the series
+    better by more than its parameters account for (Bayesian information criterion).
 
     Raises
     ------
@@ -97,14 +98,9 @@ def _negative_log_likelihood(places: FloatArray, a: float, q: float, r: float) -
     return total
 
 
-def _inverse_curvature(cost: object, at: FloatArray) -> FloatArray:
+def _inverse_curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
     """Diagonal of the inverse of the Hessian by differences: variances of what maximises a likelihood."""
     n, h = len(at), 0.05
-    f: object = cost
-
-    def value(x: FloatArray) -> float:
-        return float(f(x))  # type: ignore[operator]
-
     H = np.empty((n, n))
     for i in range(n):
         for j in range(n):
@@ -114,13 +110,13 @@ def _inverse_curvature(cost: object, at: FloatArray) -> FloatArray:
                     x = np.array(at, dtype=np.float64)
                     x[i] += a * h
                     x[j] += b * h
-                    total += a * b * value(x)
+                    total += a * b * cost(x)
             H[i, j] = total / (4 * h * h)
     return np.clip(np.diagonal(np.linalg.pinv(H)), 0.0, None)
 
 
-def first_rig(film: Film, settings: Settings, name: str) -> str:
-    """The text of a rig file for the objects of a film (``settings.track`` of them), to be imported by the same settings.
+def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int], None] | None = None) -> str:
+    """The text of a rig file for the objects of a film, ``settings.track`` of them: for an import with these settings.
 
     The slope unit is half a window. The plant has a copy for each object and direction; its input is the shift of the
     window that follows the object.
@@ -130,8 +126,10 @@ def first_rig(film: Film, settings: Settings, name: str) -> str:
     ImportingError
         There are not so many objects, or nothing says the frame rate.
     """
+    if not settings.track:
+        raise ImportingError("a first rig file is about objects in the film: say how many with --track N")
     objects = find_objects(film, settings)
-    known = survey(film, settings, objects)
+    known = survey(film, settings, objects, progress)
     rate = settings.rate_hz or film.rate_hz
     if rate is None and film.times_ns is not None and film.count > 1:
         rate = 1e9 / float(np.median(np.diff(film.times_ns)))
@@ -164,9 +162,9 @@ def _text(
         variance = motion.q / (1 - motion.a**2) / unit**2
         kind, initial = "Ornstein-Uhlenbeck process", f"[[{variance:.4g}, 0.0], [0.0, {_ANYWHERE}]]"
     memory = "" if walk else f"; a = {motion.a:.5g} +- {motion.a_sd:.2g} a frame"
-    return f"""# Written by `aolink rig --from {film.name}`: what the film's single frames show. +- is one standard deviation.
+    return f"""# Written by `aolink rig --from {film.name}` from its single frames. +- is one standard deviation.
 name = "{name}"
-summary = "{n} objects of {film.name}, each in a window of {side} pixels that follows it; the slope unit is {unit:g} pixels."
+summary = "{n} objects of {film.name}, each in a window of {side} pixels that follows it; slope unit: {unit:g} pixels"
 
 [plant]               # a copy for each object along x and along y: {kind}{memory}
 axes = {2 * n}
@@ -174,7 +172,7 @@ A = {A}
 B = {B}           # the input shifts the window
 B_w = {B_w}
 C = {C}
-process_noise = {motion.q / unit**2:.6g}  # +- {motion.q_sd / unit**2:.2g}: a step of {math.sqrt(motion.q):.4g} pixels rms from frame to frame
+process_noise = {motion.q / unit**2:.6g}  # +- {motion.q_sd / unit**2:.2g}: {math.sqrt(motion.q):.4g} pixels rms a frame
 initial_covariance = {initial}
 
 [timing]

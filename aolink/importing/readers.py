@@ -26,6 +26,7 @@ from aolink.optics.pictures import read_picture
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy", ".fits", ".fit", ".pgm")
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".gif", ".wmv")
+_LOSSY_TIFF = (6, 7)  # JPEG
 _COMPRESSED = "JPEG and video hold light after a gamma curve and lossy compression"
 
 
@@ -122,7 +123,7 @@ def _tiff(path: Path) -> Film:
             series = file.series[0]
             shape, dtype = series.shape, np.dtype(series.dtype)
             interval = (file.imagej_metadata or {}).get("finterval")
-            lossy = any(page.compression.name in ("JPEG", "OJPEG") for page in file.pages[:1])
+            lossy = int(file.pages.first.compression) in _LOSSY_TIFF
         if len(shape) == 2:
             shape = (1, *shape)
         if len(shape) != 3:
@@ -134,8 +135,7 @@ def _tiff(path: Path) -> Film:
         with tifffile.TiffFile(path) as file:
             pages = file.series[0].pages
             if len(pages) == shape[0]:
-                for page in pages:
-                    yield page.asarray()
+                yield from (page.asarray() for page in pages if page is not None)
             else:  # ImageJ keeps a large stack as one page
                 yield from file.series[0].asarray().reshape(shape)
 

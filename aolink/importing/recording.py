@@ -18,7 +18,8 @@ from aolink.recording import convert, topics
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.writer import begin_recording
 from aolink.rig import Rig
-from aolink.wire.messages_pb2 import Applied, Truth
+from aolink.wire.messages_pb2 import Applied
+from aolink.wire.truth import truth_message
 
 _AT_ONCE = 65_536
 """Numbers in one report of inputs."""
@@ -60,7 +61,7 @@ def import_film(
             begin_recording(file, rig, facts, first.frame.host_start_ns, {})
             sequence = 0
             for each in chain([first], made):
-                for topic, message in _messages(each, rig):
+                for topic, message in _messages(each):
                     sequence += 1
                     data = message.SerializeToString(deterministic=True)
                     file.add(topic, schema_of(type(message)), data, each.frame.host_receive_ns, sequence)
@@ -73,7 +74,7 @@ def import_film(
     return account
 
 
-def _messages(each: ImportedExposure, rig: Rig) -> Iterator[tuple[str, Message]]:
+def _messages(each: ImportedExposure) -> Iterator[tuple[str, Message]]:
     frame, inputs = each.frame, each.inputs
     info, image = convert.frame_messages(frame)
     yield topics.EXPOSURE, info
@@ -84,8 +85,4 @@ def _messages(each: ImportedExposure, rig: Rig) -> Iterator[tuple[str, Message]]
         some = inputs[k : k + rows]
         yield topics.APPLIED, Applied(first_step=first + k, n_steps=len(some), u=some.ravel())
     if each.truth is not None:
-        yield topics.TRUTH, Truth(
-            frame_id=frame.frame_id, axes=rig.plant.axes, n_outputs=rig.n_outputs, path=each.truth.path.ravel(),
-            start_state=each.truth.start_state.ravel(), end_state=each.truth.end_state.ravel(),
-            path_sd=each.truth.path_sd,
-        )  # fmt: skip
+        yield topics.TRUTH, truth_message(frame.frame_id, each.truth)

@@ -44,7 +44,9 @@ def aot_film(path: Path) -> Film:
     elif system.date_beginning is not None:
         known["start_ns"] = round(system.date_beginning.timestamp() * 1e9)
     notes = [f"pictures of the wavefront sensor {sensor.uid}"]
-    commands = [each.commands.data for each in system.loops if each.commands is not None and each.input_sensor is sensor]
+    commands = [
+        each.commands.data for each in system.loops if each.commands is not None and each.input_sensor is sensor
+    ]
     if commands and all(len(each) == len(pictures.data) for each in commands):
         known["inputs"] = np.hstack([np.asarray(each, np.float64).reshape(len(each), -1) for each in commands])
         notes.append("each command of its loops is held from its picture to the next")

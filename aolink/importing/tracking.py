@@ -251,7 +251,7 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
 def _fitted(
     windows: FloatArray, centres: FloatArray, start_sd: float
 ) -> tuple[float, float, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The Gaussian, integrated over pixels, and the ground that fit each object's windows best, (samples, n, side, side)."""
+    """The Gaussian, integrated over pixels, and the ground that best fit windows (samples, n, side, side)."""
     _, n, side, _ = windows.shape
     edges = np.arange(side + 1) - 0.5
 
@@ -263,7 +263,7 @@ def _fitted(
         values = windows[seen, k].ravel()
         columns = np.column_stack([shape, np.ones(len(shape))])
         found, *_ = np.linalg.lstsq(columns, values, rcond=None)
-        return found, shape, values - columns @ found
+        return np.asarray(found), shape, np.asarray(values - columns @ found)
 
     def left(sd: float, k: int) -> float:
         return float((amounts(sd, k)[2] ** 2).sum())
@@ -405,7 +405,7 @@ class _Windows:
         return windows.reshape(rows, columns, side, side).swapaxes(1, 2).reshape(rows * side, columns * side)
 
     def follow(self, places: FloatArray) -> FloatArray:
-        """Move windows after objects that have strayed from their middles; gives the inputs that say so, (n_inputs,)."""
+        """Move windows after objects that have strayed; gives the inputs that say so, (n_inputs,)."""
         old = self._corners
         if not self._moves:
             return np.zeros(old.size)

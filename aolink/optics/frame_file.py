@@ -6,6 +6,7 @@ import gzip
 import math
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,7 +59,7 @@ def parse_fits(data: bytes) -> NDArray[np.float64]:
     return np.asarray(stored * scale + zero)
 
 
-def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[np.generic], float, float]:
+def parse_fits_array(data: bytes) -> tuple[dict[str, str], NDArray[Any], float, float]:
     """The primary array of a FITS file; Pence et al., Astron. Astrophys. 524, A42 (2010).
 
     Returns

@@ -1,0 +1,137 @@
+"""Commands that bring other people's data in: import, and the film options that `aolink rig --from` shares."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aolink.cli.common import JsonOption, OverwriteOption, app, load_checked, stderr, stdout
+from aolink.cli.terminal import progress_bar
+from aolink.errors import ImportingError
+
+if TYPE_CHECKING:
+    from aolink.importing.exposures import Settings
+
+RateOption = Annotated[
+    float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not say it.")
+]
+SumOption = Annotated[
+    int, typer.Option("--sum", metavar="K", min=1, help="Make one exposure of K frames: the mean of their light.")
+]
+TrackOption = Annotated[
+    int,
+    typer.Option(
+        "--track", metavar="N", min=0, help="Follow N objects, each in a window of its own: the brightest, or --at."
+    ),
+]
+AtOption = Annotated[
+    list[str] | None,
+    typer.Option("--at", metavar="X,Y", help="Where an object to follow is in the first frame, pixels; repeatable."),
+]
+InvertOption = Annotated[
+    bool, typer.Option("--invert", help="Dark objects on a bright ground: light is how far a pixel is below it.")
+]
+GammaOption = Annotated[
+    float, typer.Option("--gamma", min=0.1, max=10.0, help="Undo a gamma curve; most JPEG and video have 2.2.")
+]
+TopicOption = Annotated[
+    str | None, typer.Option("--topic", help="Channel with the pictures, where an MCAP file or a bag has several.")
+]
+
+
+def film_settings(
+    rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
+) -> Settings:
+    """The options of a command as settings. Raises ImportingError for a place that is none."""
+    from aolink.importing.exposures import Settings
+
+    if rate is not None and rate <= 0:
+        raise ImportingError(f"--rate {rate:g} must be above 0")
+    places = []
+    for text in at or []:
+        try:
+            x, y = (float(part) for part in text.split(","))
+        except ValueError:
+            raise ImportingError(f"--at {text} is no place: give X,Y in pixels, such as --at 12.5,40") from None
+        places.append((x, y))
+    return Settings(
+        rate_hz=rate, frames_per_exposure=frames, track=track or len(places), places=tuple(places), invert=invert,
+        gamma=gamma, **more,  # type: ignore[arg-type] # fields of Settings
+    )  # fmt: skip
+
+
+@app.command(
+    "import",
+    epilog="Example: aolink import film.tif -o film.mcap --rig my.toml --rate 500"
+    "  |  aolink import film.npz -o film.mcap --rig spheres.toml --rate 24 --invert --track 6 --sum 8",
+)
+def import_(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SOURCE",
+            help="A film: .npy, .npz, TIFF, FITS cube, video, MCAP, ROS bag, AOT telemetry, or a folder of pictures.",
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What camera and plant the film shows.")],
+    rate: RateOption = None,
+    exposure: Annotated[
+        float | None, typer.Option(metavar="S", min=0.0, help="Exposure time of a frame, s, where the film lacks it.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="DATE", help="When it began, such as 2026-11-22T09:30, in UTC.")
+    ] = None,
+    frames: SumOption = 1,
+    track: TrackOption = 0,
+    at: AtOption = None,
+    invert: InvertOption = False,
+    background: Annotated[
+        bool, typer.Option("--background", help="Take each frame's median off: the ground is no light.")
+    ] = False,
+    gamma: GammaOption = 1.0,
+    scale: Annotated[
+        float | None, typer.Option(metavar="COUNTS", help="Counts for a pixel value of one. Default: by the type.")
+    ] = None,
+    topic: TopicOption = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a recording of a film: then estimate, replay, compare, deblur and view it like any other."""
+    from aolink.importing.readers import open_film
+    from aolink.importing.recording import import_film
+
+    start_ns = None
+    if start is not None:
+        try:
+            moment = datetime.fromisoformat(start)
+        except ValueError:
+            raise ImportingError(f"--start {start} is no date: give one such as 2026-11-22T09:30:00") from None
+        start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()) * 1_000_000_000
+    settings = film_settings(
+        rate, frames, track, at, invert, gamma, exposure_s=exposure or None, start_ns=start_ns,
+        subtract_median=background, scale=scale,
+    )  # fmt: skip
+    loaded = load_checked(rig)
+    film = open_film(source, topic)
+    with progress_bar(stderr, film.count // frames) as tell:
+        account = import_film(
+            film, loaded, settings, output, overwrite=overwrite, progress=lambda done: tell("import", done)
+        )
+    if as_json:
+        print(json.dumps({"out": str(output), **vars(account)}))
+        return
+    for note in account.notes:
+        stdout.print(f"note: {note}", markup=False)
+    for count, what in (
+        (account.saturated, "saturated in the film"),
+        (account.clipped, "beyond the range of the rig's camera"),
+    ):
+        if count:
+            share = count / account.pixels
+            stdout.print(f"warning: {count} pixels ({share:.2%}) are {what}: they are masked", markup=False)
+    stdout.print(f"{output}: {account.exposures} exposures of {account.frames} frames", markup=False)
