@@ -320,8 +320,10 @@ def replay(
 
     What an estimator skipped in the session for want of time, it skips again; `aolink estimate` skips nothing.
     """
+    from aolink.estimation.registry import DEFAULT_ESTIMATOR
+
     recording = open_recording(file)
-    names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
+    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if to_rig:
         if not (output and _are_driven(recording.rig, camera, mirror)):
