@@ -162,7 +162,7 @@ def test_a_lost_report_is_replaced_by_the_command_and_counted() -> None:
     assembler.add_applied(applied(150, 200))
     (exposure,) = assembler.add_frame(frame_at(0))
     assert exposure.inputs_assumed == 50
-    assert np.array_equal(exposure.inputs[100:150], RIG.mirror.quantise(2e-3 * np.arange(100, 150)[:, None]))
+    assert np.array_equal(exposure.inputs[100:150], RIG.mirror.quantise(2e-3 * np.arange(100.0, 150.0)[:, None]))
     assert not np.array_equal(exposure.inputs[100:150, 0], 2e-3 * np.arange(100, 150))
 
 
@@ -192,7 +192,7 @@ def test_an_exposure_waits_no_longer_when_reports_are_given_up() -> None:
     assert assembler.add_applied(applied(150, 200)) == []
     (exposure,) = assembler.add_applied(without_report(pb.Applied.NOT_REPORTED, 0, 150))
     assert exposure.inputs_assumed == 150
-    assert np.array_equal(exposure.inputs[:150], RIG.mirror.quantise(2e-3 * np.arange(150)[:, None]))
+    assert np.array_equal(exposure.inputs[:150], RIG.mirror.quantise(2e-3 * np.arange(150.0)[:, None]))
 
 
 def test_a_step_that_nothing_is_known_of_holds_the_last_value() -> None:
@@ -221,7 +221,7 @@ def test_the_order_of_frames_and_reports_does_not_matter(data: st.DataObject) ->
     assembler, exposures = Assembler(RIG), []
     waiting = list(frames)
     for report in reports:
-        while waiting and data.draw(st.booleans()):
+        while len(waiting) > 0 and data.draw(st.booleans()):
             exposures += assembler.add_frame(waiting.pop(0))
         exposures += assembler.add_applied(report)
     for frame in waiting:
@@ -244,8 +244,10 @@ def test_every_step_has_its_last_report_or_command_or_the_input_before(calls: li
         if len(call) == 3:
             reported, first, n_steps = call
             u = [value := value + 1.0 for _ in range(n_steps)]
-            kind, add = (pb.Applied, history.add_applied) if reported else (pb.CommandBlock, history.add_command)
-            add(kind(first_step=first, n_steps=n_steps, u=np.repeat(u, 2)))
+            if reported:
+                history.add_applied(pb.Applied(first_step=first, n_steps=n_steps, u=np.repeat(u, 2)))
+            else:
+                history.add_command(pb.CommandBlock(first_step=first, n_steps=n_steps, u=np.repeat(u, 2)))
             (applied if reported else commanded).update(zip(range(first, first + n_steps), u, strict=True))
             continue
         first = max(0, end + call[0] - 3)  # a few steps again, or a gap

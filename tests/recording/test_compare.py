@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,7 +23,9 @@ from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
+from aolink.wire.messages_pb2 import Truth
 from tests.conftest import EXPOSURES, Session
+from tests.kinds import messages_of
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -62,8 +65,8 @@ def test_one_number_is_found_with_its_frame_and_field(recorded: Session, tmp_pat
 
 def test_one_pixel_is_found(recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
-        if topic == topics.IMAGE and message.data[10] != 255:  # type: ignore[attr-defined]
-            message.data = message.data[:10] + bytes([message.data[10] + 1]) + message.data[11:]  # type: ignore[attr-defined]
+        if isinstance(message, RawImage) and message.data[10] != 255:
+            message.data = message.data[:10] + bytes([message.data[10] + 1]) + message.data[11:]
         return [message]
 
     found = compare(Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change))
@@ -72,7 +75,7 @@ def test_one_pixel_is_found(recorded: Session, tmp_path: Path) -> None:
 
 def test_missing_and_added_messages_are_named_and_shift_nothing(recorded: Session, tmp_path: Path) -> None:
     def without_frame_3(topic: str, message: Message) -> list[Message]:
-        return [] if topic == topics.TRUTH and message.frame_id == 3 else [message]  # type: ignore[attr-defined]
+        return [] if isinstance(message, Truth) and message.frame_id == 3 else [message]
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", without_frame_3)
     found = compare(one, two)[topics.TRUTH]
@@ -104,8 +107,8 @@ def test_numbers_differ_as_numpy_says(x: list[float], y: list[float]) -> None:
 
 def test_the_command_accepts_a_change_when_told_to(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
-        if topic == "/estimate/o1":
-            message.nis[0] *= 2  # type: ignore[attr-defined]
+        if topic == "/estimate/o1" and isinstance(message, pb.Estimate):
+            message.nis[0] *= 2
         return [message]
 
     shutil.copy(recorded.path, tmp_path / "right.mcap")
@@ -205,14 +208,14 @@ def test_what_has_no_counterpart_waits_in_a_file_too(
 
 
 def exposure_infos(recording: Recording) -> list[pb.ExposureInfo]:
-    return [each.message for each in recording.messages(topics.EXPOSURE) if isinstance(each.message, pb.ExposureInfo)]
+    return messages_of(pb.ExposureInfo, recording, topics.EXPOSURE)
 
 
 def test_a_full_temporary_folder_is_said(recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     connect = sqlite3.connect
 
     def of_few_pages(*args: Any, **kwargs: Any) -> sqlite3.Connection:
-        file = connect(*args, **kwargs)
+        file: sqlite3.Connection = connect(*args, **kwargs)
         file.execute("PRAGMA max_page_count = 8")
         return file
 
@@ -227,8 +230,8 @@ def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tm
         for name in ("device_ns", "device_start_ns", "host_start_ns"):
             if hasattr(message, name):
                 setattr(message, name, getattr(message, name) + 12345)
-        if topic == topics.IMAGE:
-            message.timestamp.nanos += 1  # type: ignore[attr-defined] # an image's
+        if isinstance(message, RawImage):
+            message.timestamp.nanos += 1
         return [message]
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)

@@ -10,6 +10,7 @@ import tracemalloc
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -298,11 +299,11 @@ def test_small_messages_in_a_large_chunk_cost_no_memory() -> None:
 
 
 def other_writer(
-    source: Recording, path: Path, change: Callable[[RawMessage], RawMessage] = lambda raw: raw, **options: bool
+    source: Recording, path: Path, change: Callable[[RawMessage], RawMessage] = lambda raw: raw, **options: Any
 ) -> None:
     """A recording by the stock writer, as other software may set it up."""
     with path.open("wb") as file:
-        writer = Writer(file, **options)  # type: ignore[arg-type] # of each kind its own
+        writer = Writer(file, **options)
         writer.start()
         writer.add_attachment(0, 0, topics.RIG_ATTACHMENT, "application/toml", source.rig.toml.encode())
         channels: dict[str, int] = {}
@@ -325,7 +326,7 @@ def other_writer(
          "use_summary_offsets": False},
     ],
 )  # fmt: skip
-def test_what_other_writers_leave_out_is_no_damage(recorded: Session, tmp_path: Path, options: dict[str, bool]) -> None:
+def test_what_other_writers_leave_out_is_no_damage(recorded: Session, tmp_path: Path, options: dict[str, Any]) -> None:
     source = Recording(recorded.path)
     other_writer(source, tmp_path / "a.mcap", **options)
     for check in (False, True):

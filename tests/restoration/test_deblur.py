@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from aolink.cli import app
+from aolink.cli.common import app
 from aolink.errors import RestorationError
 from aolink.optics.pictures import read_picture, read_psf, write_picture
 from aolink.restoration import restore
@@ -99,7 +99,7 @@ def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])
 def test_what_is_written_is_read_back(tmp_path: Path, dtype: type, suffix: str) -> None:
-    image = np.random.default_rng(1).integers(0, 250, (9, 11)).astype(dtype)
+    image: np.ndarray = np.random.default_rng(1).integers(0, 250, (9, 11)).astype(dtype)
     path = tmp_path / f"a{suffix}"
     if dtype is np.float32 and suffix == ".png":
         with pytest.raises(RestorationError, match=r"type float32 fits in a \.npy"):

@@ -53,7 +53,7 @@ def make_lines(values: FloatArray, scanner: Scanner = FIRST, n: int = 3, seed: i
     m = values.shape[-1] - 1
     root = np.linalg.cholesky(scene_covariance(scanner, COLUMNS + m) + 1e-12 * np.eye(COLUMNS + m))
     scene = rng.standard_normal((n, COLUMNS + m)) @ root.T
-    return scene @ line_matrix(values, COLUMNS).T + np.sqrt(NOISE) * rng.standard_normal((n, COLUMNS))
+    return np.asarray(scene @ line_matrix(values, COLUMNS).T + np.sqrt(NOISE) * rng.standard_normal((n, COLUMNS)))
 
 
 def test_the_state_space_is_the_transfer_function() -> None:

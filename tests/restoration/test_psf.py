@@ -34,7 +34,7 @@ def on_grid(psf: Psf, low: int, high: int) -> np.ndarray:
 
 def test_a_known_path_gives_the_sensors_own_light() -> None:
     psf = motion_psf(PATH, None, KERNEL, SCALE)
-    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    edges = (np.arange(-30.0, 32.0) - 0.5) * SCALE
     expected = pixel_mass(KERNEL, edges, PATH).mean(axis=0)
     assert abs(on_grid(psf, -30, 30) - expected).max() < 1e-5
     assert psf.values.sum() == pytest.approx(1, abs=1e-12)
@@ -44,7 +44,7 @@ def test_a_known_path_gives_the_sensors_own_light() -> None:
 def test_a_path_on_the_plane_gives_the_sensors_own_light() -> None:
     path = np.stack([PATH, 0.1 * np.cos(4 * STEPS)])
     psf = motion_psf(path, None, KERNEL, SCALE)
-    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    edges = (np.arange(-30.0, 32.0) - 0.5) * SCALE
     expected = pixel_mass_2d(np.eye(2) * KERNEL.variance, edges, edges, path.T).mean(axis=0)
     (row, column), (rows, columns) = psf.origin, psf.values.shape
     inside = expected[30 - row : 30 - row + rows, 30 - column : 30 - column + columns]
@@ -56,11 +56,11 @@ def test_a_path_on_the_plane_gives_the_sensors_own_light() -> None:
 def test_a_kernel_that_is_not_round(correlation: float) -> None:
     """Against quadrature over each pixel."""
     covariance = np.array([[0.05**2, correlation * 0.05 * 0.03], [correlation * 0.05 * 0.03, 0.03**2]])
-    width = linalg.sqrtm(2 * covariance).real
-    kernel = Kernel(shape="gaussian", sigma=0.06, matrix=tuple(map(tuple, width)))  # type: ignore[arg-type] # two by two
+    (a, b), (c, d) = linalg.sqrtm(2 * covariance).real
+    kernel = Kernel(shape="gaussian", sigma=0.06, matrix=((a, b), (c, d)))
     path = np.stack([PATH, 0.1 * np.cos(4 * STEPS)])
     psf = motion_psf(path, None, kernel, SCALE)
-    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    edges = (np.arange(-30.0, 32.0) - 0.5) * SCALE
     expected = pixel_mass_2d(covariance, edges, edges, path.T).mean(axis=0)
     (row, column), (rows, columns) = psf.origin, psf.values.shape
     inside = expected[30 - row : 30 - row + rows, 30 - column : 30 - column + columns]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ def test_backwards_the_filter_runs_the_other_way() -> None:
 def test_any_type_of_number(dtype: type) -> None:
     image, _ = picture(UNIFORM, (3,))
     scale = 200 if np.dtype(dtype).itemsize == 1 else 2000
-    given = (scale * np.clip(image, 0, 1.2)).astype(dtype)
+    given: np.ndarray = (scale * np.clip(image, 0, 1.2)).astype(dtype)
     found = restore(given, UNIFORM).image
     assert found.dtype == dtype
     exact = restore(given.astype(np.float64), UNIFORM).image
@@ -281,9 +282,9 @@ def test_an_even_picture_stays_as_it_is(method: str) -> None:
         (np.zeros((5, 5)), Psf(values=np.ones((4, 2)) / 2, origin=(0,)), {}, "PSFs for 4 pixels"),
     ],
 )
-def test_what_is_no_picture(image: FloatArray, psf: FloatArray, options: dict[str, object], says: str) -> None:
+def test_what_is_no_picture(image: FloatArray, psf: FloatArray, options: dict[str, Any], says: str) -> None:
     with pytest.raises(RestorationError, match=says):
-        restore(image, psf, **options)  # type: ignore[arg-type]
+        restore(image, psf, **options)
 
 
 def test_one_bad_pixel_in_a_colour() -> None:

@@ -338,7 +338,7 @@ def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None
     for path in Path(tables.__file__).parent.glob("*.py"):
         for call in ast.walk(ast.parse(path.read_text())):
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr in readers:
-                asked |= {each.value for each in call.args[:1] if isinstance(each, ast.Constant)}
+                asked |= {str(each.value) for each in call.args[:1] if isinstance(each, ast.Constant)}
     assert asked == KEYS
 
 

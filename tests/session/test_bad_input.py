@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from aolink.cli import app
+from aolink.cli.common import app
 from aolink.devices.interfaces import CommandAnswered
 from aolink.devices.native import NativeCamera
 from aolink.errors import DeviceError, PortError, RecordingError
@@ -404,7 +404,10 @@ def test_a_killed_parent_takes_its_rig_along(tmp_path: Path) -> None:
     assert Path(camera).exists()
     parent.kill()
     parent.communicate()
-    assert any(not Path(camera).exists() or time.sleep(0.05) for _ in range(400))
+    deadline = time.monotonic() + 20
+    while Path(camera).exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from aolink.devices.discovery import identify_port
@@ -22,6 +23,7 @@ from aolink.session import record
 from aolink.wire import hub
 from aolink.wire import messages_pb2 as pb
 from tests.hostile import Lie, changed, lying_rig
+from tests.kinds import messages_of
 
 RIG = load_rig("section-vi-lively")
 HUGE = 2**63 - 1
@@ -251,5 +253,5 @@ def test_a_clock_that_is_set_back_during_a_session(tmp_path: Path) -> None:
     assert abs(error[set_back]) > 45e6
     assert sigma[-1] < 20e6
     assert np.abs(error[sigma < 20e6]).max() < 20e6  # who claims to know is right
-    messages = [m.message.message for m in Recording(path).messages(topics.LOG)]
+    messages = [each.message for each in messages_of(Log, Recording(path), topics.LOG)]
     assert any("the camera's clock was set back by" in text for text in messages)

@@ -19,11 +19,12 @@ import rerun as rr
 from PIL import Image
 
 from aolink.errors import RendererError, ViewerError
-from aolink.viewing import open_viewer, save_rrd, screenshot, serve_web
+from aolink.viewing import open_viewer, screenshot, serve_web
 from aolink.viewing.palette import TRUTH, estimator_colour
+from aolink.viewing.save import save_rrd
 from aolink.viewing.viewer import free_port, headless_viewer, settled_picture
 from aolink.viewing.vulkan import has_vulkan
-from tests.viewing.stand_in import StandIn
+from tests.viewing.stand_in import StandIn, as_recording
 
 TEXTS = ("Session", "Log")
 PICTURES = ("Camera", "Intensity")
@@ -31,7 +32,9 @@ PICTURES = ("Camera", "Intensity")
 
 @pytest.fixture(scope="module")
 def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_rrd(StandIn(n=60, names=("o3", "open-loop")), tmp_path_factory.mktemp("rrd") / "session.rrd")
+    return save_rrd(
+        as_recording(StandIn(n=60, names=("o3", "open-loop"))), tmp_path_factory.mktemp("rrd") / "session.rrd"
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +71,7 @@ def listening(*processes: psutil.Process) -> set[str]:
     return {c.laddr.ip for c in connections if c.status == psutil.CONN_LISTEN}
 
 
-def spread_tabs(layout: dict) -> dict:
+def spread_tabs(layout: dict[str, Any]) -> dict[str, Any]:
     """The layout with all tabs beside each other: the viewer draws only what is visible."""
     for part in layout.values():
         container = part.get("ContainerBlueprint", {})

@@ -13,6 +13,7 @@ from aolink.estimation.pixels import likelihood
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import load_rig
+from tests.kinds import line_of
 
 LIVELY, SHAKEN = load_rig("section-vi-lively"), load_rig("jitter")
 
@@ -127,7 +128,8 @@ def test_paths_without_light_say_nothing():
 
 
 def test_wide_pixels_and_a_narrow_kernel():
-    sensor = dataclasses.replace(LIVELY.sensor, pixels=3, kernel=dataclasses.replace(LIVELY.sensor.kernel, sigma=0.01))
+    narrow = dataclasses.replace(LIVELY.sensor.kernel, sigma=0.01)
+    sensor = dataclasses.replace(line_of(LIVELY), pixels=3, kernel=narrow)
     assert likelihood.reduction(exposure_model(LIVELY.plant, 200), sensor).resolution.stride > 0
 
 
