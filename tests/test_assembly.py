@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.assembly import Assembler, Frame, FrameReassembly, PlanesReassembly, TruthReassembly, _InputHistory
+from aolink.assembly import Assembler, Frame, FrameReassembly, InputHistory, PlanesReassembly, TruthReassembly
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as pb
 
@@ -238,7 +238,7 @@ takes = st.tuples(st.integers(0, 12), st.integers(0, 12))
 @given(st.lists(st.one_of(runs, takes), max_size=25))
 def test_every_step_has_its_last_report_or_command_or_the_input_before(calls: list[tuple[int, ...]]) -> None:
     mirror = replace(RIG.mirror, park=np.zeros(2), dac_bits=0)
-    history, applied, commanded = _InputHistory(mirror), dict[int, float](), dict[int, float]()
+    history, applied, commanded = InputHistory(mirror), dict[int, float](), dict[int, float]()
     value, last, end = 0.0, 0.0, 0
     for call in calls:
         if len(call) == 3:
@@ -310,7 +310,7 @@ def test_a_report_that_cannot_be_changes_nothing() -> None:
 
 
 def test_reports_that_no_frame_uses_are_not_kept_forever() -> None:
-    history = _InputHistory(RIG.mirror)
+    history = InputHistory(RIG.mirror)
     for k in range(5000):
         history.add_applied(pb.Applied(block_id=k + 1, first_step=50 * k, n_steps=50, u=[0.01] * 50))
     assert history.take(0, 100)[1] == 100  # 200 000 steps ago

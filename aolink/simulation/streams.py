@@ -155,7 +155,7 @@ class TcpStream:
         for guest in guests:
             data = guest.receive()
             guest.introduction += data or b""
-            begun = _begins_with_identify(guest.introduction)
+            begun = begins_with_identify(guest.introduction)
             if begun is None and data is not None and time.monotonic() - guest.since_s < INTRODUCTION_S:
                 self._guests.append(guest)
             elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < IDLE_S):
@@ -179,7 +179,7 @@ class TcpStream:
         self._listener.close()
 
 
-def _begins_with_identify(data: bytes) -> bool | None:
+def begins_with_identify(data: bytes) -> bool | None:
     """Whether bytes begin with a whole Identify packet; None while that cannot be known yet."""
     piece, end, _ = data.partition(DELIMITER)
     if not end:

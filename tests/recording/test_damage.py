@@ -19,6 +19,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message as Message_
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import IndexType, Writer
@@ -47,8 +48,6 @@ def many_chunks(recorded: Session, tmp_path_factory: pytest.TempPathFactory) -> 
         file.add(raw.topic, schema_of(topics.SCHEMAS[raw.schema]), raw.data, raw.log_time_ns, raw.sequence)
     file.finish()
     with path.open("rb") as opened:
-        from mcap.reader import make_reader
-
         summary = make_reader(opened).get_summary()
     assert summary is not None
     chunks = [(each.chunk_start_offset, each.chunk_start_offset + each.chunk_length) for each in summary.chunk_indexes]
@@ -211,9 +210,10 @@ def test_only_the_chunks_of_the_asked_time_and_topics_are_read(
     (path := tmp_path / "a.mcap").write_bytes(data)
     everything = [(each.log_time_ns, each.sequence) for each in Recording(path).messages()]
     middle = sorted(time for time, _ in everything)[len(everything) // 2]
-    recording = Recording(path)
-    assert recording._index is not None
-    for index in recording._index:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    for index in summary.chunk_indexes:
         if index.message_start_time >= middle:
             data[index.chunk_start_offset + 60] ^= 0xFF
     path.write_bytes(data)

@@ -118,7 +118,7 @@ def test_what_the_mirror_no_longer_knows_is_not_reported_and_assumed_as_converte
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The line from the mirror is dead for longer than it remembers; the commands get there all the while."""
-    monkeypatch.setattr(devices, "_HISTORY_WATCHDOGS", 0)  # then it remembers as many steps as its queue has
+    monkeypatch.setattr(devices, "history_steps", lambda rig: rig.mirror.queue_steps)
     hub = SimulatedTimeHub(RIG)
     hub.at = [
         (1_300_000_000, lambda: hub.cut(to_device=False)),

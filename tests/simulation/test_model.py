@@ -175,9 +175,10 @@ def test_too_few_inputs_are_refused():
 def test_many_copies_are_as_independent_as_their_noise():
     plant = dataclasses.replace(RIG.plant, axes=3)
     rig = dataclasses.replace(RIG, plant=plant)
-    states = RigModel(rig, 1)._run(np.zeros((5, 3)))
-    assert states.shape == (6, 3, 2)
-    assert len(np.unique(states[5])) == 6
+    (exposure,) = simulate(rig, 1, seed=1, inputs=np.zeros((200, 3)))
+    state = truth_of(exposure).end_state
+    assert state.shape == (3, 2)
+    assert len(np.unique(state)) == 6
 
 
 def with_light(rig: Rig, lights: str, **sensor: Any) -> Rig:

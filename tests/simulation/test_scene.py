@@ -12,6 +12,7 @@ from PIL import Image
 from scipy import ndimage
 
 from aolink.errors import RigError
+from aolink.exposure import Picture
 from aolink.optics.scene import SceneSensor, framed
 from aolink.optics.sensor import Kernel
 from aolink.restoration import motion_psf
@@ -19,7 +20,7 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.simulation.model import RigModel, simulate
 from aolink.simulation.scene import SceneCamera
-from tests.kinds import must_be
+from tests.kinds import must_be, truth_of
 
 RIG = load_rig("moving-scene")
 SCENE = must_be(SceneSensor, RIG.scene)
@@ -131,12 +132,14 @@ def test_the_spot_is_the_same_without_the_scene() -> None:
 
 
 def test_an_exposure_between_steps_weighs_its_ends() -> None:
-    """Half a step late on a path that jumps in the step after the last: half a step of the jump is seen."""
-    late = replace(RIG, timing=replace(RIG.timing, exposure_steps=4, frame_period_steps=4, exposure_offset=0.5))
-    model = RigModel(late)
-    path, weights = model._held(np.array([[0.0, 1.0, 2.0, 3.0]]), np.array([[4.0, 0.0]]))
-    assert path.tolist() == [[0, 1, 2, 3, 4]]
-    assert weights.tolist() == [0.125, 0.25, 0.25, 0.25, 0.125]
+    """Half a step late, half of the first step and half of the one after the last are seen."""
+    timing = replace(RIG.timing, exposure_steps=4, frame_period_steps=4, exposure_offset=0.5)
+    late = replace(RIG, timing=timing, scene=replace(SCENE, noise_sd=0.0))
+    (exposure,) = simulate(late, 1)
+    truth = truth_of(exposure)
+    path = np.concatenate([truth.path, late.plant.C @ truth.end_state.T], axis=1)
+    expected = SceneCamera(late, np.random.default_rng(0)).frame(path, np.array([1, 2, 2, 2, 1]) / 8, "moving")
+    np.testing.assert_array_equal(must_be(Picture, exposure.scene).pixels, expected)
 
 
 def scene_text(**changes: object) -> str:

@@ -88,7 +88,7 @@ def test_who_begins_with_anything_else_is_dropped_unheard(stream: TcpStream, sen
 
 @given(st.binary(max_size=200))
 def test_no_other_bytes_pass(data: bytes) -> None:
-    assert streams._begins_with_identify(data) is not True
+    assert streams.begins_with_identify(data) is not True
 
 
 def test_who_says_nothing_is_dropped_and_locks_nobody_out(stream: TcpStream, monkeypatch: pytest.MonkeyPatch) -> None:
