@@ -101,8 +101,8 @@ class TcpStream:
     """A TCP port that serves one host at a time; ``name`` is the address for pyserial.
 
     A connection that begins with anything but an Identify packet is closed at once, and one that has sent nothing is
-    closed after `INTRODUCTION_S`. A host that has identified itself keeps the port until it leaves; once it has been
-    silent for `IDLE_S`, the next host that identifies itself takes its place.
+    closed after `introduction_s`. A host that has identified itself keeps the port until it leaves; once it has been
+    silent for `idle_s`, the next host that identifies itself takes its place.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -112,6 +112,7 @@ class TcpStream:
         except OSError as error:
             raise PortError(f"cannot listen on {host}:{port}: {error.strerror}; give another --listen") from None
         self._listener.setblocking(False)
+        self.introduction_s, self.idle_s = INTRODUCTION_S, IDLE_S
         self._peer: _Peer | None = None
         self._guests: list[_Peer] = []
         """Connections that have not identified themselves yet, oldest first."""
@@ -156,9 +157,9 @@ class TcpStream:
             data = guest.receive()
             guest.introduction += data or b""
             begun = begins_with_identify(guest.introduction)
-            if begun is None and data is not None and time.monotonic() - guest.since_s < INTRODUCTION_S:
+            if begun is None and data is not None and time.monotonic() - guest.since_s < self.introduction_s:
                 self._guests.append(guest)
-            elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < IDLE_S):
+            elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < self.idle_s):
                 self._hang_up()
                 self._peer, admitted = guest, guest.introduction
             else:

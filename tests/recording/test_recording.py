@@ -259,7 +259,6 @@ def test_whatever_goes_wrong_in_the_writers_thread_reaches_the_session(tmp_path:
 
 def test_a_disk_that_does_not_answer_is_an_error_not_a_hang(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write that blocks: a pipe whose reader has stopped reading stands for the disk."""
-    monkeypatch.setattr("aolink.recording.writer._STALL_S", 0.2)
     reader, disk = os.pipe()
     monkeypatch.setattr("aolink.files.create", lambda *_, **__: disk)  # which refuses a pipe that has a name
     fcntl.fcntl(disk, fcntl.F_SETPIPE_SZ, 1 << 20)  # for what a recording begins with

@@ -20,7 +20,6 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
-from aolink.wire import hub
 from aolink.wire import messages_pb2 as pb
 from tests.hostile import Lie, changed, lying_rig
 from tests.kinds import messages_of
@@ -202,13 +201,10 @@ def flood(after: type[Message], begun: threading.Event) -> Lie:
 
 
 @pytest.mark.parametrize("real_time", [False, True])
-def test_a_flood_ends_the_session_before_it_fills_the_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_time: bool
-) -> None:
-    monkeypatch.setattr(hub, "_BUDGET_BYTES", 1 << 20)
+def test_a_flood_ends_the_session_before_it_fills_the_memory(tmp_path: Path, real_time: bool) -> None:
     lies = {"camera": flood(pb.Ack, threading.Event())}
     assert_caught(
-        tmp_path, lies, "have sent messages of . MiB without answering, expected at most", real_time=real_time
+        tmp_path, lies, "have sent messages of .* MiB without answering, expected at most", real_time=real_time
     )
 
 

@@ -91,11 +91,11 @@ def test_no_other_bytes_pass(data: bytes) -> None:
     assert streams.begins_with_identify(data) is not True
 
 
-def test_who_says_nothing_is_dropped_and_locks_nobody_out(stream: TcpStream, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_says_nothing_is_dropped_and_locks_nobody_out(stream: TcpStream) -> None:
     with connect(stream) as idle, connect(stream) as host:
         host.sendall(IDENTIFY)  # served although the other one was there before
         assert taken(stream, lambda data: data != b"")
-        monkeypatch.setattr(streams, "INTRODUCTION_S", 0.0)
+        stream.introduction_s = 0.0
         taken(stream, lambda data: is_closed(idle))
         assert not is_closed(host)
 
@@ -110,15 +110,13 @@ def test_idle_connections_are_bounded(stream: TcpStream) -> None:
         each.close()
 
 
-def test_a_silent_host_gives_way_to_one_that_identifies_itself(
-    stream: TcpStream, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_silent_host_gives_way_to_one_that_identifies_itself(stream: TcpStream) -> None:
     with connect(stream) as first, connect(stream) as second, connect(stream) as page:
         first.sendall(IDENTIFY)
         taken(stream, lambda data: data != b"")
         second.sendall(IDENTIFY)
         taken(stream, lambda data: is_closed(second))  # the first one has the port
-        monkeypatch.setattr(streams, "IDLE_S", 0.0)
+        stream.idle_s = 0.0
         page.sendall(POST)
         taken(stream, lambda data: is_closed(page))
         assert not is_closed(first)  # nobody who can take its place has come

@@ -12,7 +12,6 @@ from aolink.estimation.frames.frame_data import Flux, Profile
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import blocks, quadrature_paths
-from aolink.estimation.moments import windowed
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.optics.camera import pixel_noise_variance, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
@@ -186,13 +185,6 @@ def test_a_blur_that_has_several_readings_is_not_believed_in_one(resonance_hz):
     o1, ours = (errors(exposures, estimates[name]) for name in ("o1", "moments"))
     assert upper_bound_of_ratio(ours, o1) <= (1.02 if resonance_hz == 5 else 0.7)
     assert score(exposures, estimates["moments"], 10).end_nees.mean < 2.6
-
-
-def test_without_the_memory_of_the_plant_it_would_be(monkeypatch):
-    rig = rig_with(0, 0.001, resonance_hz=5.0)
-    exposures = simulate(rig, 110, seed=2, inputs=np.zeros((22_000, 1)))
-    monkeypatch.setattr(windowed, "_MOST_MEMORY", 1.0)
-    assert score(exposures, run(rig, exposures, ["moments"])["moments"], 10).end_nees.mean > 6
 
 
 @pytest.mark.parametrize("basis", BASES)
