@@ -41,7 +41,7 @@ def feed(reassembly: FrameReassembly, parts: list[pb.FrameChunk]) -> list[Frame]
     return [frame for i, part in enumerate(parts) for frame in reassembly.add(part, 1000 + i)]
 
 
-def test_a_whole_frame() -> None:
+def test_chunks_of_a_whole_frame_make_its_picture() -> None:
     (frame,) = feed(FrameReassembly(SHAPE, 1_000_000), chunks(5))
     assert np.array_equal(frame.pixels, PICTURE)
     assert frame.mask.all()

@@ -91,7 +91,7 @@ def test_white_pixels_in_the_place_of_white_differences() -> None:
     assert abs(found.ravel() - expected).max() < 1e-8
 
 
-def test_differences_and_their_transpose() -> None:
+def test_differences_and_their_transpose_are_adjoint() -> None:
     rng = np.random.default_rng(4)
     x, along, down = rng.standard_normal((5, 6)), rng.standard_normal((5, 5)), rng.standard_normal((4, 6))
     one = (np.diff(x, axis=1) * along).sum() + (np.diff(x, axis=0) * down).sum()

@@ -53,7 +53,7 @@ def test_a_path_on_the_plane_gives_the_sensors_own_light() -> None:
 
 
 @pytest.mark.parametrize("correlation", [-0.95, -0.5, 0.02, 0.5, 0.9])
-def test_a_kernel_that_is_not_round(correlation: float) -> None:
+def test_a_kernel_that_is_not_round_gives_the_sensors_own_light(correlation: float) -> None:
     """Against quadrature over each pixel."""
     covariance = np.array([[0.05**2, correlation * 0.05 * 0.03], [correlation * 0.05 * 0.03, 0.03**2]])
     (a, b), (c, d) = linalg.sqrtm(2 * covariance).real
@@ -163,7 +163,7 @@ def test_plain_numbers_are_normalised_and_centred() -> None:
         ([0.0, 0.0], "zero everywhere"),
     ],
 )
-def test_what_is_no_psf(values: list[float], says: str) -> None:
+def test_values_that_are_no_psf_are_refused(values: list[float], says: str) -> None:
     with pytest.raises(RestorationError, match=says):
         as_psf(values)
 
@@ -183,12 +183,14 @@ def test_an_origin_outside_the_taps() -> None:
         (np.zeros(10), None, 0.0, "above zero"),
     ],
 )
-def test_what_is_no_path(path: np.ndarray, covariance: np.ndarray | None, scale: float, says: str) -> None:
+def test_a_path_that_is_none_is_refused(
+    path: np.ndarray, covariance: np.ndarray | None, scale: float, says: str
+) -> None:
     with pytest.raises(RestorationError, match=says):
         motion_psf(path, covariance, KERNEL, scale)
 
 
 @pytest.mark.parametrize("shares", [np.ones(9), np.full(10, math.nan), np.r_[-0.1, np.ones(9)], np.zeros(10)])
-def test_what_are_no_shares(shares: np.ndarray) -> None:
+def test_shares_that_are_none_are_refused(shares: np.ndarray) -> None:
     with pytest.raises(RestorationError, match="expected 10, of which none is negative, and some not zero"):
         motion_psf(np.zeros(10), None, KERNEL, SCALE, shares)

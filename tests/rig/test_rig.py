@@ -326,7 +326,7 @@ def test_a_key_that_is_missing_is_not_taken_for_one_that_is_there() -> None:
 
 
 @pytest.mark.parametrize("value", ["1" * 400, "1" * 5000, "[" * 5000])
-def test_numbers_and_nesting_beyond_what_can_be_read(value: str) -> None:
+def test_numbers_and_nesting_beyond_what_can_be_read_are_refused(value: str) -> None:
     for key in ("sigma = 0.05", "process_noise = 0.1 "):
         with pytest.raises(RigError):
             parse_rig(changed(key, f"{key.split()[0]} = {value} "))

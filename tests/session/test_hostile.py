@@ -106,13 +106,17 @@ CAMERA = [
 
 
 @pytest.mark.parametrize(("kind", "field", "value"), MIRROR)
-def test_a_mirror_that_lies(tmp_path: Path, kind: type[Message], field: str, value: object) -> None:
+def test_a_mirror_that_lies_ends_the_session_with_the_field(
+    tmp_path: Path, kind: type[Message], field: str, value: object
+) -> None:
     lies = {"mirror": changed(kind, says(field, value), 30 if kind is pb.VirtualTime else 3)}
     assert_caught(tmp_path, lies, rf"the mirror says {kind.__name__}\.{field}.* = .*, expected ")
 
 
 @pytest.mark.parametrize(("kind", "field", "value"), CAMERA)
-def test_a_camera_that_lies(tmp_path: Path, kind: type[Message], field: str, value: object) -> None:
+def test_a_camera_that_lies_ends_the_session_with_the_field(
+    tmp_path: Path, kind: type[Message], field: str, value: object
+) -> None:
     # The length of the data is what does not fit where the offset is wrong, the last step where the first one is.
     named = {"offset": "data", "first_step": "last_step"}.get(field, field)
     assert_caught(
@@ -147,7 +151,7 @@ def test_a_mirror_of_another_rig_file(tmp_path: Path, field: str, value: object)
     )
 
 
-def test_counts_beyond_the_converter(tmp_path: Path) -> None:
+def test_counts_beyond_the_converter_end_the_session(tmp_path: Path) -> None:
     rig = replace(RIG, sensor=replace(RIG.sensor, bit_depth=12))
     bright = changed(pb.FrameChunk, says("data", lambda chunk: b"\xff\xff" * (len(chunk.data) // 2)))
     with (
@@ -162,7 +166,7 @@ def test_a_code_that_nobody_knows_is_a_refusal(tmp_path: Path) -> None:
     assert_caught(tmp_path, lies, "the camera refused to start: code 77")
 
 
-def test_what_the_other_device_has_to_say(tmp_path: Path) -> None:
+def test_a_device_that_says_what_the_other_has_to_say_is_refused(tmp_path: Path) -> None:
     def lie(message: Message) -> Message:
         return pb.CommandAck(block_id=1) if isinstance(message, pb.FrameChunk) else message
 

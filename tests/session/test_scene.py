@@ -402,7 +402,7 @@ def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None
         _ = Recording(broken).true_scene
 
 
-def test_the_command(aolink: Run, session: Path, tmp_path: Path) -> None:
+def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: Path) -> None:
     shutil.copy(session, tmp_path / "a.mcap")
     done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap", "--json")
     assert done.returncode == 0, done.stderr

@@ -92,7 +92,7 @@ def test_along_x_alone_it_is_as_on_the_plane(small: tuple[Rig, SceneSensor]) -> 
     np.testing.assert_allclose(intensity(rig, path), intensity(rig, np.concatenate([path, 0 * path])), atol=3e-5)
 
 
-def test_lights(small: tuple[Rig, SceneSensor]) -> None:
+def test_each_light_gives_its_own_scene(small: tuple[Rig, SceneSensor]) -> None:
     rig, sensor = small
     path = np.zeros((1, 4))
     assert np.abs(intensity(rig, path, "dark")).max() < 1e-4
@@ -162,7 +162,7 @@ def scene_text(**changes: object) -> str:
         ({"sigma": "[[0.1, 0], [0, 0.2]]"}, r"kernel\.sigma is a matrix"),
     ],
 )
-def test_what_is_wrong_in_the_table(changes: dict[str, object], message: str) -> None:
+def test_what_is_wrong_in_the_table_is_named(changes: dict[str, object], message: str) -> None:
     with pytest.raises(RigError, match=message):
         parse_rig(scene_text(**changes))
 
@@ -178,7 +178,7 @@ def test_only_the_simulator_opens_the_picture(tmp_path: Path) -> None:
     assert simulate(parse_rig(RIG.toml, tmp_path), 1)[0].scene is not None  # it comes with aolink
 
 
-def test_pictures_of_any_kind(tmp_path: Path) -> None:
+def test_pictures_of_any_kind_are_read_as_intensities(tmp_path: Path) -> None:
     """Eight and sixteen bits and colours are 0 to 1; what is beside the rig file goes before what comes with aolink."""
     sensor = replace(SCENE, shape=(8, 8), picture_pixels=1, picture="moving-scene.png")
     for picture, expected in (

@@ -141,7 +141,7 @@ def test_with_the_word_they_may() -> None:
         each.close()
 
 
-def test_no_such_host() -> None:
+def test_a_host_that_is_not_there_is_refused() -> None:
     with pytest.raises(PortError, match="there is no host no such host"):
         open_streams("no such host:0")
 

@@ -79,7 +79,7 @@ def test_a_resting_spot_gives_little_to_combine():
     assert passing.index > at_rest.index
 
 
-def test_its_value_and_noise():
+def test_the_outputs_value_and_noise_are_those_of_its_weights():
     output = passive_output(MODEL, *POINTS[0])
     R = np.array([[0.02, 0.001], [0.001, 0.01]])
     y = output.expected + np.array([[0.1, 0.2], [0.0, 0.0]])

@@ -58,14 +58,14 @@ def test_the_camera_s_picture_lies_under_the_path(tmp_path: Path) -> None:
         assert np.abs(np.flatnonzero(near) - where).min() < 15
 
 
-def test_lost_frames_and_no_truth(tmp_path: Path) -> None:
+def test_without_a_truth_paths_are_drawn_and_errors_are_not(tmp_path: Path) -> None:
     bare = StandIn(n=60, lost=(20, 21, 22, 40), with_truth=False)
     _, inside, errors = parts(pixels(draw_session(as_recording(bare), tmp_path / "a.png")))
     assert coloured(inside, estimator_colour("o3")).sum() > 200
     assert coloured(errors, estimator_colour("o3")).sum() == 0
 
 
-def test_spots_on_a_plane(tmp_path: Path) -> None:
+def test_spots_on_a_plane_are_drawn_too(tmp_path: Path) -> None:
     simulated = Simulated(load_rig("sh-4x4"))
     _, inside, _ = parts(pixels(draw_session(as_recording(simulated), tmp_path / "a.png")))
     assert coloured(inside, estimator_colour("o1")).sum() > 200

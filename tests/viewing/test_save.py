@@ -133,7 +133,9 @@ def test_states_stand_where_they_hold(recording: StandIn, entities: Entities) ->
 
 
 @pytest.mark.parametrize(("name", "degrees"), [("o1", 1), ("o3", 2)])
-def test_nis_and_its_bounds(recording: StandIn, entities: Entities, name: str, degrees: int) -> None:
+def test_nis_is_shown_between_its_95_percent_bounds(
+    recording: StandIn, entities: Entities, name: str, degrees: int
+) -> None:
     np.testing.assert_array_equal(
         scalars(entities[f"/nis/{name}/value"])[:, 0], [e.nis[0] for e in recording.estimates(name)]
     )
@@ -217,7 +219,7 @@ def test_losses_add_up(entities: Entities) -> None:
     assert scalars(entities["/link/lost/chunks"])[:, 0].tolist() == [0] * 4 + [1] * 7
 
 
-def test_link_and_clock(entities: Entities) -> None:
+def test_what_links_and_clocks_do_is_shown_in_its_units(entities: Entities) -> None:
     np.testing.assert_allclose(scalars(entities["/link/received/mirror"])[:, 0], 180)
     np.testing.assert_allclose(scalars(entities["/link/round_trip/camera"])[:, 0], 0.2)
     np.testing.assert_allclose(scalars(entities["/clock/offset/camera"])[:, 0], [0, 20, 40])

@@ -102,7 +102,7 @@ def test_predicted_moments_and_jacobian_with_cross_terms(tilt):
             np.testing.assert_allclose(H[axis, :, k], slope, atol=1e-8)
 
 
-def test_every_step_is_filterpys(tilt):
+def test_every_step_is_the_one_of_filterpy(tilt):
     rng = np.random.default_rng(3)
     model = exposure_model(tilt, N)
     ours = BlurFilter(tilt, PathMoments(tilt, (1, 2), crosses=True))

@@ -71,7 +71,7 @@ def our_steps(plant, orders, u, moments, gain=None, **options):
 
 
 @pytest.mark.parametrize("name", ["o1", "o2", "o3"])
-def test_every_step_is_filterpys(name):
+def test_every_step_is_the_one_of_filterpy(name):
     u, moments, _ = scenario()
     orders, pick = ORDERS[name], selected(ORDERS[name])
     A_N, Q = lift(PLANT, N)

@@ -132,7 +132,7 @@ def test_noise_path_is_that_of_the_fast_steps_to_the_share_that_is_stated(plant,
     assert share == pytest.approx(best, rel=1e-3)
 
 
-def test_end_covariance_is_whole(plant, model):
+def test_the_end_has_the_whole_covariance_of_the_noise(plant, model):
     reached = model.end_rows[:, plant.n_states :]
     _, noise = lift(plant, N)
     np.testing.assert_allclose(reached @ reached.T + model.end_remainder, noise, atol=1e-12 * noise.max())

@@ -225,7 +225,7 @@ def test_better_than_o1_and_right_about_it(V):
 
 
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_order_matters(name):
+def test_frames_in_another_order_ruin_the_estimate(name):
     """Frames fed in another order must ruin the estimate: it is the frames that it lives by."""
     exposures = simulate(RIG, 24, seed=9)
     order = np.random.default_rng(1).permutation(24)
@@ -296,7 +296,7 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
 
 
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_nor_do_its_nodes(name):
+def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it(name):
     """One axis of three is commanded; the others are looked at as coarsely as alone."""
     density = np.random.default_rng(3).standard_normal((3, 40)) * 0.3 + exposure_density(
         RIG.sensor.kernel, line_of(RIG).edges, np.zeros(2)
@@ -376,7 +376,7 @@ def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
 @pytest.mark.parametrize("temper", [False, True])
-def test_a_single_coefficient(updates, temper, monkeypatch):
+def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(updates, temper, monkeypatch):
     """Of one state without process noise the posterior is an integral over a line."""
     noise = 0.0 * RIG.plant.process_noise
     one = np.ones((1, 1))
