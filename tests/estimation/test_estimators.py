@@ -374,8 +374,10 @@ def test_the_loop_over_numbers_is_the_filter_in_arrays():
         some[k] = dataclasses.replace(some[k], pixels=some[k - 7].pixels[:, ::-1].copy())
     some[30] = dataclasses.replace(some[30], inputs=np.full_like(some[30].inputs, np.nan))
     some[50:] = [dataclasses.replace(each, first_step=each.first_step + 9) for each in some[50:]]
-    in_arrays = Driver(rig, ["o3"])
-    in_arrays.estimators = [Estimator(rig, "o3", BlurFilter(rig.plant, PathMoments(rig.plant, (1, 2))))]
-    ours, theirs = ([each for _, (each,) in driver.steps(some)] for driver in (Driver(rig, ["o3"]), in_arrays))
+    written, arrays = Driver(rig, ["o3"]), Driver(rig, ["o3"])
+    arrays.estimators = [Estimator(rig, "o3", BlurFilter(rig.plant, PathMoments(rig.plant, (1, 2))))]
+    ours, theirs = ([each for _, (each,) in driver.steps(some)] for driver in (written, arrays))
     assert first_difference(ours, theirs) is None
     assert {each.status for each in ours} >= {Status.OK, Status.GATED}
+    one, two = (must_be(BlurFilter, driver.estimators[0].filter).prior for driver in (written, arrays))
+    np.testing.assert_array_equal(one.covariance, two.covariance)
