@@ -180,7 +180,7 @@ _Blocks = list[tuple[int, NDArray[np.float64]]]
 """First steps and inputs of runs of steps, (k, n_inputs), in the order in which they came."""
 
 
-class _InputHistory:
+class InputHistory:
     """Inputs that the mirror applied, and inputs that it was sent, for every fast step not yet used."""
 
     def __init__(self, mirror: MirrorDriver) -> None:
@@ -291,7 +291,7 @@ class Assembler:
     """Frames wait here until the inputs of their steps are known, and leave as exposures, in order."""
 
     def __init__(self, rig: Rig) -> None:
-        self._history = _InputHistory(rig.mirror)
+        self._history = InputHistory(rig.mirror)
         self._no_lead = np.empty((0, rig.n_inputs))
         self._fast_step_ns = rig.timing.fast_step_ns
         self._frames: deque[Frame] = deque()

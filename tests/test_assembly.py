@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.assembly import Assembler, Frame, FrameReassembly, PlanesReassembly, TruthReassembly, _InputHistory
+from aolink.assembly import Assembler, Frame, FrameReassembly, InputHistory, PlanesReassembly, TruthReassembly
 from aolink.rig import load_rig
 from aolink.wire import messages_pb2 as pb
 
@@ -41,7 +41,7 @@ def feed(reassembly: FrameReassembly, parts: list[pb.FrameChunk]) -> list[Frame]
     return [frame for i, part in enumerate(parts) for frame in reassembly.add(part, 1000 + i)]
 
 
-def test_a_whole_frame() -> None:
+def test_chunks_of_a_whole_frame_make_its_picture() -> None:
     (frame,) = feed(FrameReassembly(SHAPE, 1_000_000), chunks(5))
     assert np.array_equal(frame.pixels, PICTURE)
     assert frame.mask.all()
@@ -162,7 +162,7 @@ def test_a_lost_report_is_replaced_by_the_command_and_counted() -> None:
     assembler.add_applied(applied(150, 200))
     (exposure,) = assembler.add_frame(frame_at(0))
     assert exposure.inputs_assumed == 50
-    assert np.array_equal(exposure.inputs[100:150], RIG.mirror.quantise(2e-3 * np.arange(100, 150)[:, None]))
+    assert np.array_equal(exposure.inputs[100:150], RIG.mirror.quantise(2e-3 * np.arange(100.0, 150.0)[:, None]))
     assert not np.array_equal(exposure.inputs[100:150, 0], 2e-3 * np.arange(100, 150))
 
 
@@ -192,7 +192,7 @@ def test_an_exposure_waits_no_longer_when_reports_are_given_up() -> None:
     assert assembler.add_applied(applied(150, 200)) == []
     (exposure,) = assembler.add_applied(without_report(pb.Applied.NOT_REPORTED, 0, 150))
     assert exposure.inputs_assumed == 150
-    assert np.array_equal(exposure.inputs[:150], RIG.mirror.quantise(2e-3 * np.arange(150)[:, None]))
+    assert np.array_equal(exposure.inputs[:150], RIG.mirror.quantise(2e-3 * np.arange(150.0)[:, None]))
 
 
 def test_a_step_that_nothing_is_known_of_holds_the_last_value() -> None:
@@ -221,7 +221,7 @@ def test_the_order_of_frames_and_reports_does_not_matter(data: st.DataObject) ->
     assembler, exposures = Assembler(RIG), []
     waiting = list(frames)
     for report in reports:
-        while waiting and data.draw(st.booleans()):
+        while len(waiting) > 0 and data.draw(st.booleans()):
             exposures += assembler.add_frame(waiting.pop(0))
         exposures += assembler.add_applied(report)
     for frame in waiting:
@@ -238,14 +238,16 @@ takes = st.tuples(st.integers(0, 12), st.integers(0, 12))
 @given(st.lists(st.one_of(runs, takes), max_size=25))
 def test_every_step_has_its_last_report_or_command_or_the_input_before(calls: list[tuple[int, ...]]) -> None:
     mirror = replace(RIG.mirror, park=np.zeros(2), dac_bits=0)
-    history, applied, commanded = _InputHistory(mirror), dict[int, float](), dict[int, float]()
+    history, applied, commanded = InputHistory(mirror), dict[int, float](), dict[int, float]()
     value, last, end = 0.0, 0.0, 0
     for call in calls:
         if len(call) == 3:
             reported, first, n_steps = call
             u = [value := value + 1.0 for _ in range(n_steps)]
-            kind, add = (pb.Applied, history.add_applied) if reported else (pb.CommandBlock, history.add_command)
-            add(kind(first_step=first, n_steps=n_steps, u=np.repeat(u, 2)))
+            if reported:
+                history.add_applied(pb.Applied(first_step=first, n_steps=n_steps, u=np.repeat(u, 2)))
+            else:
+                history.add_command(pb.CommandBlock(first_step=first, n_steps=n_steps, u=np.repeat(u, 2)))
             (applied if reported else commanded).update(zip(range(first, first + n_steps), u, strict=True))
             continue
         first = max(0, end + call[0] - 3)  # a few steps again, or a gap
@@ -308,7 +310,7 @@ def test_a_report_that_cannot_be_changes_nothing() -> None:
 
 
 def test_reports_that_no_frame_uses_are_not_kept_forever() -> None:
-    history = _InputHistory(RIG.mirror)
+    history = InputHistory(RIG.mirror)
     for k in range(5000):
         history.add_applied(pb.Applied(block_id=k + 1, first_step=50 * k, n_steps=50, u=[0.01] * 50))
     assert history.take(0, 100)[1] == 100  # 200 000 steps ago

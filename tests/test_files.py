@@ -162,7 +162,7 @@ def test_the_file_is_on_the_disk_before_it_has_its_name_and_the_name_after(
         real = getattr(os, name)
 
         def watched(first: int | Path, *rest: Path) -> None:
-            folder = name == "fsync" and stat.S_ISDIR(os.fstat(first).st_mode)  # type: ignore[arg-type]
+            folder = isinstance(first, int) and stat.S_ISDIR(os.fstat(first).st_mode)
             seen.append(f"{name} folder" if folder else name)
             real(first, *rest)
 

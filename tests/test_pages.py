@@ -23,12 +23,14 @@ import numpy as np
 import pytest
 import typer
 from PIL import Image
+from typer.core import TyperGroup
 
 from aolink.cli.common import app
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
+from tests.kinds import must_be
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -218,7 +220,7 @@ def test_the_architecture_names_what_there_is() -> None:
 
 def test_commands_in_the_text_have_the_options_that_they_are_given() -> None:
     """Commands inside sentences are not run, but neither may they name what there is not."""
-    known = typer.main.get_command(app).commands  # type: ignore[attr-defined] # it is a group
+    known = must_be(TyperGroup, typer.main.get_command(app)).commands
     seen = 0
     for page in PAGES:
         for text in re.findall(r"`(aolink [a-z][^`]*)`", page.read_text()):

@@ -13,16 +13,18 @@ import sys
 import termios
 import time
 from collections.abc import Callable, Iterator
+from io import TextIOBase
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import pytest
 
-from aolink.cli import app
+from aolink.cli.common import app
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.editing import cut
 from aolink.recording.reader import Recording
 from tests.conftest import Session
+from tests.kinds import must_be
 
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 _PATIENCE_S = 120.0
@@ -77,7 +79,7 @@ def test_there_is_a_case_for_every_command() -> None:
 class Started:
     """A command as a process, in a folder of its own with a folder of its own for temporary files."""
 
-    def __init__(self, folder: Path, words: str, **options: object) -> None:
+    def __init__(self, folder: Path, words: str, **options: Any) -> None:
         self.temporary = folder / "temporary"
         self.temporary.mkdir(parents=True)
         (folder / "work").mkdir()
@@ -85,7 +87,7 @@ class Started:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "aolink", *shlex.split(words)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE, text=True, cwd=self.folder,
-            env={**os.environ, "TMPDIR": str(self.temporary), "PYTHONUNBUFFERED": "1"}, **options,  # type: ignore[call-overload]
+            env={**os.environ, "TMPDIR": str(self.temporary), "PYTHONUNBUFFERED": "1"}, **options,
         )  # fmt: skip
 
     def __enter__(self) -> Self:
@@ -142,9 +144,9 @@ def test_a_signal_ends_a_command_that_has_just_begun(
 
 
 MIDST: dict[str, Callable[[Started], bool]] = {
-    "rig": lambda it: "camera" in it.process.stdout.readline(),  # type: ignore[union-attr]
+    "rig": lambda it: "camera" in must_be(TextIOBase, it.process.stdout).readline(),
     "record": lambda it: (it.folder / "a.mcap").exists() and (it.folder / "a.mcap").stat().st_size > 30_000,
-    "calibrate": lambda it: "dark: cover the camera" in it.process.stderr.read(30),  # type: ignore[union-attr]
+    "calibrate": lambda it: "dark: cover the camera" in must_be(TextIOBase, it.process.stderr).read(30),
     "demo": lambda it: bool(it.unfinished()) and any("session.rrd" in each.name for each in it.unfinished()),
     "compare": lambda it: bool([*it.temporary.glob("aolink-*/.*.partial")]),
     **dict.fromkeys(

@@ -169,6 +169,7 @@ def _estimate_one(
     only: bool, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli import tables
+    from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
         check_has_exposures,
@@ -180,7 +181,7 @@ def _estimate_one(
 
     recording = model.applied_to(open_recording(file))
     check_has_exposures(recording)
-    names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
+    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     total, known = recording.n_frames, recording.damage
     try:
         get_ready(recording.rig, names)

@@ -22,6 +22,7 @@ class _NamingMethods(TyperCommand):
 
     def format_help(self, *arguments: Any, **named: Any) -> None:
         from aolink.restoration import METHODS, find_method
+        from aolink.restoration.registry import DEFAULT_METHOD
 
         def told(name: str) -> str:
             try:
@@ -31,7 +32,7 @@ class _NamingMethods(TyperCommand):
 
         for each in self.params:
             if isinstance(each, TyperOption) and each.name == "method":
-                each.help = f"{'; '.join(map(told, METHODS))}."
+                each.help, each.default = f"{'; '.join(map(told, METHODS))}.", DEFAULT_METHOD
         super().format_help(*arguments, **named)
 
 
@@ -70,7 +71,7 @@ def deblur(
             " is where the scene stays in place.",
         ),
     ] = None,
-    method: Annotated[str, typer.Option(help="The restoration method.")] = "tv",
+    method: Annotated[str | None, typer.Option(help="The restoration method.")] = None,
     noise_sd: Annotated[
         float | None, typer.Option(help="Noise of --image, in its own counts; estimated from it by default.")
     ] = None,
@@ -78,6 +79,9 @@ def deblur(
     as_json: JsonOption = False,
 ) -> None:
     """Remove the motion blur from every picture of a recording, or from a single picture with a known PSF."""
+    from aolink.restoration.registry import DEFAULT_METHOD
+
+    method = method or DEFAULT_METHOD
     if file is not None and not (image or psf or noise_sd):
         _deblur_recording(file, out, estimator, method, overwrite=overwrite, as_json=as_json)
     elif file is None and image is not None and psf is not None:

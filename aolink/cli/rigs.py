@@ -368,8 +368,10 @@ def replay(
 
     Exposures that an estimator skipped in the session are skipped again; `aolink estimate` skips none.
     """
+    from aolink.estimation.registry import DEFAULT_ESTIMATOR
+
     recording = open_recording(file)
-    names = list(dict.fromkeys(estimator or recording.estimators or ["o3"]))
+    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if to_rig:
         if not (output and _are_driven(recording.rig, camera, mirror)):

@@ -45,6 +45,9 @@ FloatArray = NDArray[np.float64]
 
 GROUP = "aolink.estimators"
 """The entry points by which other packages add estimators."""
+DEFAULT_ESTIMATOR = "o3"
+BASELINE_ESTIMATOR = "o1"
+"""What the others are compared with: it takes the centroid of a blurred spot alone."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
 

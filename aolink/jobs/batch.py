@@ -20,6 +20,7 @@ from typing import Any
 
 from aolink.errors import AolinkError, RecordingError, RigError
 from aolink.estimation import Engine, Scorer
+from aolink.estimation.registry import DEFAULT_ESTIMATOR
 from aolink.files import remove_unfinished, writing
 from aolink.numerics.workers import processes
 from aolink.recording.reader import Recording
@@ -330,7 +331,7 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     begin = time.perf_counter()
     recording = job.model.applied_to(Recording(job.source))
     check_has_exposures(recording)
-    names = list(job.estimators or recording.estimators or ["o3"])
+    names = list(job.estimators or recording.estimators or [DEFAULT_ESTIMATOR])
     fill_reestimated(recording, names, target, only=job.only, engine=job.engine)
     seconds = time.perf_counter() - begin
     written = Recording(target)

@@ -85,6 +85,7 @@ def compare(
     absolute: float = ABSOLUTE,
     only: Sequence[str] = (),
     relative_to_start: bool = False,
+    memory_bytes: int = _BYTES_KEPT,
     progress: Callable[[int], None] = lambda messages: None,
 ) -> dict[str, TopicComparison]:
     """Compare two recordings by topic.
@@ -100,6 +101,8 @@ def compare(
     relative_to_start:
         Count exposures and fast steps from the first of each recording, and leave out clock times: in two sessions of
         one rig they differ.
+    memory_bytes:
+        For messages whose counterpart has not come yet; more of them are in a temporary file.
 
     Raises
     ------
@@ -112,7 +115,7 @@ def compare(
         raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")
     result = {name: TopicComparison() for name in sorted(names)}
     in_both = {name for name in names if name in first.counts and name in second.counts}
-    with _Waiting() as waiting:
+    with _Waiting(memory_bytes) as waiting:
         each = _alternating(first, second, sorted(names), relative_to_start)
         for number, (is_first, key, message, frame_id) in enumerate(each, 1):
             found = result[key[0]]
@@ -154,7 +157,8 @@ class _Waiting:
     Messages with the same name come out in their order; those in the file came after all those in memory.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, memory_bytes: int) -> None:
+        self._memory_bytes = memory_bytes
         self._memory: dict[_Key, deque[_Kept]] = {}
         self._bytes = 0
         self._file = sqlite3.connect("", isolation_level=None)
@@ -180,7 +184,7 @@ class _Waiting:
     def put(self, key: _Key, message: Message, frame_id: int | None, *, is_first: bool) -> None:
         """Keep a message."""
         kept = _Kept(is_first, frame_id, message.DESCRIPTOR.full_name, message.SerializeToString())
-        if self._in_file or self._bytes + _size(kept) > _BYTES_KEPT:
+        if self._in_file or self._bytes + _size(kept) > self._memory_bytes:
             frame = None if frame_id is None else str(frame_id)  # it may need all of 64 bits
             self._file.execute("INSERT INTO kept VALUES (?, ?, ?, ?, ?, ?)", (*key, is_first, frame, *kept[2:]))
             self._in_file += 1

@@ -25,6 +25,7 @@ from aolink.recording.reader import RawMessage, Recording
 from aolink.recording.reestimate import check_has_exposures, reestimated
 from aolink.restoration import RestoredPictures, deblur, find_method
 from aolink.restoration.deblur import blurred_psnr, psnr
+from aolink.restoration.registry import DEFAULT_METHOD
 from aolink.rig import Rig
 
 _AHEAD = 4
@@ -48,7 +49,7 @@ class Summary:
 
 
 def write_deblurred(
-    recording: Recording, path: Path, *, estimator: str, method: str = "tv", overwrite: bool = False,
+    recording: Recording, path: Path, *, estimator: str, method: str = DEFAULT_METHOD, overwrite: bool = False,
     workers: int = 0, progress: Callable[[int], None] = lambda exposures: None,
 ) -> Summary:  # fmt: skip
     """Copy a recording with its pictures restored.

@@ -21,6 +21,7 @@ from aolink.optics.scene import SceneSensor, scene_motion
 from aolink.optics.sensor import Kernel, SpotSensor
 from aolink.restoration.method import Restored
 from aolink.restoration.psf import Psf, motion_psf_by_root
+from aolink.restoration.registry import DEFAULT_METHOD
 from aolink.restoration.restore import restore
 from aolink.rig import Rig
 
@@ -65,7 +66,7 @@ def scene_psf(rig: Rig, exposure: Exposure, estimate: Estimate) -> Psf:
     return next(estimated_psfs(exposure, estimate, [mix], rig.scene.kernel, rig.scene.pixel_scale))
 
 
-def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: str = "tv") -> RestoredPictures:
+def deblur(rig: Rig, exposure: Exposure, estimate: Estimate, method: str = DEFAULT_METHOD) -> RestoredPictures:
     """Restore the pictures of an exposure with the path of its estimate; intensities are cut at 0 and 1.
 
     A picture that cannot be restored is None, and ``reason`` says why; ``method`` is a name of

@@ -15,6 +15,7 @@ from aolink.restoration.method import Method
 from aolink.restoration.plane import gauss_markov, pnp, tv, why_not_pnp
 
 GROUP = "aolink.restorations"
+DEFAULT_METHOD = "tv"
 _KIND = "restoration method"
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from aolink.errors import RestorationError
 from aolink.restoration.method import Blurred, Restored
 from aolink.restoration.psf import Psf, as_psf
-from aolink.restoration.registry import check_parameters, find_method
+from aolink.restoration.registry import DEFAULT_METHOD, check_parameters, find_method
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -24,7 +24,7 @@ def restore(
     image: ArrayLike,
     psf: Psf | ArrayLike,
     *,
-    method: str = "tv",
+    method: str = DEFAULT_METHOD,
     noise_sd: float | None = None,
     mask: ArrayLike | None = None,
     **parameters: Any,

@@ -101,8 +101,8 @@ class TcpStream:
     """A TCP port that serves one host at a time; ``name`` is the address for pyserial.
 
     A connection that begins with anything but an Identify packet is closed at once, and one that has sent nothing is
-    closed after `INTRODUCTION_S`. A host that has identified itself keeps the port until it leaves; once it has been
-    silent for `IDLE_S`, the next host that identifies itself takes its place.
+    closed after `introduction_s`. A host that has identified itself keeps the port until it leaves; once it has been
+    silent for `idle_s`, the next host that identifies itself takes its place.
     """
 
     def __init__(self, host: str, port: int) -> None:
@@ -112,6 +112,7 @@ class TcpStream:
         except OSError as error:
             raise PortError(f"cannot listen on {host}:{port}: {error.strerror}; give another --listen") from None
         self._listener.setblocking(False)
+        self.introduction_s, self.idle_s = INTRODUCTION_S, IDLE_S
         self._peer: _Peer | None = None
         self._guests: list[_Peer] = []
         """Connections that have not identified themselves yet, oldest first."""
@@ -155,10 +156,10 @@ class TcpStream:
         for guest in guests:
             data = guest.receive()
             guest.introduction += data or b""
-            begun = _begins_with_identify(guest.introduction)
-            if begun is None and data is not None and time.monotonic() - guest.since_s < INTRODUCTION_S:
+            begun = begins_with_identify(guest.introduction)
+            if begun is None and data is not None and time.monotonic() - guest.since_s < self.introduction_s:
                 self._guests.append(guest)
-            elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < IDLE_S):
+            elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < self.idle_s):
                 self._hang_up()
                 self._peer, admitted = guest, guest.introduction
             else:
@@ -179,7 +180,7 @@ class TcpStream:
         self._listener.close()
 
 
-def _begins_with_identify(data: bytes) -> bool | None:
+def begins_with_identify(data: bytes) -> bool | None:
     """Whether bytes begin with a whole Identify packet; None while that cannot be known yet."""
     piece, end, _ = data.partition(DELIMITER)
     if not end:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import ViewerError
 from aolink.estimation import Estimate
+from aolink.estimation.registry import BASELINE_ESTIMATOR
 from aolink.exposure import Exposure
 from aolink.files import writing
 from aolink.optics.kernel import exposure_density
@@ -86,7 +87,7 @@ def draw_session(recording: Recording, path: str | Path) -> Path:
         raise ViewerError("a picture without the viewer needs matplotlib: pip install 'aolink[plot]'") from None
     session = _session(recording)
     focus = next(reversed(session.estimates), None)
-    compared = [name for name in ("o1", focus) if name in session.estimates]
+    compared = [name for name in (BASELINE_ESTIMATOR, focus) if name in session.estimates]
     lines = ["truth", *dict.fromkeys(compared)]
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=_SIZE_IN, layout="constrained")

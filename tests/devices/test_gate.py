@@ -9,6 +9,7 @@ import socket
 import tracemalloc
 import tty
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Received
 from aolink.wire.port import SerialPort, is_local
+from tests.kinds import must_be
 
 RIG = load_rig("section-vi")
 KINDS = [
@@ -84,7 +86,8 @@ def ports() -> Iterator[tuple[str, str]]:
     for master, slave in pairs:
         tty.setraw(slave)
         os.set_blocking(master, False)
-    yield tuple(os.ttyname(slave) for _, slave in pairs)  # type: ignore[misc] # two of them
+    camera, mirror = (os.ttyname(slave) for _, slave in pairs)
+    yield camera, mirror
     for pair in pairs:
         for descriptor in pair:
             os.close(descriptor)
@@ -105,14 +108,14 @@ def hub(ports: tuple[str, str]) -> Iterator[Hub]:
     hub.close()
 
 
-def numbers(field: FieldDescriptor) -> st.SearchStrategy[object]:
+def numbers(field: Any) -> st.SearchStrategy[object]:
     unsigned, bits = field.cpp_type in (3, 4), 64 if field.cpp_type in (2, 4) else 32
     low, high = (0, 2**bits - 1) if unsigned else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
     return st.integers(0, 200) | st.sampled_from([low, high]) | st.integers(low, high)
 
 
-def values(field: FieldDescriptor) -> st.SearchStrategy[object]:
-    """What a field may hold."""
+def values(field: Any) -> st.SearchStrategy[object]:
+    """What a field may hold, by its descriptor; those of protobuf's own C code are of another type."""
     if field.cpp_type in (FieldDescriptor.CPPTYPE_DOUBLE, FieldDescriptor.CPPTYPE_FLOAT):
         return st.sampled_from([0.0, 0.05, -1e300, float("nan"), float("inf")])
     if field.cpp_type == FieldDescriptor.CPPTYPE_BOOL:
@@ -138,7 +141,7 @@ def messages(draw: st.DrawFn) -> Message:
         pb.TruthChunk: pb.TruthChunk(frame_id=1, total=4, data=b"\x08\x01\x10\x01"),
     }  # fmt: skip
     kind = draw(st.sampled_from(KINDS))
-    message = sound.get(kind, kind())
+    message = must_be(Message, sound.get(kind, kind()))
     fields = [field for field in message.DESCRIPTOR.fields if field.message_type is None]
     for field in draw(st.lists(st.sampled_from(fields), max_size=2)):
         if field.is_repeated:
@@ -146,7 +149,7 @@ def messages(draw: st.DrawFn) -> Message:
             getattr(message, field.name).extend(draw(st.lists(values(field), max_size=60)))
         else:
             setattr(message, field.name, draw(values(field)))
-    return message  # type: ignore[no-any-return] # one of KINDS, which mypy takes for types of any kind
+    return message
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None)

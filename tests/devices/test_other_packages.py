@@ -19,6 +19,8 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import Report, record
+from aolink.wire.messages_pb2 import Applied
+from tests.kinds import messages_of
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 ROOT = Path(__file__).parents[2]
@@ -63,8 +65,8 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     assert (recording.metadata["camera"], recording.metadata["mirror"]) == ("example camera", "example mirror")
     assert recording.counts[topics.TRUTH] == recording.counts[topics.IMAGE] == 6
     assert topics.LINK not in recording.counts
-    reported = [each.message for each in recording.messages(topics.APPLIED)]
-    steps = [k for m in reported for k in range(m.first_step, m.first_step + m.n_steps)]  # type: ignore[attr-defined]
+    reported = messages_of(Applied, recording, topics.APPLIED)
+    steps = [k for m in reported for k in range(m.first_step, m.first_step + m.n_steps)]
     assert steps == list(range(steps[0], steps[0] + len(steps)))  # each once, in order
     exposures = list(recording.exposures())
     assert all(exposure.inputs_assumed == 0 for exposure in exposures)

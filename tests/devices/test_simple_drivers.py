@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -192,11 +193,11 @@ def camera(bench: CameraBench) -> AdaptedCamera:
     return camera
 
 
-def frame(since_zero_ns: int, **changes: object) -> SimpleFrame:
+def frame(since_zero_ns: int, **changes: Any) -> SimpleFrame:
     """One whose exposure began so long after the mirror's fast step 0."""
     pixels = np.full(RIG.sensor.shape, 20_000, dtype=np.uint16)
     return replace(
-        SimpleFrame(pixels=pixels, start_ns=CAMERA_ZERO_NS + since_zero_ns, exposure_ns=EXPOSURE_NS), **changes  # type: ignore[arg-type] # of its fields
+        SimpleFrame(pixels=pixels, start_ns=CAMERA_ZERO_NS + since_zero_ns, exposure_ns=EXPOSURE_NS), **changes
     )  # fmt: skip
 
 

@@ -47,7 +47,7 @@ def test_what_a_large_plants_basis_leaves_out_is_on_the_diagonal() -> None:
     np.testing.assert_allclose(np.diag(covariance), estimate.path_sd[7] ** 2, rtol=1e-12)
 
 
-def test_motion_psf_takes_it() -> None:
+def test_motion_psf_makes_the_psf_of_deblur_with_it() -> None:
     """As README has it: the same PSF as `aolink deblur` restores with."""
     rig = load_rig("moving-scene")
     assert rig.scene is not None

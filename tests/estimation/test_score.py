@@ -40,7 +40,7 @@ def test_nees_and_nis_are_means_with_chi_square_bounds(scored):
     ]
     assert result.end_nees.mean == pytest.approx(np.mean(nees))
     assert result.nis.mean == pytest.approx(np.mean([e.nis[0] for e in estimates["o3"]]))
-    low, high = stats.chi2.ppf([0.025, 0.975], 2 * 12) / 12
+    low, high = (stats.chi2.ppf(p, 2 * 12) / 12 for p in (0.025, 0.975))
     assert (result.end_nees.low, result.end_nees.high) == pytest.approx((low, high))
     assert (result.nis.low, result.nis.high) == pytest.approx((low, high))
 

@@ -9,12 +9,13 @@ from scipy import linalg
 
 import aolink
 from aolink.errors import EstimatorError
-from aolink.estimation import exposure_model, make_estimator, run, score, smooth
+from aolink.estimation import Measurement, exposure_model, make_estimator, run, score, smooth
 from aolink.estimation.frames.moments import known_flux_covariance, measure_moments, noise_integrals
 from aolink.optics.camera import effective_noise_density
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.kinds import must_be
 
 RIG = load_rig("section-vi-lively")
 
@@ -36,7 +37,8 @@ def batch(rig, exposures):
     add([(0, np.eye(n))], plant.initial_mean, np.linalg.cholesky(plant.initial_covariance))
     for k, e in enumerate(exposures):
         model = exposure_model(plant, e.n_steps)
-        y = measure_moments(sensor, e.pixels, (1,)).value[0] - model.response(e.inputs).mean[0]
+        measured = must_be(Measurement, measure_moments(sensor, e.pixels, (1,)))
+        y = measured.value[0] - model.response(e.inputs).mean[0]
         add([(k, model.mean_row)], y, np.array([[np.sqrt(R)]]))
         if k + 1 < count:
             u = np.concatenate([e.inputs, exposures[k + 1].lead_inputs])

@@ -61,7 +61,7 @@ def test_the_demo_prints_what_readme_says(readme: Rows, printed: Rows) -> None:
             assert abs(float(here) - float(there)) <= allowed, (name, column, there, here)
 
 
-def test_readme_says_so() -> None:
+def test_the_readme_says_how_near_its_figures_are() -> None:
     text = " ".join(README.read_text().split())
     assert "on x86-64 your figures are these to a unit of the last digit" in text
     assert "allow `profile` and `mixture` 1 % (NIS and NEES 3 %)" in text

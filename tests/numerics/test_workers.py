@@ -33,8 +33,8 @@ def all_end(processes: list[psutil.Process]) -> bool:
 
 
 def started(folder: Path, *words: str) -> subprocess.Popen[bytes]:
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return subprocess.Popen([sys.executable, "-m", "aolink", *words], cwd=folder, **quiet)  # type: ignore[call-overload, no-any-return]
+    command = [sys.executable, "-m", "aolink", *words]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def wait_for(true: Callable[[], object], process: subprocess.Popen[bytes]) -> None:

@@ -52,12 +52,12 @@ def test_weights_and_correlation_stand_noise_that_the_plain_one_does_not():
     rng = np.random.default_rng(3)
     places = np.repeat(PLACES, 10, axis=0)
     windows = spots(places) + rng.normal(0, 4.0, (400, 17, 17))
-    rms = {
+    errors = {
         "plain": centre_of_gravity(windows) - places,
         "weighted": weighted_centroid(windows, 2.0) - places,
         "correlation": correlation_centroid(windows, spots(np.array([[8.0, 8.0]]))[0]) - places,
     }
-    rms = {name: float(np.sqrt((error**2).mean())) for name, error in rms.items()}
+    rms = {name: float(np.sqrt((error**2).mean())) for name, error in errors.items()}
     # Cramer-Rao for a Gaussian spot under white noise: sd = 2 sqrt(2 pi) sd^2... per axis, s^2 = 8 pi n^2 sd^4 / F^2.
     bound = np.sqrt(8 * np.pi) * 4.0 * (1.4**2 + 1 / 12) / 1000
     assert bound < 1.05 * rms["correlation"] < 1.3 * bound

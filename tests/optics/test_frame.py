@@ -9,6 +9,7 @@ from aolink.optics.frame import frame_density, spots_density
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.optics.sensor import Kernel
 from aolink.rig import load_rig
+from tests.kinds import line_of
 
 EDGES = np.linspace(-1, 1, 17)
 WIDTH = 0.125
@@ -84,5 +85,5 @@ def test_the_sum_over_one_direction_is_the_line_sensors_profile():
 
 
 def test_a_line_sensors_frame_is_its_exposure():
-    sensor, path = load_rig("section-vi").sensor, wandering(1, 30)[0, :1]
+    sensor, path = line_of(load_rig("section-vi")), wandering(1, 30)[0, :1]
     assert np.array_equal(frame_density(sensor, path), exposure_density(sensor.kernel, sensor.edges, path))

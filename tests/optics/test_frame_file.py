@@ -31,7 +31,7 @@ def test_real_frames_read_as_another_library_reads_them(mmirs):
     np.testing.assert_array_equal(read_frame(mmirs / "mmirs_wfs_0150.fits.gz"), expected)
 
 
-def test_numpys_own_files(tmp_path):
+def test_numpys_own_files_are_read(tmp_path):
     np.save(tmp_path / "a.npy", np.eye(3, dtype=np.uint16))
     np.testing.assert_array_equal(read_frame(tmp_path / "a.npy"), np.eye(3))
 

@@ -1,5 +1,7 @@
 """A Shack-Hartmann frame that another library propagates: its slopes are those of the wavefront."""
 
+from typing import Any
+
 import hcipy
 import numpy as np
 import pytest
@@ -34,7 +36,7 @@ def frames() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def measured(frames) -> tuple[np.ndarray, np.ndarray]:
+def measured(frames: Any) -> tuple[np.ndarray, np.ndarray]:
     """Displacements by correlation with the reference's own spots, pixels, and the lenslet of each."""
     reference, frame = (find_lattice(f) for f in frames)
     moved = match(frame, reference)
@@ -53,11 +55,13 @@ def measured(frames) -> tuple[np.ndarray, np.ndarray]:
 def expected_slopes() -> np.ndarray:
     """Of the known wavefront, radians, (spots, 2)."""
     r = DIAMETER / 2
-    return LENSLETS.mean_slopes(lambda p: sum(c * zernike_gradient(i, p / r) / r for i, c in COEFFICIENTS.items()))
+    return LENSLETS.mean_slopes(
+        lambda p: np.sum([c * zernike_gradient(i, p / r) / r for i, c in COEFFICIENTS.items()], axis=0)
+    )
 
 
 def whole(lenslet: np.ndarray) -> np.ndarray:
-    return LENSLETS.light[lenslet] > 0.999
+    return np.asarray(LENSLETS.light[lenslet] > 0.999)
 
 
 def test_the_lattice_is_that_of_the_lenslets(frames):

@@ -1,5 +1,8 @@
 """The kernel on pixels, against integrals on a fine grid."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,10 +19,15 @@ widths = st.floats(0.04, 0.15)
 
 def density(w: np.ndarray, sigma: float) -> np.ndarray:
     """The kernel with the constant that gives it unit mass."""
-    return np.exp(-(w**2) / sigma**2) / (sigma * np.sqrt(np.pi))
+    return np.asarray(np.exp(-(w**2) / sigma**2) / (sigma * np.sqrt(np.pi)))
 
 
-def fine_pixels(function, points: int = 4000) -> np.ndarray:
+def shifted(place: float, w: np.ndarray) -> np.ndarray:
+    """A kernel that stands there."""
+    return density(w - place, 0.05)
+
+
+def fine_pixels(function: Callable[[np.ndarray], np.ndarray], points: int = 4000) -> np.ndarray:
     """Integral of a function over each pixel by the midpoint rule."""
     inside = (np.arange(points) + 0.5) / points * WIDTH
     return np.array([function(edge + inside).mean() * WIDTH for edge in EDGES[:-1]])
@@ -54,7 +62,7 @@ def test_slope_is_the_derivative_of_the_mass():
 
 def test_exposure_density_is_the_mean_over_the_path():
     kernel, path = Kernel(shape="gaussian", sigma=0.05), np.sin(np.linspace(0, 5, 200)) * 0.4
-    expected = np.mean([fine_pixels(lambda w, p=p: density(w - p, 0.05), 400) for p in path], axis=0) / WIDTH
+    expected = np.mean([fine_pixels(partial(shifted, p), 400) for p in path], axis=0) / WIDTH
     np.testing.assert_allclose(exposure_density(kernel, EDGES, path), expected, atol=1e-4)
 
 

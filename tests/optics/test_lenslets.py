@@ -54,7 +54,7 @@ def test_partly_lit_lenslets_average_what_is_lit_and_dark_ones_have_no_slope():
     assert -2 * 0.45 < slopes[0, 4, 1] < -2 * 0.4
 
 
-def test_scales():
+def test_pixels_and_diffraction_have_their_angles():
     assert SQUARE.pixels_to_slope(5e-6) == pytest.approx(1e-3)
     assert SQUARE.diffraction_width(1e-6) == pytest.approx(5e-3)
 

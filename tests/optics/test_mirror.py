@@ -80,10 +80,11 @@ def test_second_order_is_the_differential_equation():
     state, true = np.array([0.3, 0.1]), np.array([0.3, 0.1 / step])
     for u in rng.standard_normal(20):
         state = A @ state + B[:, 0] * u
-        solved = integrate.solve_ivp(
-            lambda t, x, u=u: [x[1], omega**2 * (u - x[0]) - 2 * damping * omega * x[1]],
-            (0, step), true, rtol=1e-10, atol=1e-10,
-        )  # fmt: skip
+
+        def slope(t, x, u=u):
+            return [x[1], omega**2 * (u - x[0]) - 2 * damping * omega * x[1]]
+
+        solved = integrate.solve_ivp(slope, (0, step), true, rtol=1e-10, atol=1e-10)
         true = solved.y[:, -1]
         np.testing.assert_allclose(state, true * [1, step], atol=1e-7)
 
@@ -111,4 +112,4 @@ def test_voltages_go_to_forces_and_back():
     volts = np.linspace(0, 200, 51)
     np.testing.assert_allclose(law.volts(law.force(volts)), volts, atol=1e-12)
     assert law.force(np.array(100.0)) == 0
-    assert law.input_range == (law.force(np.array(0.0)), law.force(np.array(200.0)))
+    assert law.input_range == (float(law.force(np.array(0.0))), float(law.force(np.array(200.0))))

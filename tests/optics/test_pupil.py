@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aolink.errors import RigError
-from aolink.estimation import make_estimator, run
+from aolink.estimation import Measurement, make_estimator, run
 from aolink.estimation.exposure_scan import exposure_scan
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.measure import measure
@@ -20,7 +20,9 @@ from aolink.optics.lenslets import Lenslets
 from aolink.optics.sensor import SpotSensor
 from aolink.optics.turbulence import FrozenFlow, Layer
 from aolink.rig import Rig, load_rig, parse_rig
+from aolink.rig.optical_plant import Optics
 from aolink.simulation.model import simulate
+from tests.kinds import must_be, truth_of
 
 SH = load_rig("sh-8x8")
 LENSLETS = """
@@ -55,6 +57,10 @@ def sensor_of(rig: Rig) -> SpotSensor:
     return rig.sensor
 
 
+def light_of(sensor: SpotSensor) -> np.ndarray:
+    return must_be(np.ndarray, sensor.spot_light)
+
+
 def test_dark_windows_have_no_spots_and_others_their_share_of_the_light():
     sensor = sensor_of(SH)
     assert SH.optics is not None
@@ -66,7 +72,7 @@ def test_dark_windows_have_no_spots_and_others_their_share_of_the_light():
     np.testing.assert_allclose(light, np.where(share >= 0.4, share, 0.0), rtol=1e-4)
     windows = spot_windows(sensor, frame)
     assert windows.shape == (48, 16, 16)
-    np.testing.assert_allclose(windows.sum(axis=(1, 2)) * sensor.pixel_size, sensor.spot_light, rtol=1e-4)
+    np.testing.assert_allclose(windows.sum(axis=(1, 2)) * sensor.pixel_size, light_of(sensor), rtol=1e-4)
 
 
 def test_the_plant_has_the_rows_of_the_lit_lenslets():
@@ -76,7 +82,7 @@ def test_the_plant_has_the_rows_of_the_lit_lenslets():
     whole = parse_rig(text[:a] + text[b:])
     assert whole.n_outputs == 128
     ours, theirs = SH.plant.C.reshape(48, 2, -1), whole.plant.C.reshape(64, 2, -1)[sensor_of(SH).lit]
-    full = sensor_of(SH).spot_light == 1
+    full = light_of(sensor_of(SH)) == 1
     np.testing.assert_array_equal(ours[full], theirs[full])
     assert np.abs(ours[~full] - theirs[~full]).max() > 0.01 * np.abs(theirs).max()
 
@@ -92,7 +98,7 @@ def test_turbulence_is_averaged_over_the_lit_part():
 
     expected = lenslets.mean_slopes(gradient)
     assert {0.0, 1.0} < set(lenslets.light)
-    np.testing.assert_allclose(slopes, expected, atol=0.02 * np.nanstd(expected))
+    np.testing.assert_allclose(slopes, expected, atol=0.02 * float(np.nanstd(expected)))
 
 
 @pytest.mark.parametrize("photoelectrons", [0, 400])
@@ -110,22 +116,21 @@ def test_what_is_measured_is_as_sure_as_its_light_allows(rig, photoelectrons, or
     observation = PathMoments(tested.plant, orders)
     pulls = []
     for exposure in exposures:
-        found, remark = measure(tested, exposure, observation.needs)
-        assert found is not None, remark
-        path = exposure.truth.path
+        found = must_be(Measurement, measure(tested, exposure, observation.needs)[0])
+        path = truth_of(exposure).path
         truth = np.stack([(path**p).mean(axis=1) for p in orders], axis=1)
         covariance = found.covariance.reshape(-1, *found.covariance.shape[-2:])
         sd = np.sqrt(np.einsum("kmm->km", covariance)).reshape(truth.shape)
         pulls.append((found.value.reshape(truth.shape) - truth) / sd)
     spread = np.array(pulls).reshape(len(exposures), -1, 2 * len(orders)).var(axis=(0, 2))
-    light = sensor_of(tested).spot_light
+    light = light_of(sensor_of(tested))
     for group in (light < 0.8, light == 1):
         # Light that falls beside the window's edge takes some of the noise's part.
         assert spread[group].mean() == pytest.approx(1, abs=0.15)
 
 
 def test_gains_and_noise_follow_the_light():
-    light = np.repeat(sensor_of(FOUR).spot_light, 2)
+    light = np.repeat(light_of(sensor_of(FOUR)), 2)
     noise = centroid_covariance(FOUR)[:, 0, 0, 0]
     np.testing.assert_allclose(noise * light**2, noise[light == 1][0])
     exposures = simulate(FOUR, 30)
@@ -159,7 +164,8 @@ def test_a_plant_of_few_lit_spots_is_seen_by_moments_too():
     text = (
         (text[:a] + text[b:]).replace("grid = [1, 1]", "grid = [4, 4]").replace("[lenslets]", "[lenslets]\npupil_m = 1")
     )
-    rig = parse_rig(text.replace("pupil_m = 1", f"pupil_m = {4 * load_rig('tip-tilt').optics.lenslets.pitch_m}"))
+    pitch_m = must_be(Optics, load_rig("tip-tilt").optics).lenslets.pitch_m
+    rig = parse_rig(text.replace("pupil_m = 1", f"pupil_m = {4 * pitch_m}"))
     assert rig.n_outputs == 24
     exposures = simulate(rig, 10)
     estimates = run(rig, exposures, ("o1", "moments"))

@@ -15,7 +15,7 @@ PATHS = 5.5 + RNG.uniform(-1.5, 1.5, (20, 2, 1)) + np.cumsum(RNG.normal(0, 0.05,
 
 def test_delta_is_the_histogram_of_the_path():
     windows = spot_windows(Psi(shape="delta"), 12, PATHS)
-    edges = np.arange(13) - 0.5
+    edges = np.arange(13.0) - 0.5
     for window, (x, y) in zip(windows, PATHS, strict=True):
         np.testing.assert_allclose(window, np.histogram2d(y, x, (edges, edges))[0] / 100, atol=1e-12)
 
@@ -45,7 +45,7 @@ def test_an_image_of_a_gaussian_is_the_gaussian_kernel():
     w = (np.arange(121) - 60) / fine
     gaussian = np.exp(-(w**2) / (2 * sd**2))
     psi = Psi(shape="image", image=np.outer(gaussian, gaussian), finer=fine)
-    kernel, edges = Kernel(shape="gaussian", sigma=sd * np.sqrt(2)), np.arange(13) - 0.5
+    kernel, edges = Kernel(shape="gaussian", sigma=sd * np.sqrt(2)), np.arange(13.0) - 0.5
     expected = np.stack([pixel_mass(kernel, edges, p[1]).T @ pixel_mass(kernel, edges, p[0]) / 100 for p in PATHS])
     assert np.abs(spot_windows(psi, 12, PATHS) - expected).max() < 2e-3 * expected.max()
 

@@ -65,7 +65,7 @@ def test_slopes_are_the_wavefronts_own_in_time():
             assert slopes[spot, axis, when] == pytest.approx(expected, rel=1e-6)
 
 
-def test_seeds_make_the_difference():
+def test_the_same_seed_gives_the_same_flow_and_another_another():
     first, again, other = (FrozenFlow(LAYER, np.random.default_rng(s), 0.05).amplitudes for s in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)

@@ -1,5 +1,7 @@
 """Wavefront reconstruction: against dense least squares, known wavefronts, and HCIPy's image of a point."""
 
+from collections.abc import Callable
+
 import hcipy
 import numpy as np
 import pytest
@@ -23,7 +25,7 @@ ROUND = Lenslets(grid=(14, 14), pitch_m=0.1, focal_length_m=1.0, pupil_diameter_
 LIT = (ROUND.light > 0.5).reshape(ROUND.grid)
 
 
-def grid_slopes(lenslets: Lenslets, gradient) -> np.ndarray:
+def grid_slopes(lenslets: Lenslets, gradient: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     return lenslets.mean_slopes(gradient).reshape(*lenslets.grid, 2)
 
 
@@ -113,7 +115,7 @@ def cell_means(gradient, positions, kind, pitch, turn):
 def test_spots_on_a_square_grid_are_southwells_geometry():
     rng, (y, x) = np.random.default_rng(6), np.nonzero(LIT)
     weights, slopes = rng.uniform(0.3, 1, LIT.shape), rng.standard_normal((*LIT.shape, 2))
-    positions = 0.1 * np.stack([x, y], axis=1)
+    positions = 0.1 * np.stack([x, y], axis=1).astype(float)
     edges = np.argwhere(np.triu(abs(np.linalg.norm(positions[:, None] - positions, axis=-1) - 0.1) < 1e-9))
     found = SpotReconstructor(positions, edges, weights[LIT])(slopes[LIT])
     np.testing.assert_allclose(found, ZonalReconstructor(LIT, 0.1, weights=weights)(slopes)[LIT], atol=1e-12)

@@ -1,6 +1,7 @@
 """The lifted plant against brute-force recursions, and what the rig check finds."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def oscillator(frequency_hz: float, *, decay: float = 0.0) -> Plant:
     return dataclasses.replace(RIG.plant, A=rotation * np.exp(-decay), C=np.array([[1.0, 0.0]]))
 
 
-def with_plant(**changes: object) -> Rig:
+def with_plant(**changes: Any) -> Rig:
     return dataclasses.replace(RIG, plant=dataclasses.replace(RIG.plant, **changes))
 
 
@@ -259,7 +260,7 @@ def test_blocks_give_what_the_whole_matrices_give():
 def test_ranks_are_those_of_the_observability_matrix(outputs):
     """Three actuators alike, seen through few outputs or many, against the rank of all powers together."""
     one = np.array([[0.6, 0.5], [-0.5, 0.6]])
-    A = linalg.block_diag(one, one, one, 0.8)
+    A = linalg.block_diag(one, one, one, [[0.8]])
     C = np.random.default_rng(8).standard_normal((outputs, 7))
     C[:, 4:6] = C[:, :2]  # the third moves as the first does
     plant = dataclasses.replace(RIG.plant, A=A, C=C)

@@ -7,22 +7,26 @@ import sqlite3
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aolink.errors import RecordingError
-from aolink.recording import compare as module
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording import topics
 from aolink.recording.compare import compare
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
+from aolink.rig import load_rig
+from aolink.wire.messages_pb2 import Truth
 from tests.conftest import EXPOSURES, Session
+from tests.kinds import messages_of
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -62,8 +66,8 @@ def test_one_number_is_found_with_its_frame_and_field(recorded: Session, tmp_pat
 
 def test_one_pixel_is_found(recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
-        if topic == topics.IMAGE and message.data[10] != 255:  # type: ignore[attr-defined]
-            message.data = message.data[:10] + bytes([message.data[10] + 1]) + message.data[11:]  # type: ignore[attr-defined]
+        if isinstance(message, RawImage) and message.data[10] != 255:
+            message.data = message.data[:10] + bytes([message.data[10] + 1]) + message.data[11:]
         return [message]
 
     found = compare(Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change))
@@ -72,7 +76,7 @@ def test_one_pixel_is_found(recorded: Session, tmp_path: Path) -> None:
 
 def test_missing_and_added_messages_are_named_and_shift_nothing(recorded: Session, tmp_path: Path) -> None:
     def without_frame_3(topic: str, message: Message) -> list[Message]:
-        return [] if topic == topics.TRUTH and message.frame_id == 3 else [message]  # type: ignore[attr-defined]
+        return [] if isinstance(message, Truth) and message.frame_id == 3 else [message]
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", without_frame_3)
     found = compare(one, two)[topics.TRUTH]
@@ -85,27 +89,47 @@ def test_missing_and_added_messages_are_named_and_shift_nothing(recorded: Sessio
 numbers = st.lists(st.floats(width=64), min_size=1, max_size=6)
 
 
-@given(numbers, numbers)
-def test_numbers_differ_as_numpy_says(x: list[float], y: list[float]) -> None:
-    n = min(len(x), len(y))
-    *_, differs, where = module._numbers_differ(x[:n], y[:n], 1e-9, 1e-12)
-    a, b = np.array(x[:n]), np.array(y[:n])
-    with np.errstate(invalid="ignore", over="ignore"):
-        same = np.array_equal(a, b, equal_nan=True) or bool(
-            np.all(
-                (a == b)
-                | (np.isnan(a) & np.isnan(b))
-                | (np.isfinite(a) & np.isfinite(b) & (np.abs(a - b) <= 1e-12 + 1e-9 * np.maximum(abs(a), abs(b))))
-            )
+def with_numbers(path: Path, rows: list[list[float]]) -> Recording:
+    """A recording in which each row stands in a topic of its own."""
+    with RecordingWriter(path, load_rig("section-vi"), {}, 0, deterministic=True) as writer:
+        for k, row in enumerate(rows):
+            writer.write(f"{topics.ESTIMATE}{k}", pb.Estimate(nis=row), k)
+    return Recording(path)
+
+
+def differ(pairs: list[tuple[list[float], list[float]]], relative: float, absolute: float) -> list[bool]:
+    """Whether the numbers of each pair are different ones to `compare`."""
+    with TemporaryDirectory() as folder:
+        one, two = (
+            with_numbers(Path(folder) / name, list(rows))
+            for name, rows in zip(("a.mcap", "b.mcap"), zip(*pairs, strict=True), strict=True)
         )
-    assert differs is not same
-    assert bool(where) is differs
+        found = compare(one, two, relative=relative, absolute=absolute)
+    return [not found[f"{topics.ESTIMATE}{k}"].same for k in range(len(pairs))]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=20))
+def test_numbers_differ_as_numpy_says(pairs: list[tuple[list[float], list[float]]]) -> None:
+    pairs = [(x[: len(y)], y[: len(x)]) for x, y in pairs]
+    expected = []
+    for a, b in (map(np.array, pair) for pair in pairs):
+        with np.errstate(invalid="ignore", over="ignore"):
+            close = np.abs(a - b) <= 1e-12 + 1e-9 * np.maximum(abs(a), abs(b))
+        same = (a == b) | (np.isnan(a) & np.isnan(b)) | (np.isfinite(a) & np.isfinite(b) & close)
+        expected.append(not same.all())
+    assert differ(pairs, 1e-9, 1e-12) == expected
+
+
+def test_nan_is_equal_to_nan_and_to_nothing_else() -> None:
+    assert differ([([np.nan, 1.0], [np.nan, 1.0])], 0, 0) == [False]
+    assert differ([([np.nan], [1.0])], 1, 1) == [True]
 
 
 def test_the_command_accepts_a_change_when_told_to(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     def change(topic: str, message: Message) -> list[Message]:
-        if topic == "/estimate/o1":
-            message.nis[0] *= 2  # type: ignore[attr-defined]
+        if topic == "/estimate/o1" and isinstance(message, pb.Estimate):
+            message.nis[0] *= 2
         return [message]
 
     shutil.copy(recorded.path, tmp_path / "right.mcap")
@@ -148,9 +172,8 @@ def test_messages_of_unknown_kinds_are_compared_as_bytes(recorded: Session, tmp_
     assert compare(one, two)["/mine"].fields["value"].messages == 1
 
 
-def test_what_does_not_fit_into_memory_waits_in_a_file(
-    recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("memory_bytes", [0, 10_000])
+def test_what_does_not_fit_into_memory_waits_in_a_file(recorded: Session, tmp_path: Path, memory_bytes: int) -> None:
     """Frames of one recording are far behind those of the other; the same is found as with much memory."""
     one = Recording(recorded.path)
     with RecordingWriter(tmp_path / "b.mcap", one.rig, {}, one.start_ns, deterministic=True) as writer:
@@ -159,27 +182,13 @@ def test_what_does_not_fit_into_memory_waits_in_a_file(
                 if (each.topic == topics.IMAGE) is kept and not each.topic.startswith(topics.ESTIMATE):
                     writer.write(each.topic, each.message, each.log_time_ns)
     two = Recording(tmp_path / "b.mcap")
-    put, peak = module._Waiting.put, []
-
-    def watched(self: module._Waiting, *args: Any, **kwargs: Any) -> None:
-        put(self, *args, **kwargs)
-        peak.append((self._bytes, len(self._memory)))
-
-    monkeypatch.setattr(module._Waiting, "put", watched)
     expected = compare(one, two)
-    most, entries = max(peak)
-    monkeypatch.setattr(module, "_BYTES_KEPT", most // 10)
-    peak.clear()
-    assert compare(one, two) == expected
-    assert 0 < max(peak)[0] <= most // 10
+    assert compare(one, two, memory_bytes=memory_bytes) == expected
     # What one of them alone has is counted, not kept.
     assert expected["/estimate/o3"].missing == one.counts["/estimate/o3"]
-    assert entries <= sum(two.counts.values())
 
 
-def test_what_has_no_counterpart_waits_in_a_file_too(
-    recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_has_no_counterpart_waits_in_a_file_too(recorded: Session, tmp_path: Path) -> None:
     """In the second every frame is twice, first as in the first recording, and the odd ones have other numbers."""
 
     def change(topic: str, message: Message) -> list[Message]:
@@ -193,8 +202,7 @@ def test_what_has_no_counterpart_waits_in_a_file_too(
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
     expected = compare(one, two, only=["/camera/"])
-    monkeypatch.setattr(module, "_BYTES_KEPT", 0)
-    found = compare(one, two, only=["/camera/"])
+    found = compare(one, two, only=["/camera/"], memory_bytes=0)
     assert found == expected
     of = found[topics.EXPOSURE]
     odd = sum(message.frame_id % 2 for message in exposure_infos(one))
@@ -205,21 +213,20 @@ def test_what_has_no_counterpart_waits_in_a_file_too(
 
 
 def exposure_infos(recording: Recording) -> list[pb.ExposureInfo]:
-    return [each.message for each in recording.messages(topics.EXPOSURE) if isinstance(each.message, pb.ExposureInfo)]
+    return messages_of(pb.ExposureInfo, recording, topics.EXPOSURE)
 
 
 def test_a_full_temporary_folder_is_said(recorded: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     connect = sqlite3.connect
 
     def of_few_pages(*args: Any, **kwargs: Any) -> sqlite3.Connection:
-        file = connect(*args, **kwargs)
+        file: sqlite3.Connection = connect(*args, **kwargs)
         file.execute("PRAGMA max_page_count = 8")
         return file
 
-    monkeypatch.setattr(module, "_BYTES_KEPT", 0)
     monkeypatch.setattr(sqlite3, "connect", of_few_pages)
     with pytest.raises(RecordingError, match=r"full.*SQLITE_TMPDIR"):
-        compare(Recording(recorded.path), Recording(recorded.path))
+        compare(Recording(recorded.path), Recording(recorded.path), memory_bytes=0)
 
 
 def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tmp_path: Path) -> None:
@@ -227,8 +234,8 @@ def test_of_two_sessions_of_a_rig_clock_times_are_left_out(recorded: Session, tm
         for name in ("device_ns", "device_start_ns", "host_start_ns"):
             if hasattr(message, name):
                 setattr(message, name, getattr(message, name) + 12345)
-        if topic == topics.IMAGE:
-            message.timestamp.nanos += 1  # type: ignore[attr-defined] # an image's
+        if isinstance(message, RawImage):
+            message.timestamp.nanos += 1
         return [message]
 
     one, two = Recording(recorded.path), rewritten(recorded.path, tmp_path / "b.mcap", change)
@@ -248,8 +255,3 @@ def test_accept_is_refused_where_it_would_replace_more(aolink: Run, recorded: Se
     assert damaged.returncode == 5
     assert "a damaged recording is not accepted" in damaged.stderr
     assert (tmp_path / "a.mcap").read_bytes() == data
-
-
-def test_nan_is_equal_to_nan_and_to_nothing_else() -> None:
-    assert module._numbers_differ([np.nan, 1.0], [np.nan, 1.0], 0, 0)[2] is False
-    assert module._numbers_differ([np.nan], [1.0], 1, 1)[2] is True

@@ -110,7 +110,7 @@ def test_the_source_is_never_the_target(recorded: Session) -> None:
     assert recorded.path.read_bytes() == before
 
 
-def test_the_commands(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+def test_the_editing_commands_say_what_they_did_and_lost(aolink: Run, recorded: Session, tmp_path: Path) -> None:
     data = recorded.path.read_bytes()
     (tmp_path / "broken.mcap").write_bytes(data[: len(data) * 2 // 3])
     result = aolink("recover", "broken.mcap", "-o", "whole.mcap")

@@ -10,6 +10,7 @@ import pytest
 
 from aolink.estimation import run
 from aolink.estimation.estimate import coefficient_roots, motion
+from aolink.estimation.model.factored import FactoredModel
 from aolink.jobs.demo import simulated_rig
 from aolink.recording import convert
 from aolink.recording.reader import Recording
@@ -19,6 +20,7 @@ from aolink.session import record
 from aolink.simulation.model import simulate
 from aolink.wire.truth import truth_message
 from tests.conftest import Session
+from tests.kinds import must_be
 
 NAMES = ("open-loop", "o1", "o3")
 
@@ -79,7 +81,9 @@ def test_a_plant_of_hundreds_of_states_is_recorded_as_patterns_and_courses(tmp_p
     mixed, root = motion(estimate, mix, coefficient_roots(estimate))
     np.testing.assert_allclose(mixed, estimate.path[:2], atol=1e-12)
     missing = estimate.path_sd[:2].ravel() ** 2 - np.sum(root**2, axis=1)
-    np.testing.assert_allclose(missing, np.repeat(estimate.model.noise.left_out[:2], 200), atol=1e-12)
+    np.testing.assert_allclose(
+        missing, np.repeat(must_be(FactoredModel, estimate.model).noise.left_out[:2], 200), atol=1e-12
+    )
 
 
 def test_a_whole_innovation_covariance_of_an_older_file_is_read() -> None:

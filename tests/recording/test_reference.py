@@ -13,7 +13,7 @@ from aolink.recording.reestimate import write_reestimated
 FILES = sorted((Path(__file__).parents[2] / "recordings").glob("*.mcap"))
 
 
-def test_there_are_references() -> None:
+def test_there_are_reference_recordings() -> None:
     assert FILES
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from aolink.cli import app
+from aolink.cli.common import app
 from aolink.errors import AolinkError, EstimatorError, RecordingError, ViewerError
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import reestimated, scored_and_compared

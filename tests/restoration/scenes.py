@@ -29,9 +29,10 @@ def blurred(scene: FloatArray, values: FloatArray, origin: tuple[int, ...]) -> t
     """The picture that a larger scene gives, and the part of the scene that lies in its frame."""
     taps = np.atleast_2d(values)
     down, right = (0, *origin)[-2:]
-    image = signal.convolve(scene, taps, mode="valid", method="direct")
+    image = np.asarray(signal.convolve(scene, taps, mode="valid", method="direct"))
     top, left = taps.shape[0] - 1 - down, taps.shape[1] - 1 - right
-    return image, scene[top : top + image.shape[0], left : left + image.shape[1]]
+    rows, columns = image.shape
+    return image, scene[top : top + rows, left : left + columns]
 
 
 def blur_matrix(shape: tuple[int, int], values: FloatArray) -> FloatArray:

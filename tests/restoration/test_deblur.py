@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from aolink.cli import app
+from aolink.cli.common import app
 from aolink.errors import RestorationError
 from aolink.optics.pictures import read_picture, read_psf, write_picture
 from aolink.restoration import restore
@@ -99,7 +99,7 @@ def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("suffix", [".png", ".tif", ".npy"])
 def test_what_is_written_is_read_back(tmp_path: Path, dtype: type, suffix: str) -> None:
-    image = np.random.default_rng(1).integers(0, 250, (9, 11)).astype(dtype)
+    image: np.ndarray = np.random.default_rng(1).integers(0, 250, (9, 11)).astype(dtype)
     path = tmp_path / f"a{suffix}"
     if dtype is np.float32 and suffix == ".png":
         with pytest.raises(RestorationError, match=r"type float32 fits in a \.npy"):
@@ -110,7 +110,7 @@ def test_what_is_written_is_read_back(tmp_path: Path, dtype: type, suffix: str) 
     assert (read_picture(path) == image).all()
 
 
-def test_colours_and_palettes(tmp_path: Path) -> None:
+def test_colours_and_palettes_are_read_as_colours(tmp_path: Path) -> None:
     colours = np.random.default_rng(1).integers(0, 255, (6, 7, 3), dtype=np.uint8)
     write_picture(tmp_path / "a.png", colours)
     assert (read_picture(tmp_path / "a.png") == colours).all()
@@ -129,7 +129,7 @@ def test_psfs_as_text_and_numbers(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "content"), [("a.csv", "1 2\n3\n"), ("a.npy", "junk"), ("a.csv", None)])
-def test_what_is_no_psf_file(tmp_path: Path, name: str, content: str | None) -> None:
+def test_a_file_that_is_no_psf_is_refused(tmp_path: Path, name: str, content: str | None) -> None:
     if content is not None:
         (tmp_path / name).write_text(content)
     with pytest.raises(RestorationError, match="cannot be read as a PSF"):
@@ -137,7 +137,7 @@ def test_what_is_no_psf_file(tmp_path: Path, name: str, content: str | None) -> 
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.npy"])
-def test_what_is_no_picture_file(tmp_path: Path, name: str) -> None:
+def test_a_file_that_is_no_picture_is_refused(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("junk")
     with pytest.raises(RestorationError, match="cannot be read as a picture"):
         read_picture(tmp_path / name)

@@ -82,7 +82,7 @@ def test_an_unstable_direction_is_refused_before_it_runs() -> None:
         restore(image, psf(DECAYING), method="inverse", direction="backward")
 
 
-def test_zeros_on_both_sides() -> None:
+def test_a_psf_with_zeros_on_both_sides_has_no_stable_inverse() -> None:
     with pytest.raises(RestorationError, match=r"largest zero is 2 forwards and 1\.67.*smoother, gauss_markov or tv"):
         restore(np.zeros((4, 30)), psf(MIXED), method="inverse")
     with pytest.raises(RestorationError, match=r"so is the other direction \(1\.67\)"):
@@ -100,7 +100,7 @@ def test_a_psf_for_each_pixel() -> None:
     assert found.image == pytest.approx(scene[:, 1:], abs=1e-12)
 
 
-def test_what_it_cannot_do_without() -> None:
+def test_a_missing_pixel_or_a_wrong_boundary_is_refused() -> None:
     mask = np.ones((4, 30), bool)
     mask[1, 3] = False
     with pytest.raises(RestorationError, match="cannot do without a pixel"):

@@ -53,7 +53,7 @@ def make_lines(values: FloatArray, scanner: Scanner = FIRST, n: int = 3, seed: i
     m = values.shape[-1] - 1
     root = np.linalg.cholesky(scene_covariance(scanner, COLUMNS + m) + 1e-12 * np.eye(COLUMNS + m))
     scene = rng.standard_normal((n, COLUMNS + m)) @ root.T
-    return scene @ line_matrix(values, COLUMNS).T + np.sqrt(NOISE) * rng.standard_normal((n, COLUMNS))
+    return np.asarray(scene @ line_matrix(values, COLUMNS).T + np.sqrt(NOISE) * rng.standard_normal((n, COLUMNS)))
 
 
 def test_the_state_space_is_the_transfer_function() -> None:
@@ -158,7 +158,9 @@ def test_known_pixels_before_the_line(scanner: Scanner, count: int) -> None:
     st.floats(0, 0.99),
     st.floats(1e-4, 1.0),
 )
-def test_any_psf_and_scanner(taps: list[float], correlation: float, noise: float) -> None:
+def test_the_smoother_is_the_banded_solution_for_any_psf_and_scanner(
+    taps: list[float], correlation: float, noise: float
+) -> None:
     values, scanner = np.array(taps) / sum(taps), first_order(correlation, 1.0)
     lines = np.random.default_rng(1).standard_normal((2, 20))
     model = line_model(values, 20, scanner)

@@ -64,9 +64,8 @@ def test_on_the_plane_and_masked_it_is_dense_least_squares(line: bool, masked: b
     found = solver.solve(solver.project(images), solver.guess(images), 1e-12)
     assert abs(found - dense(psf, images, 0.01, seen)).max() < 1e-8
     expected = (slice(1, 12), slice(1, 15)) if not line else (slice(0, 11), slice(1, 15))
-    rows, columns = np.indices(found.shape[1:])
-    assert (rows[solver.frame] == rows[expected]).all()
-    assert (columns[solver.frame] == columns[expected]).all()
+    places = np.indices(found.shape[1:])
+    assert (places[:, *solver.frame] == places[:, *expected]).all()
 
 
 def test_small_frames_are_solved_directly_and_large_ones_are_not() -> None:
@@ -92,7 +91,7 @@ def test_white_pixels_in_the_place_of_white_differences() -> None:
     assert abs(found.ravel() - expected).max() < 1e-8
 
 
-def test_differences_and_their_transpose() -> None:
+def test_differences_and_their_transpose_are_adjoint() -> None:
     rng = np.random.default_rng(4)
     x, along, down = rng.standard_normal((5, 6)), rng.standard_normal((5, 5)), rng.standard_normal((4, 6))
     one = (np.diff(x, axis=1) * along).sum() + (np.diff(x, axis=0) * down).sum()
@@ -147,13 +146,17 @@ def test_few_iterations_are_enough(values: FloatArray) -> None:
     assert psnr(found[0], inside) > psnr(image, inside) + 4
 
 
+def in_precision(single: bool, psf: Psf, image: np.ndarray, noise_variance: float) -> np.ndarray:
+    """The picture restored by total variation, in single precision or in double."""
+    return total_variation(
+        lambda kappa: make_solver(psf, image.shape, kappa, single=single), image[None], noise_variance, 60.0
+    )[0]
+
+
 def test_single_precision_is_enough_for_total_variation() -> None:
     image, _ = blurred(blocks(40, 80), UNIFORM, (3,))
     psf = Psf(values=UNIFORM, origin=(3,))
-    one, two = (
-        total_variation(lambda kappa, t=t: make_solver(psf, image.shape, kappa, single=t), image[None], 1e-4, 60.0)[0]
-        for t in (True, False)
-    )
+    one, two = (in_precision(single, psf, image, 1e-4) for single in (True, False))
     assert one.dtype == np.float32
     assert abs(one - two).max() < 1e-3
 
@@ -164,10 +167,7 @@ def test_single_precision_is_wrong_by_less_than_the_noise(noise_sd: float) -> No
     image, _ = blurred(blocks(40, 80), LOPSIDED, (3,))
     image = image + noise_sd * np.random.default_rng(1).standard_normal(image.shape)
     psf = Psf(values=LOPSIDED, origin=(3,))
-    one, two = (
-        total_variation(lambda k, t=t: make_solver(psf, image.shape, k, single=t), image[None], noise_sd**2, 60.0)[0]
-        for t in (True, False)
-    )
+    one, two = (in_precision(single, psf, image, noise_sd**2) for single in (True, False))
     assert np.std(one - two) < 0.1 * noise_sd
 
 

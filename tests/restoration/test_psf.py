@@ -34,7 +34,7 @@ def on_grid(psf: Psf, low: int, high: int) -> np.ndarray:
 
 def test_a_known_path_gives_the_sensors_own_light() -> None:
     psf = motion_psf(PATH, None, KERNEL, SCALE)
-    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    edges = (np.arange(-30.0, 32.0) - 0.5) * SCALE
     expected = pixel_mass(KERNEL, edges, PATH).mean(axis=0)
     assert abs(on_grid(psf, -30, 30) - expected).max() < 1e-5
     assert psf.values.sum() == pytest.approx(1, abs=1e-12)
@@ -44,7 +44,7 @@ def test_a_known_path_gives_the_sensors_own_light() -> None:
 def test_a_path_on_the_plane_gives_the_sensors_own_light() -> None:
     path = np.stack([PATH, 0.1 * np.cos(4 * STEPS)])
     psf = motion_psf(path, None, KERNEL, SCALE)
-    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    edges = (np.arange(-30.0, 32.0) - 0.5) * SCALE
     expected = pixel_mass_2d(np.eye(2) * KERNEL.variance, edges, edges, path.T).mean(axis=0)
     (row, column), (rows, columns) = psf.origin, psf.values.shape
     inside = expected[30 - row : 30 - row + rows, 30 - column : 30 - column + columns]
@@ -53,14 +53,14 @@ def test_a_path_on_the_plane_gives_the_sensors_own_light() -> None:
 
 
 @pytest.mark.parametrize("correlation", [-0.95, -0.5, 0.02, 0.5, 0.9])
-def test_a_kernel_that_is_not_round(correlation: float) -> None:
+def test_a_kernel_that_is_not_round_gives_the_sensors_own_light(correlation: float) -> None:
     """Against quadrature over each pixel."""
     covariance = np.array([[0.05**2, correlation * 0.05 * 0.03], [correlation * 0.05 * 0.03, 0.03**2]])
-    width = linalg.sqrtm(2 * covariance).real
-    kernel = Kernel(shape="gaussian", sigma=0.06, matrix=tuple(map(tuple, width)))  # type: ignore[arg-type] # two by two
+    (a, b), (c, d) = linalg.sqrtm(2 * covariance).real
+    kernel = Kernel(shape="gaussian", sigma=0.06, matrix=((a, b), (c, d)))
     path = np.stack([PATH, 0.1 * np.cos(4 * STEPS)])
     psf = motion_psf(path, None, kernel, SCALE)
-    edges = (np.arange(-30, 32) - 0.5) * SCALE
+    edges = (np.arange(-30.0, 32.0) - 0.5) * SCALE
     expected = pixel_mass_2d(covariance, edges, edges, path.T).mean(axis=0)
     (row, column), (rows, columns) = psf.origin, psf.values.shape
     inside = expected[30 - row : 30 - row + rows, 30 - column : 30 - column + columns]
@@ -163,7 +163,7 @@ def test_plain_numbers_are_normalised_and_centred() -> None:
         ([0.0, 0.0], "zero everywhere"),
     ],
 )
-def test_what_is_no_psf(values: list[float], says: str) -> None:
+def test_values_that_are_no_psf_are_refused(values: list[float], says: str) -> None:
     with pytest.raises(RestorationError, match=says):
         as_psf(values)
 
@@ -183,12 +183,14 @@ def test_an_origin_outside_the_taps() -> None:
         (np.zeros(10), None, 0.0, "above zero"),
     ],
 )
-def test_what_is_no_path(path: np.ndarray, covariance: np.ndarray | None, scale: float, says: str) -> None:
+def test_a_path_that_is_none_is_refused(
+    path: np.ndarray, covariance: np.ndarray | None, scale: float, says: str
+) -> None:
     with pytest.raises(RestorationError, match=says):
         motion_psf(path, covariance, KERNEL, scale)
 
 
 @pytest.mark.parametrize("shares", [np.ones(9), np.full(10, math.nan), np.r_[-0.1, np.ones(9)], np.zeros(10)])
-def test_what_are_no_shares(shares: np.ndarray) -> None:
+def test_shares_that_are_none_are_refused(shares: np.ndarray) -> None:
     with pytest.raises(RestorationError, match="expected 10, of which none is negative, and some not zero"):
         motion_psf(np.zeros(10), None, KERNEL, SCALE, shares)

@@ -7,6 +7,7 @@ import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,7 +80,7 @@ def test_a_method_that_cannot_be_loaded_is_one_line(
         ("tv", {"strength": 2}, "tv takes no strength, which is a parameter of no method of aolink"),
     ],
 )
-def test_a_parameter_that_a_method_does_not_take(method: str, parameters: dict[str, object], says: str) -> None:
+def test_a_parameter_that_a_method_does_not_take_is_refused(method: str, parameters: dict[str, Any], says: str) -> None:
     with pytest.raises(RestorationError, match=says):
         restore(np.ones((9, 9)), np.ones(2), method=method, **parameters)
 

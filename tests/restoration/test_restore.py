@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -88,10 +89,10 @@ def test_backwards_the_filter_runs_the_other_way() -> None:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.float32, np.float64])
-def test_any_type_of_number(dtype: type) -> None:
+def test_the_type_of_the_numbers_stays(dtype: type) -> None:
     image, _ = picture(UNIFORM, (3,))
     scale = 200 if np.dtype(dtype).itemsize == 1 else 2000
-    given = (scale * np.clip(image, 0, 1.2)).astype(dtype)
+    given: np.ndarray = (scale * np.clip(image, 0, 1.2)).astype(dtype)
     found = restore(given, UNIFORM).image
     assert found.dtype == dtype
     exact = restore(given.astype(np.float64), UNIFORM).image
@@ -169,7 +170,7 @@ def test_an_oblique_motion_with_pixels_missing() -> None:
         assert psnr(found.image, inside) > psnr(image, inside) + 1
 
 
-def test_a_bent_motion() -> None:
+def test_a_bent_motion_is_undone_on_the_plane_and_refused_on_lines() -> None:
     turn = np.linspace(0, math.pi, 200)
     psf = motion_psf(np.stack([5 * np.cos(turn), 5 * np.sin(turn)]), None, SMALL, 1.0)
     image, inside = picture(psf.values, psf.origin)
@@ -281,9 +282,11 @@ def test_an_even_picture_stays_as_it_is(method: str) -> None:
         (np.zeros((5, 5)), Psf(values=np.ones((4, 2)) / 2, origin=(0,)), {}, "PSFs for 4 pixels"),
     ],
 )
-def test_what_is_no_picture(image: FloatArray, psf: FloatArray, options: dict[str, object], says: str) -> None:
+def test_what_cannot_be_restored_is_refused_with_what_was_expected(
+    image: FloatArray, psf: FloatArray, options: dict[str, Any], says: str
+) -> None:
     with pytest.raises(RestorationError, match=says):
-        restore(image, psf, **options)  # type: ignore[arg-type]
+        restore(image, psf, **options)
 
 
 def test_one_bad_pixel_in_a_colour() -> None:

@@ -45,7 +45,7 @@ def test_noise_by_the_psfs_error_on_the_plane() -> None:
     found = []
     for _ in range(6):
         scene = np.fft.fft2(rng.standard_normal((n, n))) / np.sqrt(weight * rough)
-        found.append(sum(np.mean(np.fft.ifft2(scene * np.fft.fft(m, n)).real ** 2) for m in modes))
+        found.append(sum(float(np.mean(np.fft.ifft2(scene * np.fft.fft(m, n)).real ** 2)) for m in modes))
     assert plane_variance(modes, weight) == pytest.approx(np.mean(found), rel=0.1)
 
 

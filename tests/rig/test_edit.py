@@ -50,7 +50,7 @@ def test_a_new_key_stands_behind_the_last_of_its_table() -> None:
         "name = 'x'\n[sensor.kernel]\nsigma = 2\n",
     ],
 )
-def test_the_same_in_every_way_to_write_a_table(text: str) -> None:
+def test_a_value_is_changed_in_every_way_to_write_a_table(text: str) -> None:
     expected = tomllib.loads(text)
     expected["sensor"] |= {"new": 3}
     expected["sensor"]["kernel"]["sigma"] = 4
@@ -84,6 +84,6 @@ def test_line_ends_stay_as_they_are() -> None:
         ("name = \n", "name", "not valid TOML"),
     ],
 )
-def test_what_cannot_be_changed(text: str, key: str, says: str) -> None:
+def test_a_value_that_cannot_be_changed_is_refused(text: str, key: str, says: str) -> None:
     with pytest.raises(RigError, match=says):
         with_value(text, key, 1)

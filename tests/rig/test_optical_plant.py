@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 
 from aolink.errors import RigError
-from aolink.optics.mirror import Membrane, square_pads
-from aolink.rig import load_rig, parse_rig
+from aolink.optics.mirror import Membrane, VoltageLaw, square_pads
+from aolink.rig import Rig, load_rig, parse_rig
+from aolink.rig.optical_plant import Optics
 from tests.conftest import without_pupil
+from tests.kinds import must_be
 
 SH = load_rig("sh-8x8")
 TILT = load_rig("tip-tilt")
 
 
-def changed(rig, old: str, new: str):
+def changed(rig: Rig, old: str, new: str) -> Rig:
     assert rig.toml.count(old) == 1, old
     return parse_rig(rig.toml.replace(old, new))
 
@@ -37,7 +39,9 @@ def test_a_pressure_moves_every_spot_as_the_membrane_bends():
 
 def test_the_window_is_a_lenslet_seen_from_its_focus():
     assert SH.sensor.field == pytest.approx((-0.15 / 45 * 1e3, 0.15 / 45 * 1e3))
-    assert SH.sensor.pixel_width * 1e-3 == pytest.approx(SH.optics.lenslets.pixels_to_slope(0.3e-3 / 16))
+    assert SH.sensor.pixel_width * 1e-3 == pytest.approx(
+        must_be(Optics, SH.optics).lenslets.pixels_to_slope(0.3e-3 / 16)
+    )
 
 
 def test_a_drift_is_as_slow_and_as_large_as_the_file_says():
@@ -57,7 +61,7 @@ def test_tip_tilt_moves_all_spots_alike_with_its_coupling():
 
 def test_voltages_are_what_the_driver_has_steps_of():
     mirror = SH.mirror
-    law = mirror.voltage
+    law = must_be(VoltageLaw, mirror.voltage)
     assert mirror.input_min[0] == pytest.approx(-1.8e-3 * 140**2)
     u = np.linspace(mirror.input_min[0], mirror.input_max[0], 1001)[:, None] * np.ones(16)
     out = mirror.quantise(u)

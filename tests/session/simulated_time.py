@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
@@ -25,8 +26,10 @@ from aolink.session.loop import Inputs, SessionLoop
 from aolink.session.report import Report
 from aolink.simulation.devices import Line
 from aolink.simulation.server import RigServer
+from aolink.simulation.streams import Stream
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
+from tests.kinds import must_be
 
 _EPOCH_NS = 1_767_225_600_000_000_000
 _TRUTH_STEPS = 200
@@ -81,7 +84,8 @@ class End:
         self._outgoing = outgoing
         self.unsent = outgoing.unsent
 
-    def write(self, data: bytes) -> int:
+    def write(self, data: bytes) -> Any:
+        """Of a device it is how much was taken, of a host nothing is asked."""
         return self._outgoing.write(data)
 
     def fileno(self) -> int:
@@ -103,8 +107,8 @@ class SimulatedTimeHub(Host):
         """What the mirror really held: the command's block and the source, by fast step."""
         names: tuple[Line, Line] = ("camera", "mirror")
         self.to_device, self.to_host = ({name: Way(self) for name in names} for _ in range(2))
-        streams = {name: End(name, self.to_device[name], self.to_host[name]) for name in names}
-        self.server = RigServer(rig, streams, seed=seed, real_time=True, clock_ns=lambda: self.clock_ns)  # type: ignore[arg-type] # an End is a Stream
+        streams: dict[Line, Stream] = {name: End(name, self.to_device[name], self.to_host[name]) for name in names}
+        self.server = RigServer(rig, streams, seed=seed, real_time=True, clock_ns=lambda: self.clock_ns)
         for name in names:
             self.links.append(Link(name, End(name, self.to_host[name], self.to_device[name]), self.now_ns))
 
@@ -178,7 +182,8 @@ class Run:
     @property
     def first_step(self) -> int:
         """Of the session."""
-        return next(each.message.first_step for each in Recording(self.path).messages(topics.COMMAND))  # type: ignore[attr-defined, no-any-return]
+        command = next(Recording(self.path).messages(topics.COMMAND)).message
+        return must_be(pb.CommandBlock, command).first_step
 
     @property
     def report(self) -> Report:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,6 +22,7 @@ from aolink.session.account import Account
 from aolink.session.report import Report
 from aolink.simulation import devices
 from aolink.wire import messages_pb2 as pb
+from tests.kinds import messages_of
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 
 RIG = load_rig("section-vi")
@@ -43,37 +45,29 @@ def check_account(run: Run) -> None:
     """The sums are exact, and what is said to be applied was applied."""
     report, held = run.report, run.hub.truth()
     assert ended(report) == report.steps_commanded
-    blocks = [each.message for each in Recording(run.path).messages(topics.COMMAND)]
+    blocks = messages_of(pb.CommandBlock, Recording(run.path), topics.COMMAND)
     really = sum(
-        held.get(step, (0, 0))[0] == block.block_id  # type: ignore[attr-defined]
+        held.get(step, (0, 0))[0] == block.block_id
         for block in blocks
-        for step in range(block.first_step, block.first_step + block.n_steps)  # type: ignore[attr-defined]
+        for step in range(block.first_step, block.first_step + block.n_steps)
     )
-    assert report.steps_commanded == sum(block.n_steps for block in blocks)  # type: ignore[attr-defined]
+    assert report.steps_commanded == sum(block.n_steps for block in blocks)
     assert report.steps_applied <= really <= report.steps_applied + report.steps_not_reported
     # In the recording each step is reported, or said not to be, once.
-    ends = [each.message for each in Recording(run.path).messages(topics.APPLIED)]
+    ends = messages_of(pb.Applied, Recording(run.path), topics.APPLIED)
     steps = [
-        step
-        for m in ends
-        if m.source != pb.Applied.AWAITED  # type: ignore[attr-defined]
-        for step in range(m.first_step, m.first_step + m.n_steps)  # type: ignore[attr-defined]
+        step for m in ends if m.source != pb.Applied.AWAITED for step in range(m.first_step, m.first_step + m.n_steps)
     ]
     assert len(steps) == len(set(steps))
 
 
 def recorded_steps(run: Run, source: pb.Applied.Source) -> set[int]:
-    ends = [each.message for each in Recording(run.path).messages(topics.APPLIED)]
-    return {
-        step
-        for m in ends
-        if m.source == source  # type: ignore[attr-defined]
-        for step in range(m.first_step, m.first_step + m.n_steps)  # type: ignore[attr-defined]
-    }
+    ends = messages_of(pb.Applied, Recording(run.path), topics.APPLIED)
+    return {step for m in ends if m.source == source for step in range(m.first_step, m.first_step + m.n_steps)}
 
 
 def log_of(run: Run) -> list[str]:
-    return [each.message.message for each in Recording(run.path).messages(topics.LOG)]  # type: ignore[attr-defined]
+    return [each.message for each in messages_of(Log, Recording(run.path), topics.LOG)]
 
 
 def check_live_is_recorded(run: Run) -> None:
@@ -102,7 +96,7 @@ def check_live_is_recorded(run: Run) -> None:
 def test_every_commanded_step_ends_once_at_every_error_rate(
     faults: dict[str, float], seed: int, tmp_path: Path
 ) -> None:
-    rig = rig_with(**faults)
+    rig = rig_with("", **faults)
     run = run_session(SimulatedTimeHub(rig, seed), rig, tmp_path / "a.mcap", 20)
     check_account(run)
     check_live_is_recorded(run)
@@ -124,7 +118,7 @@ def test_what_the_mirror_no_longer_knows_is_not_reported_and_assumed_as_converte
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The line from the mirror is dead for longer than it remembers; the commands get there all the while."""
-    monkeypatch.setattr(devices, "_HISTORY_WATCHDOGS", 0)  # then it remembers as many steps as its queue has
+    monkeypatch.setattr(devices, "history_steps", lambda rig: rig.mirror.queue_steps)
     hub = SimulatedTimeHub(RIG)
     hub.at = [
         (1_300_000_000, lambda: hub.cut(to_device=False)),
@@ -153,8 +147,8 @@ def test_a_block_is_sent_again_as_often_as_its_lead_leaves_room_for(loss: float,
     assert run.error is None
     check_account(run)
     held = run.hub.truth()
-    blocks = [each.message for each in Recording(run.path).messages(topics.COMMAND)]
-    late = sum(held[block.first_step][0] != block.block_id for block in blocks)  # type: ignore[attr-defined]
+    blocks = messages_of(pb.CommandBlock, Recording(run.path), topics.COMMAND)
+    late = sum(held[block.first_step][0] != block.block_id for block in blocks)
     expected = len(blocks) * loss**16
     assert expected - 4 * expected**0.5 < late < expected + 4 * expected**0.5 + 1
     assert (run.report.steps_late > 0) == (late > 0)

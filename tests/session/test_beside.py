@@ -12,15 +12,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from aolink.errors import EstimatorError
-from aolink.estimation import Driver, make_estimator
+from aolink.estimation import Driver, Estimate, make_estimator
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
 from aolink.jobs.demo import simulated_rig
@@ -35,6 +36,7 @@ from aolink.session.report import LatencyBook
 from aolink.session.waiting import Aside, Waiting, most_waiting
 from aolink.wire import messages_pb2 as wire
 from tests.conftest import Session
+from tests.kinds import messages_of
 
 SLOW = "sampled"
 """It takes some tenths of a second for an exposure, ..."""
@@ -73,7 +75,7 @@ def test_what_it_had_no_time_for_is_counted_and_recorded(loaded: Session) -> Non
     recording, metadata = Recording(loaded.path), Recording(loaded.path).metadata
     for name in (SLOW, "o3"):
         counted = loaded.report.estimation[name]
-        accounts = [each.message for each in recording.messages(topics.estimation_topic(name))]
+        accounts = messages_of(pb.Estimation, recording, topics.estimation_topic(name))
         assert counted.estimated + counted.skipped == len(accounts) == EXPOSURES
         assert sorted(each.frame_id for each in accounts) == list(range(1, EXPOSURES + 1))
         estimated = [each.frame_id for each in recording.iter_estimates(name)]
@@ -211,14 +213,14 @@ def children(parent: int, what: str) -> list[int]:
 
 
 @contextmanager
-def recording_process(rig_file: Path, path: Path, *more: str, **options: object) -> Iterator[subprocess.Popen[bytes]]:
+def recording_process(rig_file: Path, path: Path, *more: str, **options: Any) -> Iterator[subprocess.Popen[bytes]]:
     """`aolink record` in real time with a slow estimator."""
     with simulated_rig(rig_file, "--real-time") as (camera, mirror):
         command = [
             sys.executable, "-m", "aolink", "record", "--camera", camera, "--mirror", mirror, "--rig", str(rig_file),
             "-o", str(path), *more,
         ]  # fmt: skip
-        with subprocess.Popen(command, **options) as process:  # type: ignore[call-overload] # options of Popen
+        with subprocess.Popen(command, **options) as process:
             try:
                 yield process
             finally:
@@ -302,10 +304,13 @@ def test_who_watches_or_is_told_and_never_comes_back_holds_up_no_session(rig_fil
         watched.append(exposure.frame_id)
         go_on.wait(60)
 
+    def never_back(exposures: int) -> None:
+        go_on.wait(60)
+
     with simulated_rig(rig_file, "--real-time") as ports:
         report = record(
             parse_rig(FAST), *ports, tmp_path / "a.mcap", estimators=["o3"], exposures=EXPOSURES, watch=watch,
-            progress=lambda exposures: bool(go_on.wait(60)) and None,
+            progress=never_back,
         )  # fmt: skip
     go_on.set()
     assert (report.ended, report.frames_received, report.frames_lost) == ("complete", EXPOSURES, 0)
@@ -318,7 +323,7 @@ def test_who_watches_gets_each_exposure_once_and_each_estimate_once(rig_file: Pa
     seen: list[int] = []
     estimates: list[tuple[str, int]] = []
 
-    def watch(exposure: Exposure, some: list) -> None:
+    def watch(exposure: Exposure, some: Sequence[Estimate]) -> None:
         seen.append(exposure.frame_id)
         estimates.extend((each.estimator, each.frame_id) for each in some)
 
@@ -405,8 +410,8 @@ def with_frames_lost(recording: Recording, lost: set[int]) -> list[Exposure]:
 
     assembly, exposures, is_lost = ExposureAssembly(recording.rig), [], False
     for each in recording.messages():
-        if each.topic == topics.EXPOSURE:
-            is_lost = each.message.frame_id in lost  # type: ignore[attr-defined]
+        if isinstance(each.message, pb.ExposureInfo):
+            is_lost = each.message.frame_id in lost
         if each.topic in (topics.EXPOSURE, topics.IMAGE) and is_lost:
             continue
         exposures += assembly.take(each.topic, each.message)

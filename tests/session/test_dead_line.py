@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.errors import DeviceError
 from aolink.jobs.demo import simulated_rig
@@ -23,6 +24,7 @@ from aolink.session import Report, record
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import MessageDecoder, PacketDecoder
 from aolink.wire.port import SerialPort
+from tests.kinds import messages_of
 
 
 class Forwarder:
@@ -143,7 +145,7 @@ def test_a_line_that_comes_back_is_told_to_go_on_and_the_gap_is_recorded(rig_fil
         + report.steps_not_reported
     )  # fmt: skip
     recording = Recording(tmp_path / "a.mcap")
-    held = [each.message for each in recording.messages(topics.APPLIED)]
-    assert any(m.source == pb.Applied.WATCHDOG for m in held)  # type: ignore[attr-defined]
-    log = [each.message.message for each in recording.messages(topics.LOG)]  # type: ignore[attr-defined]
+    held = messages_of(pb.Applied, recording, topics.APPLIED)
+    assert any(m.source == pb.Applied.WATCHDOG for m in held)
+    log = [each.message for each in messages_of(Log, recording, topics.LOG)]
     assert any("parked by its watchdog in this session: re-armed" in text for text in log)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
 from aolink.devices.discovery import identify_port
@@ -19,9 +20,9 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
-from aolink.wire import hub
 from aolink.wire import messages_pb2 as pb
 from tests.hostile import Lie, changed, lying_rig
+from tests.kinds import messages_of
 
 RIG = load_rig("section-vi-lively")
 HUGE = 2**63 - 1
@@ -105,13 +106,17 @@ CAMERA = [
 
 
 @pytest.mark.parametrize(("kind", "field", "value"), MIRROR)
-def test_a_mirror_that_lies(tmp_path: Path, kind: type[Message], field: str, value: object) -> None:
+def test_a_mirror_that_lies_ends_the_session_with_the_field(
+    tmp_path: Path, kind: type[Message], field: str, value: object
+) -> None:
     lies = {"mirror": changed(kind, says(field, value), 30 if kind is pb.VirtualTime else 3)}
     assert_caught(tmp_path, lies, rf"the mirror says {kind.__name__}\.{field}.* = .*, expected ")
 
 
 @pytest.mark.parametrize(("kind", "field", "value"), CAMERA)
-def test_a_camera_that_lies(tmp_path: Path, kind: type[Message], field: str, value: object) -> None:
+def test_a_camera_that_lies_ends_the_session_with_the_field(
+    tmp_path: Path, kind: type[Message], field: str, value: object
+) -> None:
     # The length of the data is what does not fit where the offset is wrong, the last step where the first one is.
     named = {"offset": "data", "first_step": "last_step"}.get(field, field)
     assert_caught(
@@ -146,7 +151,7 @@ def test_a_mirror_of_another_rig_file(tmp_path: Path, field: str, value: object)
     )
 
 
-def test_counts_beyond_the_converter(tmp_path: Path) -> None:
+def test_counts_beyond_the_converter_end_the_session(tmp_path: Path) -> None:
     rig = replace(RIG, sensor=replace(RIG.sensor, bit_depth=12))
     bright = changed(pb.FrameChunk, says("data", lambda chunk: b"\xff\xff" * (len(chunk.data) // 2)))
     with (
@@ -161,7 +166,7 @@ def test_a_code_that_nobody_knows_is_a_refusal(tmp_path: Path) -> None:
     assert_caught(tmp_path, lies, "the camera refused to start: code 77")
 
 
-def test_what_the_other_device_has_to_say(tmp_path: Path) -> None:
+def test_a_device_that_says_what_the_other_has_to_say_is_refused(tmp_path: Path) -> None:
     def lie(message: Message) -> Message:
         return pb.CommandAck(block_id=1) if isinstance(message, pb.FrameChunk) else message
 
@@ -200,19 +205,15 @@ def flood(after: type[Message], begun: threading.Event) -> Lie:
 
 
 @pytest.mark.parametrize("real_time", [False, True])
-def test_a_flood_ends_the_session_before_it_fills_the_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real_time: bool
-) -> None:
-    monkeypatch.setattr(hub, "_BUDGET_BYTES", 1 << 20)
+def test_a_flood_ends_the_session_before_it_fills_the_memory(tmp_path: Path, real_time: bool) -> None:
     lies = {"camera": flood(pb.Ack, threading.Event())}
     assert_caught(
-        tmp_path, lies, "have sent messages of . MiB without answering, expected at most", real_time=real_time
+        tmp_path, lies, "have sent messages of .* MiB without answering, expected at most", real_time=real_time
     )
 
 
-def test_a_stop_is_heard_in_a_flood(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_is_heard_in_a_flood(tmp_path: Path) -> None:
     """The flood has no end, and nothing but the stop ends the session."""
-    monkeypatch.setattr(hub, "_BUDGET_BYTES", 1 << 40)
     begun = threading.Event()
     with lying_rig(RIG, mirror=flood(pb.CommandAck, begun)) as ports:
         report = record(RIG, *ports, tmp_path / "a.mcap", stop=begun.is_set)
@@ -251,5 +252,5 @@ def test_a_clock_that_is_set_back_during_a_session(tmp_path: Path) -> None:
     assert abs(error[set_back]) > 45e6
     assert sigma[-1] < 20e6
     assert np.abs(error[sigma < 20e6]).max() < 20e6  # who claims to know is right
-    messages = [m.message.message for m in Recording(path).messages(topics.LOG)]
+    messages = [each.message for each in messages_of(Log, Recording(path), topics.LOG)]
     assert any("the camera's clock was set back by" in text for text in messages)

@@ -58,7 +58,7 @@ def test_as_fast_as_it_goes_nobody_sleeps(recorded: Session) -> None:
     assert clock.slept == []
 
 
-def test_a_part_only(recorded: Session) -> None:
+def test_a_part_of_a_recording_is_played_by_its_times(recorded: Session) -> None:
     frames = [each.frame_id for each, _ in replay(Recording(recorded.path), ["o1"], start_s=0.4, end_s=1.0)]
     assert frames == [3, 4, 5]
     with pytest.raises(RecordingError, match="no exposure between 90 s and the end"):
@@ -75,7 +75,9 @@ def test_the_commands_are_those_of_the_session(recorded: Session) -> None:
     assert np.array_equal(asked[-1], recording.rig.mirror.park), "after the last command the mirror rests"
 
 
-def test_through_a_rig_again(aolink: Run, recorded: Session, tmp_path: Path) -> None:
+def test_played_to_the_same_simulated_rig_a_recording_comes_out_the_same(
+    aolink: Run, recorded: Session, tmp_path: Path
+) -> None:
     """The simulated rig of the same seed does the same again: the two recordings are one."""
     with simulated_rig("section-vi-lively") as (camera, mirror):
         result = aolink(
@@ -121,7 +123,7 @@ def test_a_replay_that_waits_can_be_stopped(recorded: Session, rate: float) -> N
     assert 101.0 < clock.now < 101.2
 
 
-def test_the_command_line(aolink: Run, recorded: Session) -> None:
+def test_the_command_plays_a_part_and_says_what_a_rig_needs(aolink: Run, recorded: Session) -> None:
     result = aolink("replay", recorded.path, "-e", "o1", "--start", "0.4", "--json")
     assert json.loads(result.stdout)["o1"]["exposures"] == EXPOSURES - 2
     wrong = aolink("replay", recorded.path, "--to-rig")

@@ -9,19 +9,21 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from typer.testing import CliRunner
 
 import aolink
-from aolink.cli import app
+from aolink.cli.common import app
 from aolink.errors import DeviceError, EstimatorError, RecordingError, RestorationError
 from aolink.estimation.estimate import coefficient_roots, motion
-from aolink.exposure import Exposure
+from aolink.exposure import Exposure, Picture
 from aolink.jobs.demo import simulated_rig
 from aolink.optics.camera import to_density
-from aolink.optics.scene import framed
+from aolink.optics.scene import SceneSensor, framed
 from aolink.optics.sensor import SpotSensor
 from aolink.recording import topics
 from aolink.recording.compare import compare
@@ -36,19 +38,20 @@ from aolink.rig import load_rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session import Report, record
 from aolink.viewing import LiveView, save_rrd
+from tests.kinds import must_be, truth_of
 from tests.session.test_session import FAULTY
 from tests.viewing.rrd import read_rrd
 from tests.viewing.test_save import absent_from_views
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 RIG = load_rig("moving-scene")
-assert RIG.scene is not None
+SCENE = must_be(SceneSensor, RIG.scene)
 EXPOSURES = 8
 
 
-def take(path: Path, rig: str | Path = "moving-scene", exposures: int = EXPOSURES, **options: object) -> Report:
+def take(path: Path, rig: str | Path = "moving-scene", exposures: int = EXPOSURES, **options: Any) -> Report:
     with simulated_rig(rig) as (camera, mirror):
-        return record(load_rig(rig), camera, mirror, path, estimators=["o1"], exposures=exposures, **options)  # type: ignore[arg-type]
+        return record(load_rig(rig), camera, mirror, path, estimators=["o1"], exposures=exposures, **options)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +96,7 @@ def test_the_wire_gives_what_the_model_gives_in_memory(session: Path) -> None:
 def test_the_true_scene_is_in_the_recording_of_a_simulated_rig(session: Path) -> None:
     true = Recording(session).true_scene
     assert true is not None
-    expected = RIG.scene.to_counts(framed(RIG.scene, read_scene_picture(RIG.scene, RIG.folder)))  # type: ignore[union-attr,arg-type]
+    expected = SCENE.to_counts(framed(SCENE, read_scene_picture(SCENE, must_be(Path, RIG.folder))))
     np.testing.assert_array_equal(true, expected)
 
 
@@ -120,19 +123,19 @@ def test_a_bad_link_costs_scenes_their_own_pixels_and_is_reproducible(tmp_path: 
     reports = [take(tmp_path / name, rig, exposures=12) for name in ("a.mcap", "b.mcap")]
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
     report, exposures = reports[0], list(Recording(tmp_path / "a.mcap").exposures())
-    known = [e for e in exposures if e.scene is not None]
+    known = [(e, e.scene) for e in exposures if e.scene is not None]
     assert report.scenes_incomplete > 0
     assert report.scenes_lost == 12 - report.scenes_received
     assert len(known) <= report.scenes_received
-    assert sum(not e.scene.mask.all() for e in known) in range(1, report.scenes_incomplete + 1)
+    assert sum(not scene.mask.all() for _, scene in known) in range(1, report.scenes_incomplete + 1)
     truth = aolink.simulate(rig, 12)
-    for e in known:
-        mask, expected = e.scene.mask, truth[e.first_step // 200].scene
-        np.testing.assert_array_equal(e.scene.pixels[mask], expected.pixels[mask])
-        assert not e.scene.pixels[~mask].any()
-        assert np.count_nonzero(~mask) % 2048 == 0  # whole chunks
+    for e, scene in known:
+        expected = must_be(Picture, truth[e.first_step // 200].scene)
+        np.testing.assert_array_equal(scene.pixels[scene.mask], expected.pixels[scene.mask])
+        assert not scene.pixels[~scene.mask].any()
+        assert np.count_nonzero(~scene.mask) % 2048 == 0  # whole chunks
     # The spots of exposures whose scene was damaged are whole, and the other way round.
-    assert any(e.complete and not e.scene.mask.all() for e in known)
+    assert any(e.complete and not scene.mask.all() for e, scene in known)
     summary = write_deblurred(Recording(tmp_path / "a.mcap"), tmp_path / "sharp.mcap", estimator="o1")
     assert summary.exposures == len(exposures)
     assert summary.scenes == len(known)
@@ -141,7 +144,7 @@ def test_a_bad_link_costs_scenes_their_own_pixels_and_is_reproducible(tmp_path: 
 
 
 def test_a_camera_with_another_scene_is_refused(tmp_path: Path) -> None:
-    other = replace(RIG, scene=replace(RIG.scene, shape=(128, 64)))  # type: ignore[type-var]
+    other = replace(RIG, scene=replace(SCENE, shape=(128, 64)))
     with simulated_rig("moving-scene") as (camera, mirror):
         scene_less = replace(RIG, scene=None)
         for rig, found in ((other, r"\(128, 64\) in the file, \(128, 128\)"), (scene_less, r"\(0, 0\) in the")):
@@ -173,7 +176,7 @@ def test_cut_and_merged_again_scenes_stay_with_their_exposures(sharp: Path, tmp_
     merged = list(Recording(tmp_path / "c.mcap").exposures())
     assert [e.frame_id for e in merged] == [e.frame_id for e in whole]
     for one, two in zip(merged, whole, strict=True):
-        np.testing.assert_array_equal(one.scene.pixels, two.scene.pixels)
+        np.testing.assert_array_equal(must_be(Picture, one.scene).pixels, must_be(Picture, two.scene).pixels)
 
 
 def test_compare_names_the_exposure_of_a_scene(session: Path, tmp_path: Path) -> None:
@@ -182,7 +185,8 @@ def test_compare_names_the_exposure_of_a_scene(session: Path, tmp_path: Path) ->
     with RecordingWriter(tmp_path / "b.mcap", one.rig, {}, one.start_ns, deterministic=True) as writer:
         for each in one.messages():
             if each.topic == topics.SCENE and each.sequence >= third:
-                each.message.data = bytes(len(each.message.data))  # type: ignore[attr-defined]
+                picture = must_be(RawImage, each.message)
+                picture.data = bytes(len(picture.data))
             writer.write(each.topic, each.message, each.log_time_ns)
     found = compare(one, Recording(tmp_path / "b.mcap"))
     assert {topic for topic, each in found.items() if not each.same} == {topics.SCENE}
@@ -192,19 +196,19 @@ def test_compare_names_the_exposure_of_a_scene(session: Path, tmp_path: Path) ->
 
 def test_restored_pictures_come_close_to_the_true_scene(session: Path, sharp: Path) -> None:
     """With the estimated path they gain most of what the true path would give."""
-    recording, sensor = Recording(sharp), RIG.scene
-    assert sensor is not None
-    true = sensor.to_intensity(recording.true_scene)  # type: ignore[arg-type]
+    recording = Recording(sharp)
+    true = SCENE.to_intensity(must_be(np.ndarray, recording.true_scene))
     gains, possible = [], []
     for exposure, restored in zip(recording.exposures(), recording.restored(), strict=True):
         assert restored.scene is not None
-        assert (restored.scene.dtype, restored.scene.min() >= 0, restored.scene.max() <= 1) == (np.float32, True, True)
-        path = exposure.truth.path  # type: ignore[union-attr]
-        shift = np.rint(path.mean(axis=1) / sensor.pixel_scale).astype(np.intp)
-        blurred = blurred_psnr(sensor, exposure, shift, true)
+        assert restored.scene.dtype == np.float32
+        assert 0 <= restored.scene.min() <= restored.scene.max() <= 1
+        path = truth_of(exposure).path
+        shift = np.rint(path.mean(axis=1) / SCENE.pixel_scale).astype(np.intp)
+        blurred = blurred_psnr(SCENE, exposure, shift, true)
         best = restore(
-            sensor.to_intensity(exposure.scene.pixels),  # type: ignore[union-attr]
-            motion_psf(path, None, sensor.kernel, sensor.pixel_scale),
+            SCENE.to_intensity(must_be(Picture, exposure.scene).pixels),
+            motion_psf(path, None, SCENE.kernel, SCENE.pixel_scale),
         )
         gains.append(psnr(restored.scene.astype(float), true) - blurred)
         possible.append(psnr(best.image, true) - blurred)
@@ -255,7 +259,7 @@ def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sha
         assert (a.frame_id, a.estimator, a.method, a.reason) == (b.frame_id, b.estimator, b.method, b.reason)
         assert b.scene_noise_sd == pytest.approx(a.scene_noise_sd, rel=1e-9)
         # Two threads add up in another order than one, and the solver stops at 1e-4 of what it began with.
-        np.testing.assert_allclose(a.scene, b.scene, atol=1e-4)
+        np.testing.assert_allclose(must_be(np.ndarray, a.scene), must_be(np.ndarray, b.scene), atol=1e-4)
     assert Recording(again).counts[wanted[0]] == EXPOSURES
     new = tmp_path / "new.mcap"
     write_reestimated(Recording(sharp), ["o3"], new)
@@ -279,11 +283,11 @@ def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:
     covariance = own @ own.T
     np.testing.assert_allclose(path, estimate.path.reshape(16, 2, -1).mean(axis=0))
     n_steps, rng = path.shape[1], np.random.default_rng(1)
-    root = [np.linalg.cholesky(each + 1e-15 * np.eye(len(each))) for each in estimate.coefficient_covariance]
-    basis = estimate.model.basis[:, :, : root[0].shape[1]]
+    roots = [np.linalg.cholesky(each + 1e-15 * np.eye(len(each))) for each in estimate.coefficient_covariance]
+    basis = estimate.model.basis[:, :, : roots[0].shape[1]]
     drawn = []
     for _ in range(4000):
-        moved = np.stack([basis @ (each @ rng.standard_normal(each.shape[1])) for each in root])
+        moved = np.stack([basis @ (each @ rng.standard_normal(each.shape[1])) for each in roots])
         drawn.append((mix @ moved.reshape(len(estimate.path), n_steps))[:, [0, n_steps - 1]].ravel())
     some = [0, n_steps - 1, n_steps, 2 * n_steps - 1]
     expected = covariance[np.ix_(some, some)]
@@ -398,7 +402,7 @@ def test_what_cannot_be_restored_says_why(session: Path, tmp_path: Path) -> None
         _ = Recording(broken).true_scene
 
 
-def test_the_command(aolink: Run, session: Path, tmp_path: Path) -> None:
+def test_the_command_deblurs_a_recording(aolink: Run, session: Path, tmp_path: Path) -> None:
     shutil.copy(session, tmp_path / "a.mcap")
     done = aolink("deblur", "a.mcap", "-e", "o1", "--method", "gauss_markov", "-o", "b.mcap", "--json")
     assert done.returncode == 0, done.stderr

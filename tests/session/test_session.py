@@ -305,7 +305,9 @@ def test_the_demo_does_the_main_job(aolink: Callable[..., subprocess.CompletedPr
 
 
 @pytest.mark.parametrize("arguments", [["--exposures", "3"], ["--duration", "0.5"]])
-def test_by_hand(aolink: Callable[..., subprocess.CompletedProcess[str]], arguments: list[str]) -> None:
+def test_the_commands_of_a_session_by_hand_work_one_after_the_other(
+    aolink: Callable[..., subprocess.CompletedProcess[str]], arguments: list[str]
+) -> None:
     with simulated_rig("section-vi") as (camera, mirror):
         listed = aolink("devices", camera, mirror)
         assert f"{camera}: camera section-vi" in listed.stdout

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from google.protobuf.message import Message
@@ -21,8 +23,8 @@ def devices() -> SimulatedDevices:
     return SimulatedDevices(RIG, virtual_time=True, step_zero_ns=0)
 
 
-def ask(device: SimulatedDevices, message: Message, line: Line = "mirror", sequence: int = 0) -> Message:
-    """Hand over a message; gives the answer, which is the only thing that leaves."""
+def ask(device: SimulatedDevices, message: Message, line: Line = "mirror", sequence: int = 0) -> Any:
+    """Hand over a message; gives the answer, which is the only thing that leaves and is of the question's kind."""
     device.handle(line, message, sequence)
     (answer,) = device.outbox
     device.outbox.clear()

@@ -8,9 +8,12 @@ import pytest
 from aolink.errors import RigError
 from aolink.optics.turbulence import Layer, structure_function
 from aolink.rig import load_rig, parse_rig
+from aolink.rig.disturbance import Disturbance
+from aolink.rig.optical_plant import Optics
 from aolink.simulation.disturbance import DisturbancePlayer
 from aolink.simulation.model import RigModel, simulate
 from tests.conftest import without_pupil
+from tests.kinds import must_be, truth_of
 
 SH, TILT = without_pupil(load_rig("sh-8x8")), load_rig("tip-tilt")
 
@@ -28,7 +31,7 @@ def slopes(rig, n_steps, seed=1):
 
 
 def test_vibrations_are_lines_of_their_frequency_and_height():
-    rig = disturbed(TILT, vibrations=TILT.disturbance.vibrations)
+    rig = disturbed(TILT, vibrations=must_be(Disturbance, TILT.disturbance).vibrations)
     n = 4000  # 2 s: both lines on whole bins
     spectrum = np.abs(np.fft.rfft(slopes(rig, n), axis=0)) * 2 / n
     frequency = np.fft.rfftfreq(n, rig.timing.fast_step_s)
@@ -66,7 +69,7 @@ def test_a_static_aberration_stays():
     assert np.ptp(path, axis=0).max() == 0
     # Noll 4 is sqrt(3) (2 r^2 / R^2 - 1), R half the grid's diagonal: slopes 4 sqrt(3) r / R^2.
     radius = 8 * 0.3e-3 / np.sqrt(2)
-    expected = 20e-9 * 4 * np.sqrt(3) * SH.optics.lenslets.centres_m / radius**2 / 1e-3
+    expected = 20e-9 * 4 * np.sqrt(3) * must_be(Optics, SH.optics).lenslets.centres_m / radius**2 / 1e-3
     np.testing.assert_allclose(path[0].reshape(-1, 2), expected, rtol=1e-9)
 
 
@@ -115,13 +118,14 @@ def test_the_path_is_the_plants_output_and_the_disturbance():
     stream = np.random.default_rng(np.random.SeedSequence(TILT.simulation.seed).spawn(5)[4])
     added = DisturbancePlayer(TILT, stream).slopes(0, 300).T
     for k, (exposure, without) in enumerate(zip(exposures, quiet, strict=True)):
-        np.testing.assert_allclose(exposure.truth.path, without.truth.path + added[:, k * 100 : (k + 1) * 100])
-        np.testing.assert_array_equal(exposure.truth.start_state, without.truth.start_state)
+        np.testing.assert_allclose(truth_of(exposure).path, truth_of(without).path + added[:, k * 100 : (k + 1) * 100])
+        np.testing.assert_array_equal(truth_of(exposure).start_state, truth_of(without).start_state)
 
 
 def test_plant_noise_goes_on_beside_a_disturbance_where_the_file_says_so():
-    noisy = dataclasses.replace(TILT, disturbance=dataclasses.replace(TILT.disturbance, plant_noise=True))
+    disturbance = dataclasses.replace(must_be(Disturbance, TILT.disturbance), plant_noise=True)
+    noisy = dataclasses.replace(TILT, disturbance=disturbance)
     free = dataclasses.replace(TILT, disturbance=None)
     for a, b in zip(simulate(noisy, 2), simulate(free, 2), strict=True):
-        np.testing.assert_array_equal(a.truth.start_state, b.truth.start_state)
-        assert np.abs(a.truth.path - b.truth.path).max() > 0.1
+        np.testing.assert_array_equal(truth_of(a).start_state, truth_of(b).start_state)
+        assert np.abs(truth_of(a).path - truth_of(b).path).max() > 0.1

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from hypothesis import strategies as st
 from aolink.optics.camera import pixel_noise_variance, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.plant.lifting import lift
-from aolink.rig import load_rig, parse_light
+from aolink.rig import Rig, load_rig, parse_light
 from aolink.simulation.model import CameraFrame, RigModel, simulate
+from tests.kinds import line_of, truth_of
 
 RIG = load_rig("section-vi")
 STILL = dataclasses.replace(
@@ -21,7 +23,7 @@ STILL = dataclasses.replace(
 )
 
 
-def with_timing(rig, exposure_steps: int, frame_period_steps: int):
+def with_timing(rig: Rig, exposure_steps: int, frame_period_steps: int) -> Rig:
     timing = dataclasses.replace(
         rig.timing, exposure_steps=exposure_steps, frame_period_steps=frame_period_steps
     )  # fmt: skip
@@ -57,9 +59,9 @@ def test_without_noise_the_path_is_the_recursion():
     (exposure,) = simulate(STILL, 1)
     x = np.zeros(2)
     for k in range(200):
-        assert exposure.truth.path[0, k] == pytest.approx(x[0], abs=1e-12)
+        assert truth_of(exposure).path[0, k] == pytest.approx(x[0], abs=1e-12)
         x = RIG.plant.A @ x + RIG.plant.B @ exposure.inputs[k]
-    np.testing.assert_allclose(exposure.truth.end_state[0], x, atol=1e-12)
+    np.testing.assert_allclose(truth_of(exposure).end_state[0], x, atol=1e-12)
 
 
 def test_the_output_is_sampled_before_the_input_acts():
@@ -74,14 +76,14 @@ def test_the_output_is_sampled_before_the_input_acts():
 def test_states_of_consecutive_exposures_join():
     exposures = simulate(RIG, 4)
     for before, after in itertools.pairwise(exposures):
-        np.testing.assert_array_equal(before.truth.end_state, after.truth.start_state)
+        np.testing.assert_array_equal(truth_of(before).end_state, truth_of(after).start_state)
 
 
 def test_states_scatter_as_the_lifted_covariance_says():
     transition, noise = lift(RIG.plant, 200)
     exposures = simulate(RIG, 3000, seed=3, inputs=np.zeros((600_000, 1)))
-    starts = np.array([e.truth.start_state[0] for e in exposures])
-    ends = np.array([e.truth.end_state[0] for e in exposures])
+    starts = np.array([truth_of(e).start_state[0] for e in exposures])
+    ends = np.array([truth_of(e).end_state[0] for e in exposures])
     innovations = ends - starts @ transition.T
     np.testing.assert_allclose(np.cov(innovations.T) / noise, 1, atol=0.12)
     # Successive states are correlated over seven exposures, so fewer of them count.
@@ -100,10 +102,10 @@ def test_first_states_scatter_as_the_initial_covariance_says():
 
 def test_pixels_are_the_exposure_with_noise_of_v_over_d():
     exposures = simulate(RIG, 300)
-    sensor = RIG.sensor
+    sensor = line_of(RIG)
     noise = np.array(
         [
-            to_density(sensor, e.pixels)[0] - exposure_density(sensor.kernel, sensor.edges, e.truth.path[0])
+            to_density(sensor, e.pixels)[0] - exposure_density(sensor.kernel, sensor.edges, truth_of(e).path[0])
             for e in exposures
         ]
     )
@@ -173,17 +175,18 @@ def test_too_few_inputs_are_refused():
 def test_many_copies_are_as_independent_as_their_noise():
     plant = dataclasses.replace(RIG.plant, axes=3)
     rig = dataclasses.replace(RIG, plant=plant)
-    states = RigModel(rig, 1)._run(np.zeros((5, 3)))
-    assert states.shape == (6, 3, 2)
-    assert len(np.unique(states[5])) == 6
+    (exposure,) = simulate(rig, 1, seed=1, inputs=np.zeros((200, 3)))
+    state = truth_of(exposure).end_state
+    assert state.shape == (3, 2)
+    assert len(np.unique(state)) == 6
 
 
-def with_light(rig, lights: str, **sensor: float):
+def with_light(rig: Rig, lights: str, **sensor: Any) -> Rig:
     simulation = dataclasses.replace(rig.simulation, light=parse_light(lights, "lights"))
     return dataclasses.replace(rig, simulation=simulation, sensor=dataclasses.replace(rig.sensor, **sensor))
 
 
-def shots(rig, starts: int, frames: int):
+def shots(rig: Rig, starts: int, frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Densities and paths under each light, (starts, frames, pixels) and (starts, frames, steps)."""
     model, taken = RigModel(rig, 11), []
     for _ in range(starts):
@@ -202,7 +205,7 @@ def test_each_start_of_the_camera_takes_the_next_light():
     assert np.ptp(paths[3]) > 0
     assert np.ptp(paths[4]) > 0
     for k in (2, 3, 4):
-        expected = exposure_density(rig.sensor.kernel, rig.sensor.edges, paths[k])
+        expected = exposure_density(rig.sensor.kernel, line_of(rig).edges, paths[k])
         np.testing.assert_allclose(densities[k], expected, atol=0.05)
 
 
@@ -216,7 +219,7 @@ def test_photoelectrons_are_poisson(light):
     frames = 4000
     rig = with_light(with_timing(RIG, 1, 1), light, noise_density=1e-3, photoelectrons=200.0)
     (densities,), (paths,) = shots(rig, 1, frames)
-    level = exposure_density(rig.sensor.kernel, rig.sensor.edges, paths[0])
+    level = exposure_density(rig.sensor.kernel, line_of(rig).edges, paths[0])
     level = level if light == "still" else np.full(40, float(light[5:]))
     variance = pixel_noise_variance(rig.sensor, level)
     assert np.abs((densities.mean(axis=0) - level) / np.sqrt(variance / frames)).max() < 5

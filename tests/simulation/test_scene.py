@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from PIL import Image
 from scipy import ndimage
 
 from aolink.errors import RigError
+from aolink.exposure import Picture
 from aolink.optics.scene import SceneSensor, framed
 from aolink.optics.sensor import Kernel
 from aolink.restoration import motion_psf
@@ -18,16 +20,17 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.simulation.model import RigModel, simulate
 from aolink.simulation.scene import SceneCamera
+from tests.kinds import must_be, truth_of
 
 RIG = load_rig("moving-scene")
-assert RIG.scene is not None
+SCENE = must_be(SceneSensor, RIG.scene)
 FINE = 4
 PICTURE = np.random.default_rng(3).random((96, 112))
 
 
-def rig_with(picture: np.ndarray, folder: Path, **changes: object) -> tuple[Rig, SceneSensor]:
+def rig_with(picture: np.ndarray, folder: Path, **changes: Any) -> tuple[Rig, SceneSensor]:
     np.save(folder / "a.npy", picture)
-    sensor = replace(RIG.scene, picture="a.npy", noise_sd=0.0, bit_depth=16, counts_per_intensity=40_000.0, **changes)  # type: ignore[type-var]
+    sensor = replace(SCENE, picture="a.npy", noise_sd=0.0, bit_depth=16, counts_per_intensity=40_000.0, **changes)
     return replace(RIG, scene=sensor, folder=folder), sensor
 
 
@@ -38,11 +41,11 @@ def small(tmp_path: Path) -> tuple[Rig, SceneSensor]:
 
 
 def intensity(rig: Rig, path: np.ndarray, light: str = "moving") -> np.ndarray:
-    assert rig.scene is not None
+    sensor = must_be(SceneSensor, rig.scene)
     rig = replace(rig, plant=replace(rig.plant, C=np.ones((len(path), 2))))
     camera = SceneCamera(rig, np.random.default_rng(0))
     weights = np.full(path.shape[1], 1 / path.shape[1])
-    return rig.scene.to_intensity(camera.frame(path, weights, light))
+    return sensor.to_intensity(camera.frame(path, weights, light))
 
 
 @pytest.mark.parametrize("directions", [1, 2])
@@ -61,7 +64,7 @@ def test_it_is_the_mean_of_the_picture_moved_step_by_step(small: tuple[Rig, Scen
 SLANTED = Kernel(shape="gaussian", sigma=0.2, matrix=((0.24, 0.12), (0.12, 0.09)))
 
 
-@pytest.mark.parametrize("kernel", [RIG.scene.kernel, SLANTED], ids=["round", "slanted"])
+@pytest.mark.parametrize("kernel", [SCENE.kernel, SLANTED], ids=["round", "slanted"])
 def test_it_is_what_restoration_takes_it_for(tmp_path: Path, kernel: Kernel) -> None:
     """The direction of a positive slope, the place of no displacement and the scale are those of `motion_psf`."""
     smooth = ndimage.gaussian_filter(PICTURE, 2.5, mode="wrap")
@@ -73,10 +76,10 @@ def test_it_is_what_restoration_takes_it_for(tmp_path: Path, kernel: Kernel) -> 
         seen = intensity(rig, spread)
         psf = motion_psf(path, None, sensor.kernel, sensor.pixel_scale)
         values = np.atleast_2d(psf.values)
-        rows, columns = psf.origin if len(psf.origin) == 2 else (0, *psf.origin)
-        whole = ndimage.convolve(
-            smooth, values, mode="wrap", origin=(rows - values.shape[0] // 2, columns - values.shape[1] // 2)
-        )
+        row, column = psf.origin if len(psf.origin) == 2 else (0, psf.origin[0])
+        middle = (values.shape[0] // 2, values.shape[1] // 2)
+        centred = ndimage.convolve(smooth, values, mode="wrap")
+        whole = np.roll(centred, (middle[0] - row, middle[1] - column), axis=(0, 1))
         expected = framed(sensor, whole)
         still = framed(sensor, smooth)
         assert np.abs(seen - expected).max() < 0.05 * np.abs(still - expected).max()
@@ -89,7 +92,7 @@ def test_along_x_alone_it_is_as_on_the_plane(small: tuple[Rig, SceneSensor]) -> 
     np.testing.assert_allclose(intensity(rig, path), intensity(rig, np.concatenate([path, 0 * path])), atol=3e-5)
 
 
-def test_lights(small: tuple[Rig, SceneSensor]) -> None:
+def test_each_light_gives_its_own_scene(small: tuple[Rig, SceneSensor]) -> None:
     rig, sensor = small
     path = np.zeros((1, 4))
     assert np.abs(intensity(rig, path, "dark")).max() < 1e-4
@@ -100,12 +103,12 @@ def test_lights(small: tuple[Rig, SceneSensor]) -> None:
 
 def test_noise_is_as_the_rig_file_says() -> None:
     exposures = simulate(RIG, 3)
-    model = replace(RIG, scene=replace(RIG.scene, noise_sd=0.0))  # type: ignore[type-var]
+    model = replace(RIG, scene=replace(SCENE, noise_sd=0.0))
     for noisy, clean in zip(exposures, simulate(model, 3), strict=True):
         assert noisy.scene is not None
         assert clean.scene is not None
-        difference = (noisy.scene.pixels.astype(float) - clean.scene.pixels) / RIG.scene.counts_per_intensity  # type: ignore[union-attr]
-        assert np.std(difference) == pytest.approx(RIG.scene.noise_sd, rel=0.03)  # type: ignore[union-attr]
+        difference = (noisy.scene.pixels.astype(float) - clean.scene.pixels) / SCENE.counts_per_intensity
+        assert np.std(difference) == pytest.approx(SCENE.noise_sd, rel=0.03)
         assert abs(np.mean(difference)) < 3e-4
         np.testing.assert_array_equal(noisy.pixels, clean.pixels)
 
@@ -129,12 +132,14 @@ def test_the_spot_is_the_same_without_the_scene() -> None:
 
 
 def test_an_exposure_between_steps_weighs_its_ends() -> None:
-    """Half a step late on a path that jumps in the step after the last: half a step of the jump is seen."""
-    late = replace(RIG, timing=replace(RIG.timing, exposure_steps=4, frame_period_steps=4, exposure_offset=0.5))
-    model = RigModel(late)
-    path, weights = model._held(np.array([[0.0, 1.0, 2.0, 3.0]]), np.array([[4.0, 0.0]]))
-    assert path.tolist() == [[0, 1, 2, 3, 4]]
-    assert weights.tolist() == [0.125, 0.25, 0.25, 0.25, 0.125]
+    """Half a step late, half of the first step and half of the one after the last are seen."""
+    timing = replace(RIG.timing, exposure_steps=4, frame_period_steps=4, exposure_offset=0.5)
+    late = replace(RIG, timing=timing, scene=replace(SCENE, noise_sd=0.0))
+    (exposure,) = simulate(late, 1)
+    truth = truth_of(exposure)
+    path = np.concatenate([truth.path, late.plant.C @ truth.end_state.T], axis=1)
+    expected = SceneCamera(late, np.random.default_rng(0)).frame(path, np.array([1, 2, 2, 2, 1]) / 8, "moving")
+    np.testing.assert_array_equal(must_be(Picture, exposure.scene).pixels, expected)
 
 
 def scene_text(**changes: object) -> str:
@@ -157,7 +162,7 @@ def scene_text(**changes: object) -> str:
         ({"sigma": "[[0.1, 0], [0, 0.2]]"}, r"kernel\.sigma is a matrix"),
     ],
 )
-def test_what_is_wrong_in_the_table(changes: dict[str, object], message: str) -> None:
+def test_what_is_wrong_in_the_table_is_named(changes: dict[str, object], message: str) -> None:
     with pytest.raises(RigError, match=message):
         parse_rig(scene_text(**changes))
 
@@ -173,9 +178,9 @@ def test_only_the_simulator_opens_the_picture(tmp_path: Path) -> None:
     assert simulate(parse_rig(RIG.toml, tmp_path), 1)[0].scene is not None  # it comes with aolink
 
 
-def test_pictures_of_any_kind(tmp_path: Path) -> None:
+def test_pictures_of_any_kind_are_read_as_intensities(tmp_path: Path) -> None:
     """Eight and sixteen bits and colours are 0 to 1; what is beside the rig file goes before what comes with aolink."""
-    sensor = replace(RIG.scene, shape=(8, 8), picture_pixels=1, picture="moving-scene.png")  # type: ignore[type-var]
+    sensor = replace(SCENE, shape=(8, 8), picture_pixels=1, picture="moving-scene.png")
     for picture, expected in (
         (np.full((8, 9), 51, dtype=np.uint8), 0.2),
         (np.full((9, 8), 13107, dtype=np.uint16), 0.2),

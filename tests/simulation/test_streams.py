@@ -88,14 +88,14 @@ def test_who_begins_with_anything_else_is_dropped_unheard(stream: TcpStream, sen
 
 @given(st.binary(max_size=200))
 def test_no_other_bytes_pass(data: bytes) -> None:
-    assert streams._begins_with_identify(data) is not True
+    assert streams.begins_with_identify(data) is not True
 
 
-def test_who_says_nothing_is_dropped_and_locks_nobody_out(stream: TcpStream, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_says_nothing_is_dropped_and_locks_nobody_out(stream: TcpStream) -> None:
     with connect(stream) as idle, connect(stream) as host:
         host.sendall(IDENTIFY)  # served although the other one was there before
         assert taken(stream, lambda data: data != b"")
-        monkeypatch.setattr(streams, "INTRODUCTION_S", 0.0)
+        stream.introduction_s = 0.0
         taken(stream, lambda data: is_closed(idle))
         assert not is_closed(host)
 
@@ -110,15 +110,13 @@ def test_idle_connections_are_bounded(stream: TcpStream) -> None:
         each.close()
 
 
-def test_a_silent_host_gives_way_to_one_that_identifies_itself(
-    stream: TcpStream, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_silent_host_gives_way_to_one_that_identifies_itself(stream: TcpStream) -> None:
     with connect(stream) as first, connect(stream) as second, connect(stream) as page:
         first.sendall(IDENTIFY)
         taken(stream, lambda data: data != b"")
         second.sendall(IDENTIFY)
         taken(stream, lambda data: is_closed(second))  # the first one has the port
-        monkeypatch.setattr(streams, "IDLE_S", 0.0)
+        stream.idle_s = 0.0
         page.sendall(POST)
         taken(stream, lambda data: is_closed(page))
         assert not is_closed(first)  # nobody who can take its place has come
@@ -143,7 +141,7 @@ def test_with_the_word_they_may() -> None:
         each.close()
 
 
-def test_no_such_host() -> None:
+def test_a_host_that_is_not_there_is_refused() -> None:
     with pytest.raises(PortError, match="there is no host no such host"):
         open_streams("no such host:0")
 

@@ -231,7 +231,7 @@ def test_the_slips_that_matter_cost_something(page: str) -> None:
         assert float(match[2]) > 1.02
 
 
-def test_remark_1_by_rank(page: str) -> None:
+def test_remark_1_counts_the_states_by_rank(page: str) -> None:
     assert row(page, "10 Hz")[1:] == ["2 of 2", "0 of 2", "1 of 2"]
     assert row(page, "12.5 Hz")[1:] == ["2 of 2", "1 of 2", "2 of 2"]
     assert row(page, "section VI's plant")[1:] == ["2 of 2"] * 3

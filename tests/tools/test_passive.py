@@ -79,10 +79,10 @@ def test_a_resting_spot_gives_little_to_combine():
     assert passing.index > at_rest.index
 
 
-def test_its_value_and_noise():
+def test_the_outputs_value_and_noise_are_those_of_its_weights():
     output = passive_output(MODEL, *POINTS[0])
     R = np.array([[0.02, 0.001], [0.001, 0.01]])
     y = output.expected + np.array([[0.1, 0.2], [0.0, 0.0]])
     value, sd = output.value(Measurement(value=y, covariance=np.tile(R, (2, 1, 1))))
-    np.testing.assert_allclose(value, [output.weights @ [0.1, 0.2], 0.0], atol=1e-12)
+    np.testing.assert_allclose(value, [output.weights @ np.array([0.1, 0.2]), 0.0], atol=1e-12)
     np.testing.assert_allclose(sd, np.sqrt(output.weights @ R @ output.weights))

@@ -39,7 +39,7 @@ def test_the_blur_is_a_causal_mean(shahin: ModuleType) -> None:
     assert shahin.degraded(0.0, 0) == pytest.approx(expected, abs=1e-12)
 
 
-def test_the_alignment_flatters(shahin: ModuleType) -> None:
+def test_an_alignment_by_index_flatters_what_is_restored(shahin: ModuleType) -> None:
     """Index for index a causal blur looks worse than it is, so what is restored looks better."""
     image = shahin.degraded(0.1, 1)
     scanner, _ = shahin.models()["first order, α = 0.873"]

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 from rerun.chunk import RrdReader
 
+Entities = dict[str, dict[str, list[Any]]]
+"""Entity -> column -> values."""
 
-def read_rrd(path: Path) -> dict[str, dict[str, list[Any]]]:
+
+def read_rrd(path: Path) -> Entities:
     """Entity -> column -> values in order of logging; a component's are lists, a timeline's integers."""
     return _columns(RrdReader(path).stream())
 

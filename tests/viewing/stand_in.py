@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -18,9 +18,11 @@ from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.plain import plain_data
 from aolink.recording import schemas_pb2 as schemas
+from aolink.recording.reader import Recording
 from aolink.restoration import RestoredPictures
 from aolink.rig import Rig, load_rig
 from aolink.wire import messages_pb2 as wire
+from tests.kinds import line_of
 
 HOST_ZERO_NS = 1_700_000_000_000_000_000
 DEVICE_ZERO_NS = 5_000_000_000
@@ -76,7 +78,7 @@ class StandIn:
             path = self.spot[k * period : k * period + n_steps]
             ends = [self.spot[k * period], self.spot[k * period + n_steps]]
             start_state, end_state = (np.array([[x, 0.1 * x]]) for x in ends)
-            seen = exposure_density(self.rig.sensor.kernel, self.rig.sensor.edges, path) + rng.normal(
+            seen = exposure_density(self.rig.sensor.kernel, line_of(self.rig).edges, path) + rng.normal(
                 size=40
             ) * np.sqrt(0.01 / 0.05)
             pixels = np.clip(np.rint(20000 + 2000 * seen), 0, 65535).astype(np.uint16).reshape(1, -1)
@@ -116,7 +118,7 @@ class StandIn:
     def exposures(self) -> Iterator[Exposure]:
         return iter(self._exposures)
 
-    def estimates(self, name: str) -> list[Estimate]:
+    def estimates(self, name: str) -> list[Drawn]:
         rng = np.random.default_rng(len(name))
         sd, m = SD[name], MEASUREMENTS[name]
         made = []
@@ -197,3 +199,8 @@ class StandIn:
                 yield Recorded("/clock", at, 0, clock)
             text = Log(level=Log.WARNING if s == 1 else Log.INFO, message=f"second {s}", name="session")
             yield Recorded("/log", at, 0, text)
+
+
+def as_recording(stand_in: object) -> Recording:
+    """For the type checker: it has what viewing asks of a recording."""
+    return cast(Recording, stand_in)

@@ -15,7 +15,7 @@ from aolink.errors import ViewerError
 from aolink.rig import load_rig
 from aolink.viewing import draw_session
 from aolink.viewing.palette import estimator_colour
-from tests.viewing.stand_in import StandIn
+from tests.viewing.stand_in import StandIn, as_recording
 from tests.viewing.test_spots import Simulated
 
 pytest.importorskip("matplotlib", reason="the picture is drawn with it: install aolink[plot]")
@@ -27,7 +27,7 @@ def pixels(path: Path) -> np.ndarray:
 
 def coloured(picture: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:
     """Where a colour is, (rows, columns)."""
-    return np.abs(picture - colour).max(axis=2) < 12
+    return np.asarray(np.abs(picture - colour).max(axis=2) < 12)
 
 
 def parts(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -38,7 +38,7 @@ def parts(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_every_part_shows_its_estimators(tmp_path: Path) -> None:
     """The session has the best estimator's path, the exposures also that of o1, the errors have all."""
-    session, inside, errors = parts(pixels(draw_session(StandIn(n=60), tmp_path / "a.png")))  # type: ignore[arg-type] # it has what is asked of a recording
+    session, inside, errors = parts(pixels(draw_session(as_recording(StandIn(n=60)), tmp_path / "a.png")))
     for part, names in ((session, ["o3"]), (inside, ["o1", "o3"]), (errors, ["open-loop", "o1", "o3"])):
         for name in names:
             assert coloured(part, estimator_colour(name)).sum() > 200, name
@@ -49,7 +49,7 @@ def test_every_part_shows_its_estimators(tmp_path: Path) -> None:
 
 def test_the_camera_s_picture_lies_under_the_path(tmp_path: Path) -> None:
     """Of the session's picture, the pixels about the path are darker than the others."""
-    session, _, _ = parts(pixels(draw_session(StandIn(n=60), tmp_path / "a.png")))  # type: ignore[arg-type]
+    session, _, _ = parts(pixels(draw_session(as_recording(StandIn(n=60)), tmp_path / "a.png")))
     grey = (np.ptp(session, axis=2) < 6) & (session.mean(axis=2) > 40) & (session.mean(axis=2) < 200)
     path = coloured(session, estimator_colour("o3"))
     for column in np.flatnonzero(path.any(axis=0))[100:-100:50]:
@@ -58,28 +58,28 @@ def test_the_camera_s_picture_lies_under_the_path(tmp_path: Path) -> None:
         assert np.abs(np.flatnonzero(near) - where).min() < 15
 
 
-def test_lost_frames_and_no_truth(tmp_path: Path) -> None:
+def test_without_a_truth_paths_are_drawn_and_errors_are_not(tmp_path: Path) -> None:
     bare = StandIn(n=60, lost=(20, 21, 22, 40), with_truth=False)
-    _, inside, errors = parts(pixels(draw_session(bare, tmp_path / "a.png")))  # type: ignore[arg-type]
+    _, inside, errors = parts(pixels(draw_session(as_recording(bare), tmp_path / "a.png")))
     assert coloured(inside, estimator_colour("o3")).sum() > 200
     assert coloured(errors, estimator_colour("o3")).sum() == 0
 
 
-def test_spots_on_a_plane(tmp_path: Path) -> None:
+def test_spots_on_a_plane_are_drawn_too(tmp_path: Path) -> None:
     simulated = Simulated(load_rig("sh-4x4"))
-    _, inside, _ = parts(pixels(draw_session(simulated, tmp_path / "a.png")))  # type: ignore[arg-type]
+    _, inside, _ = parts(pixels(draw_session(as_recording(simulated), tmp_path / "a.png")))
     assert coloured(inside, estimator_colour("o1")).sum() > 200
 
 
 def test_a_recording_without_exposures_is_one_clear_error(tmp_path: Path) -> None:
     empty = StandIn(n=5, lost=(0, 1, 2, 3, 4))
     with pytest.raises(ViewerError, match="has no exposure"):
-        draw_session(empty, tmp_path / "a.png")  # type: ignore[arg-type]
+        draw_session(as_recording(empty), tmp_path / "a.png")
 
 
 def test_where_it_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(ViewerError, match=r"cannot write .*a\.png: there is no folder"):
-        draw_session(StandIn(), tmp_path / "absent" / "a.png")  # type: ignore[arg-type]
+        draw_session(as_recording(StandIn()), tmp_path / "absent" / "a.png")
 
 
 @pytest.mark.usefixtures("without_vulkan")

@@ -13,14 +13,15 @@ from scipy import stats
 
 from aolink.errors import ViewerError
 from aolink.recording.reader import Recording
-from aolink.viewing import save_rrd
 from aolink.viewing.camera import HISTORY
 from aolink.viewing.motion import log_estimates, nis_bounds
 from aolink.viewing.palette import MISSING, NOTHING, TRUTH, estimator_colour
+from aolink.viewing.save import save_rrd
 from aolink.viewing.timebase import Timebase
 from tests.conftest import Session
-from tests.viewing.rrd import read_blueprint, read_rrd, scalars
-from tests.viewing.stand_in import DEVICE_ZERO_NS, MEASUREMENTS, StandIn
+from tests.kinds import truth_of
+from tests.viewing.rrd import Entities, read_blueprint, read_rrd, scalars
+from tests.viewing.stand_in import DEVICE_ZERO_NS, MEASUREMENTS, StandIn, as_recording
 
 N = 200
 LOST = 3
@@ -33,16 +34,16 @@ def recording() -> StandIn:
 
 @pytest.fixture(scope="module")
 def saved(recording: StandIn, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_rrd(recording, tmp_path_factory.mktemp("rrd") / "session.rrd")
+    return save_rrd(as_recording(recording), tmp_path_factory.mktemp("rrd") / "session.rrd")
 
 
 @pytest.fixture(scope="module")
-def entities(saved: Path) -> dict:
+def entities(saved: Path) -> Entities:
     return read_rrd(saved)
 
 
 def without_breaks(values: np.ndarray) -> np.ndarray:
-    return values[~np.isnan(values).any(axis=1)]
+    return np.asarray(values[~np.isnan(values).any(axis=1)])
 
 
 def absent_from_views(path: Path) -> list[str]:
@@ -66,7 +67,7 @@ def test_a_recorded_session_shows_its_estimates(recorded: Session, tmp_path: Pat
     for name in recording.estimators:
         shown = scalars(entities[f"/path/{name}/mean"])[:, 0]
         np.testing.assert_array_equal(shown, np.concatenate([e.path[0] for e in recording.estimates(name)]))
-    truth = np.concatenate([e.truth.path[0] for e in recording.exposures()])
+    truth = np.concatenate([truth_of(e).path[0] for e in recording.exposures()])
     np.testing.assert_array_equal(scalars(entities["/path/truth"])[:, 0], truth)
     assert entities["/camera/image"]["frame"] == [e.frame_id for e in recording.exposures()]
     assert absent_from_views(path) == []
@@ -78,7 +79,7 @@ def test_rerun_finds_no_fault_in_the_file(saved: Path) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(MEASUREMENTS))
-def test_path_and_band_are_the_estimates(recording: StandIn, entities: dict, name: str) -> None:
+def test_path_and_band_are_the_estimates(recording: StandIn, entities: Entities, name: str) -> None:
     estimates = recording.estimates(name)
     mean = np.concatenate([e.path[0] for e in estimates])
     sd = np.concatenate([e.path_sd[0] for e in estimates])
@@ -88,20 +89,20 @@ def test_path_and_band_are_the_estimates(recording: StandIn, entities: dict, nam
 
 
 @pytest.mark.parametrize("name", sorted(MEASUREMENTS))
-def test_errors_are_estimate_minus_truth(recording: StandIn, entities: dict, name: str) -> None:
+def test_errors_are_estimate_minus_truth(recording: StandIn, entities: Entities, name: str) -> None:
     pairs = list(zip(recording.estimates(name), recording.exposures(), strict=True))
-    error = [estimate.path[0] - exposure.truth.path[0] for estimate, exposure in pairs]
+    error = [estimate.path[0] - truth_of(exposure).path[0] for estimate, exposure in pairs]
     np.testing.assert_allclose(
         without_breaks(scalars(entities[f"/error/path/{name}"]))[:, 0], np.concatenate(error), atol=1e-15
     )
     rms = scalars(entities[f"/error/path_rms/{name}"])[:, 0]
     np.testing.assert_allclose(rms, [np.linalg.norm(e) / np.sqrt(N) for e in error])
     for i in range(2):
-        end = [estimate.end_state[0, i] - exposure.truth.end_state[0, i] for estimate, exposure in pairs]
+        end = [estimate.end_state[0, i] - truth_of(exposure).end_state[0, i] for estimate, exposure in pairs]
         np.testing.assert_allclose(scalars(entities[f"/error/end/x{i + 1}/{name}"])[:, 0], end, atol=1e-15)
 
 
-def test_a_path_is_at_its_own_fast_steps_and_device_times(recording: StandIn, entities: dict) -> None:
+def test_a_path_is_at_its_own_fast_steps_and_device_times(recording: StandIn, entities: Entities) -> None:
     truth = entities["/path/truth"]
     steps = np.array(truth["fast_step"])
     np.testing.assert_array_equal(np.array(truth["device_time"]), DEVICE_ZERO_NS + steps * 1_000_000)
@@ -110,13 +111,13 @@ def test_a_path_is_at_its_own_fast_steps_and_device_times(recording: StandIn, en
     assert "frame" not in truth
 
 
-def test_a_lost_frame_breaks_the_lines(entities: dict) -> None:
+def test_a_lost_frame_breaks_the_lines(entities: Entities) -> None:
     truth = entities["/path/truth"]
     (gap,) = np.flatnonzero(np.isnan(scalars(truth)[:, 0]))
     assert truth["fast_step"][gap - 1 : gap + 2] == [LOST * N - 1, LOST * N, (LOST + 1) * N]
 
 
-def test_states_stand_where_they_hold(recording: StandIn, entities: dict) -> None:
+def test_states_stand_where_they_hold(recording: StandIn, entities: Entities) -> None:
     estimates = recording.estimates("o3")
     for where, states, steps in (
         ("start", [e.start_state for e in estimates], [e.first_step for e in estimates]),
@@ -132,7 +133,9 @@ def test_states_stand_where_they_hold(recording: StandIn, entities: dict) -> Non
 
 
 @pytest.mark.parametrize(("name", "degrees"), [("o1", 1), ("o3", 2)])
-def test_nis_and_its_bounds(recording: StandIn, entities: dict, name: str, degrees: int) -> None:
+def test_nis_is_shown_between_its_95_percent_bounds(
+    recording: StandIn, entities: Entities, name: str, degrees: int
+) -> None:
     np.testing.assert_array_equal(
         scalars(entities[f"/nis/{name}/value"])[:, 0], [e.nis[0] for e in recording.estimates(name)]
     )
@@ -141,19 +144,19 @@ def test_nis_and_its_bounds(recording: StandIn, entities: dict, name: str, degre
     np.testing.assert_array_equal(scalars(entities[f"/nis/{name}/bounds"]), [[low, high]] * 11)
 
 
-def test_an_estimator_that_does_not_measure_has_no_nis(entities: dict) -> None:
+def test_an_estimator_that_does_not_measure_has_no_nis(entities: Entities) -> None:
     assert not [path for path in entities if path.startswith("/nis/open-loop")]
     assert set(map(tuple, entities["/status/open-loop"]["StateChange:state"])) == {("PREDICTED",)}
 
 
-def test_frames_are_the_counts_that_came(recording: StandIn, entities: dict) -> None:
+def test_frames_are_the_counts_that_came(recording: StandIn, entities: Entities) -> None:
     frames = entities["/camera/image"]
     for buffer, exposure in zip(frames["Image:buffer"], recording.exposures(), strict=False):
         np.testing.assert_array_equal(np.array(buffer[0], dtype=np.uint8).view("<u2"), exposure.pixels.ravel())
     assert frames["frame"] == recording.frame_ids
 
 
-def test_the_newest_exposure_is_the_last_row_and_what_never_came_is_marked(entities: dict) -> None:
+def test_the_newest_exposure_is_the_last_row_and_what_never_came_is_marked(entities: Entities) -> None:
     buffers = entities["/camera/history"]["Image:buffer"]
     pictures = {
         frame: np.array(buffer[0], dtype=np.uint8).reshape(HISTORY, 40, 3)
@@ -166,7 +169,7 @@ def test_the_newest_exposure_is_the_last_row_and_what_never_came_is_marked(entit
     assert (pictures[4][: HISTORY - 5] == NOTHING).all()
 
 
-def test_a_path_runs_down_its_own_row(recording: StandIn, entities: dict) -> None:
+def test_a_path_runs_down_its_own_row(recording: StandIn, entities: Entities) -> None:
     strips = dict(
         zip(
             entities["/camera/history/path/truth"]["frame"],
@@ -176,12 +179,12 @@ def test_a_path_runs_down_its_own_row(recording: StandIn, entities: dict) -> Non
     )
     newest = np.array(strips[11][-1])
     assert len(strips[11]) == 11
-    path = list(recording.exposures())[-1].truth.path[0]
+    path = truth_of(list(recording.exposures())[-1]).path[0]
     np.testing.assert_allclose(newest[[0, -1], 0], (path[[0, -1]] + 1) / 0.05, rtol=1e-6)
     assert HISTORY - 1 < newest[0, 1] < newest[-1, 1] < HISTORY
 
 
-def test_predicted_profile_has_unit_mass_about_the_path_it_came_from(recording: StandIn, entities: dict) -> None:
+def test_predicted_profile_has_unit_mass_about_the_path_it_came_from(recording: StandIn, entities: Entities) -> None:
     predicted = entities["/profile/predicted/o3"]["LineStrips2D:strips"]
     measured = entities["/profile/measured"]["LineStrips2D:strips"]
     (exposure, estimate) = next(zip(recording.exposures(), recording.estimates("o3"), strict=True))
@@ -194,7 +197,7 @@ def test_predicted_profile_has_unit_mass_about_the_path_it_came_from(recording: 
     assert (x * density).sum() * 0.05 == pytest.approx(estimate.path.mean(), abs=1e-3)
 
 
-def test_commands_and_what_was_applied(recording: StandIn, entities: dict) -> None:
+def test_commands_and_what_was_applied(recording: StandIn, entities: Entities) -> None:
     steps = np.arange(12 * N)
     sent, held = entities["/mirror/command"], entities["/mirror/applied"]
     assert sent["fast_step"] == held["fast_step"] == steps.tolist()
@@ -205,18 +208,18 @@ def test_commands_and_what_was_applied(recording: StandIn, entities: dict) -> No
     assert entities["/status/mirror"]["fast_step"] == [0, 150, 200]
 
 
-def test_latency_counts_from_the_end_of_the_exposure(entities: dict) -> None:
+def test_latency_counts_from_the_end_of_the_exposure(entities: Entities) -> None:
     np.testing.assert_allclose(scalars(entities["/latency/first_byte"]), 0.4)
     np.testing.assert_allclose(scalars(entities["/latency/complete"]), 0.9)
     assert "/latency/command_sent" not in entities  # it never happened
 
 
-def test_losses_add_up(entities: dict) -> None:
+def test_losses_add_up(entities: Entities) -> None:
     assert scalars(entities["/link/lost/frames"])[:, 0].tolist() == [0] * 3 + [1] * 8
     assert scalars(entities["/link/lost/chunks"])[:, 0].tolist() == [0] * 4 + [1] * 7
 
 
-def test_link_and_clock(entities: dict) -> None:
+def test_what_links_and_clocks_do_is_shown_in_its_units(entities: Entities) -> None:
     np.testing.assert_allclose(scalars(entities["/link/received/mirror"])[:, 0], 180)
     np.testing.assert_allclose(scalars(entities["/link/round_trip/camera"])[:, 0], 0.2)
     np.testing.assert_allclose(scalars(entities["/clock/offset/camera"])[:, 0], [0, 20, 40])
@@ -225,12 +228,12 @@ def test_link_and_clock(entities: dict) -> None:
     assert entities["/clock/sigma/mirror"]["fast_step"] == [0, 1000, 2000]
 
 
-def test_the_log_keeps_its_levels(entities: dict) -> None:
+def test_the_log_keeps_its_levels(entities: Entities) -> None:
     assert entities["/log"]["TextLog:text"] == [["session: second 0"], ["session: second 1"], ["session: second 2"]]
     assert entities["/log"]["TextLog:level"] == [["INFO"], ["WARN"], ["INFO"]]
 
 
-def test_a_quantity_has_one_colour_everywhere(entities: dict) -> None:
+def test_a_quantity_has_one_colour_everywhere(entities: Entities) -> None:
     def colours(path: str) -> set[int]:
         columns = [v for k, v in entities[path].items() if k.endswith(":colors")]
         return {colour >> 8 for rows in columns for row in rows for colour in row or []}
@@ -248,7 +251,7 @@ def test_every_view_shows_entities_that_exist(saved: Path) -> None:
 
 
 def test_what_a_session_lacks_has_no_view(tmp_path: Path) -> None:
-    path = save_rrd(StandIn(n=4, with_truth=False, with_latency=False, names=()), tmp_path / "bare.rrd")
+    path = save_rrd(as_recording(StandIn(n=4, with_truth=False, with_latency=False, names=())), tmp_path / "bare.rrd")
     entities = read_rrd(path)
     assert "/profile/measured" in entities
     assert not [p for p in entities if p.startswith(("/error", "/path", "/nis", "/latency", "/state"))]
@@ -285,17 +288,17 @@ def test_an_existing_file_is_only_replaced_when_told_to(tmp_path: Path) -> None:
     path = tmp_path / "session.rrd"
     path.write_text("precious")
     with pytest.raises(ViewerError, match="exists and is not overwritten"):
-        save_rrd(StandIn(n=2), path)
+        save_rrd(as_recording(StandIn(n=2)), path)
     assert path.read_text() == "precious"
-    save_rrd(StandIn(n=2), path, overwrite=True)
+    save_rrd(as_recording(StandIn(n=2)), path, overwrite=True)
     assert "/path/truth" in read_rrd(path)
 
 
 def test_a_file_that_cannot_be_written_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(ViewerError, match=r"cannot write .*there is no folder"):
-        save_rrd(StandIn(n=2), tmp_path / "absent" / "session.rrd")
+        save_rrd(as_recording(StandIn(n=2)), tmp_path / "absent" / "session.rrd")
     with pytest.raises(ViewerError, match="no exposure"):
-        save_rrd(StandIn(n=0), tmp_path / "empty.rrd")
+        save_rrd(as_recording(StandIn(n=0)), tmp_path / "empty.rrd")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -304,7 +307,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> No
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
     try:
         with pytest.raises(ViewerError, match="disk full"):
-            save_rrd(StandIn(n=12), tmp_path / "session.rrd")
+            save_rrd(as_recording(StandIn(n=12)), tmp_path / "session.rrd")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(tmp_path.iterdir()) == []
@@ -361,7 +364,7 @@ def test_a_live_view_takes_an_estimate_with_a_later_exposure(recorded: Session, 
 
 
 def test_what_an_estimator_had_no_time_for_is_shown(tmp_path: Path) -> None:
-    save_rrd(StandIn(n=12, without_time=(7, 8)), tmp_path / "a.rrd")
+    save_rrd(as_recording(StandIn(n=12, without_time=(7, 8))), tmp_path / "a.rrd")
     entities = read_rrd(tmp_path / "a.rrd")
     assert len(scalars(entities["/latency/estimation/o3"])) == 10
     states = [each for each in entities["/status/o3"]["StateChange:state"] if each is not None]

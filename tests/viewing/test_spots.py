@@ -17,6 +17,7 @@ from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
 from aolink.viewing import save_rrd
 from tests.viewing.rrd import read_rrd
+from tests.viewing.stand_in import as_recording
 from tests.viewing.test_save import absent_from_views
 
 N = 4
@@ -65,7 +66,7 @@ def recording() -> Simulated:
 
 @pytest.fixture(scope="module")
 def saved(recording: Simulated, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_rrd(recording, tmp_path_factory.mktemp("rrd") / "spots.rrd")  # type: ignore[arg-type]
+    return save_rrd(as_recording(recording), tmp_path_factory.mktemp("rrd") / "spots.rrd")
 
 
 def test_paths_of_all_spots_lie_in_their_blur(recording: Simulated, saved: Path) -> None:
@@ -107,7 +108,7 @@ def test_no_view_is_empty(saved: Path) -> None:
 
 def test_windows_in_the_dark_have_no_paths(tmp_path: Path) -> None:
     rig = load_rig("sh-8x8")
-    saved = save_rrd(Simulated(rig, ["o1"]), tmp_path / "pupil.rrd")  # type: ignore[arg-type] # it has what is asked of a recording
+    saved = save_rrd(as_recording(Simulated(rig, ["o1"])), tmp_path / "pupil.rrd")
     (strips, *_) = read_rrd(saved)["/camera/image/path/truth"]["LineStrips2D:strips"]
     assert rig.optics is not None
     lit = np.argwhere(rig.optics.lenslets.light.reshape(8, 8) >= 0.4)
@@ -119,7 +120,7 @@ def test_the_session_page_says_how_many_exposures_were_gated(tmp_path: Path) -> 
     recording = Simulated(load_rig("sh-4x4"))
     o1 = recording.estimates("o1")
     o1[1:3] = [replace(o1[1], status=Status.GATED), replace(o1[2], status=Status.DIVERGED)]
-    entities = read_rrd(save_rrd(recording, tmp_path / "gated.rrd"))  # type: ignore[arg-type] # as above
+    entities = read_rrd(save_rrd(as_recording(recording), tmp_path / "gated.rrd"))
     rows = [row.split("|") for row in entities["/session"]["TextDocument:text"][0][0].splitlines() if "|" in row]
     gated = {row[1].strip(): row[-2].strip() for row in rows}
     assert gated["estimator"] == "gated"

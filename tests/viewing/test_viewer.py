@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import signal
@@ -19,11 +20,12 @@ import rerun as rr
 from PIL import Image
 
 from aolink.errors import RendererError, ViewerError
-from aolink.viewing import open_viewer, save_rrd, screenshot, serve_web
+from aolink.viewing import open_viewer, screenshot, serve_web
 from aolink.viewing.palette import TRUTH, estimator_colour
-from aolink.viewing.viewer import free_port, headless_viewer, settled_picture
+from aolink.viewing.save import save_rrd
+from aolink.viewing.viewer import WEB_PORT, free_port, headless_viewer, settled_picture
 from aolink.viewing.vulkan import has_vulkan
-from tests.viewing.stand_in import StandIn
+from tests.viewing.stand_in import StandIn, as_recording
 
 TEXTS = ("Session", "Log")
 PICTURES = ("Camera", "Intensity")
@@ -31,7 +33,9 @@ PICTURES = ("Camera", "Intensity")
 
 @pytest.fixture(scope="module")
 def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return save_rrd(StandIn(n=60, names=("o3", "open-loop")), tmp_path_factory.mktemp("rrd") / "session.rrd")
+    return save_rrd(
+        as_recording(StandIn(n=60, names=("o3", "open-loop"))), tmp_path_factory.mktemp("rrd") / "session.rrd"
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -68,7 +72,7 @@ def listening(*processes: psutil.Process) -> set[str]:
     return {c.laddr.ip for c in connections if c.status == psutil.CONN_LISTEN}
 
 
-def spread_tabs(layout: dict) -> dict:
+def spread_tabs(layout: dict[str, Any]) -> dict[str, Any]:
     """The layout with all tabs beside each other: the viewer draws only what is visible."""
     for part in layout.values():
         container = part.get("ContainerBlueprint", {})
@@ -226,7 +230,7 @@ def test_a_port_in_use_is_one_clear_error(rrd: Path) -> None:
             serve_web(rrd, port)
 
 
-def test_a_page_moves_where_its_usual_port_is_taken(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_moves_where_its_usual_port_is_taken(rrd: Path) -> None:
     seen: list[str] = []
 
     def look(address: str) -> None:
@@ -236,14 +240,13 @@ def test_a_page_moves_where_its_usual_port_is_taken(rrd: Path, monkeypatch: pyte
         raise KeyboardInterrupt
 
     with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        taken = other.getsockname()[1]
-        monkeypatch.setattr("aolink.viewing.viewer.WEB_PORT", taken)
+        with contextlib.suppress(OSError):  # then somebody else has it
+            other.bind(("127.0.0.1", WEB_PORT))
+            other.listen()
         with pytest.raises(KeyboardInterrupt):
             serve_web(rrd, on_ready=look)
     assert "<canvas" in seen[0]
-    assert urllib.parse.urlsplit(seen[1]).port != taken
+    assert urllib.parse.urlsplit(seen[1]).port != WEB_PORT
 
 
 def test_a_rerun_file_is_shown_as_it_is(rrd: Path, start_aolink: Callable[..., subprocess.Popen[str]]) -> None:

@@ -112,7 +112,7 @@ def test_a_port_that_is_pulled_is_one_clear_error(peer: Peer, link: Link) -> Non
         link.receive()
 
 
-def test_no_such_port() -> None:
+def test_a_port_that_is_not_there_is_refused() -> None:
     with pytest.raises(PortError, match=r"there is no port /dev/nowhere: `aolink devices` lists"):
         SerialPort("/dev/nowhere")
     with pytest.raises(PortError, match="there is no port nonsense://"):
@@ -124,6 +124,6 @@ def test_nothing_listens() -> None:
         SerialPort("socket://127.0.0.1:1")
 
 
-def test_port_in_use(peer: Peer, link: Link) -> None:
+def test_a_port_in_use_is_refused(peer: Peer, link: Link) -> None:
     with pytest.raises(PortError, match=f"port {peer.path} is in use by another program"):
         SerialPort(peer.path)

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import resources
 
 import pytest
@@ -14,7 +18,6 @@ from hypothesis import strategies as st
 
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import (
-    MAX_MESSAGE,
     MAX_PAYLOAD,
     TYPE_OF_MESSAGE,
     MessageDecoder,
@@ -88,11 +91,30 @@ def test_resynchronises_after_garbage(garbage: bytes, sent: list[Packet]) -> Non
     assert received[-len(sent) :] == sent
 
 
+@dataclass
+class Peak:
+    """The most memory that was taken at a time."""
+
+    bytes: int = 0
+
+
+@contextmanager
+def peak_memory() -> Iterator[Peak]:
+    peak = Peak()
+    tracemalloc.start()
+    try:
+        yield peak
+        _, peak.bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+
 def test_a_line_that_never_ends_is_thrown_away_and_holds_no_memory() -> None:
     decoder, packet = PacketDecoder(), Packet(1, 2, 3, b"abc")
-    for _ in range(200):
-        assert decoder.feed(b"\x55" * 4096) == []
-        assert len(decoder._rest) < 10_000
+    with peak_memory() as peak:
+        for _ in range(200):
+            assert decoder.feed(b"\x55" * 4096) == []
+    assert peak.bytes < 100_000
     assert decoder.feed(b"\0" + encode_packet(packet)) == [packet]
     assert (decoder.bad_framing, decoder.seen) == (1, 2)
 
@@ -142,7 +164,6 @@ def joined(sent: list[Packet]) -> tuple[list[Message], int]:
             refused += 1
         else:
             messages += [message] if message else []
-        assert len(decoder._data) <= MAX_MESSAGE
     return messages, refused
 
 
@@ -169,8 +190,15 @@ part_packets = st.builds(
 
 
 @given(st.lists(part_packets | packets, max_size=30))
-def test_whatever_parts_come_memory_is_bounded(sent: list[Packet]) -> None:
+def test_whatever_parts_come_they_are_joined_or_refused(sent: list[Packet]) -> None:
     joined(sent)
+
+
+def test_a_part_of_a_message_too_long_takes_no_memory_for_the_rest() -> None:
+    part = pb.Part(type=PacketType.APPLIED, offset=0, total=2**32 - 1, data=bytes(MAX_PAYLOAD // 2))
+    with peak_memory() as peak:
+        assert joined([Packet(1, PacketType.PART, 0, part.SerializeToString())])[0] == []
+    assert peak.bytes < 100_000
 
 
 def test_a_message_too_long_is_refused() -> None:

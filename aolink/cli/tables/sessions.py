@@ -149,7 +149,9 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
     else:
         lines = ["online and offline estimates agree bit for bit"]
     if result.deblurred is not None:
-        lines += deblurred_lines(result.deblurred, result.deblurred_by, "tv")
+        from aolink.restoration.registry import DEFAULT_METHOD
+
+        lines += deblurred_lines(result.deblurred, result.deblurred_by, DEFAULT_METHOD)
     lines.append("times     " + ", ".join(f"{name} {seconds:.1f} s" for name, seconds in result.seconds.items()))
     lines.append(f"recording {result.recording}")
     if result.deblurred_recording is not None:

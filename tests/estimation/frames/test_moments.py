@@ -1,12 +1,14 @@
 """Measured moments: against fine integrals, against the spread of many noisy frames."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from aolink.estimation.frames.frame_data import Flux, Measurement
 from aolink.estimation.frames.moments import (
     known_flux_covariance,
     least_significance,
@@ -21,8 +23,9 @@ from aolink.optics.camera import to_counts, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import Sensor
 from aolink.rig import load_rig
+from tests.kinds import line_of, must_be
 
-SENSOR = load_rig("section-vi").sensor
+SENSOR = line_of(load_rig("section-vi"))
 # As many counts as can be, so that rounding does not show.
 FINE = dataclasses.replace(SENSOR, noise_density=1e-4, counts_per_density=5000.0, black_level=1000.0)
 
@@ -35,10 +38,14 @@ def frames(sensor: Sensor, paths: np.ndarray, seed: int | None = None) -> np.nda
     return to_counts(sensor, density)
 
 
-def values(sensor: Sensor, counts: np.ndarray, orders=(1, 2), **kwargs) -> np.ndarray:
-    measured = measure_moments(sensor, counts, orders, **kwargs)
-    assert not isinstance(measured, str)
-    return measured.value
+def measured_of(
+    sensor: Sensor, counts: np.ndarray, orders: Sequence[int] = (1, 2), flux: Flux = "known"
+) -> Measurement:
+    return must_be(Measurement, measure_moments(sensor, counts, orders, flux))
+
+
+def values(sensor: Sensor, counts: np.ndarray, orders: Sequence[int] = (1, 2), flux: Flux = "known") -> np.ndarray:
+    return measured_of(sensor, counts, orders, flux).value
 
 
 @given(centre=st.floats(-0.4, 0.4), swing=st.floats(0, 0.3), turns=st.floats(0.1, 3))
@@ -85,7 +92,7 @@ def test_noise_integrals_are_integrals():
 def test_moments_scatter_as_their_covariance_says(field, orders):
     sensor = dataclasses.replace(SENSOR, field=field)
     counts = frames(sensor, np.full((20_000, 1), 0.3), seed=1)
-    measured = measure_moments(sensor, counts, orders)
+    measured = measured_of(sensor, counts, orders)
     spread = np.cov(measured.value.T)
     scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
     np.testing.assert_allclose(measured.covariance[0] / scale, spread / scale, atol=0.04)
@@ -95,7 +102,7 @@ def test_moments_scatter_as_their_covariance_says(field, orders):
 def test_ratios_scatter_as_their_covariance_says(field):
     sensor = dataclasses.replace(SENSOR, field=field, noise_density=1e-3)
     counts = frames(sensor, np.full((20_000, 1), 0.3), seed=2)
-    measured = measure_moments(sensor, counts, (1, 2), flux="measured")
+    measured = measured_of(sensor, counts, (1, 2), flux="measured")
     spread, predicted = np.cov(measured.value.T), measured.covariance.mean(axis=0)
     scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
     np.testing.assert_allclose(predicted / scale, spread / scale, atol=0.04)
@@ -112,20 +119,20 @@ def test_shot_noise_is_in_the_covariance(flux):
         (10_000, 40)
     )
     counts = to_counts(sensor, density)
-    measured = measure_moments(sensor, counts, (1, 2), flux)
+    measured = measured_of(sensor, counts, (1, 2), flux)
     spread = np.cov(measured.value.T)
     scale = np.sqrt(np.outer(spread.diagonal(), spread.diagonal()))
     np.testing.assert_allclose(measured.covariance.mean(axis=0) / scale, spread / scale, atol=0.05)
-    without = measure_moments(dataclasses.replace(sensor, photoelectrons=0.0), counts, (1, 2), flux)
+    without = measured_of(dataclasses.replace(sensor, photoelectrons=0.0), counts, (1, 2), flux)
     assert (without.covariance.mean(axis=0).diagonal() < 0.9 * spread.diagonal()).all()
-    np.testing.assert_array_equal(measure_moments(sensor, counts[:3], (1, 2), flux).covariance, measured.covariance[:3])
+    np.testing.assert_array_equal(measured_of(sensor, counts[:3], (1, 2), flux).covariance, measured.covariance[:3])
 
 
 def test_a_covariance_with_shot_noise_is_one_whatever_noise_does():
     sensor = dataclasses.replace(SENSOR, noise_density=1e-6, photoelectrons=3.0)
     rng = np.random.default_rng(5)
     counts = to_counts(sensor, 0.5 * rng.standard_normal((500, 40)))
-    covariance = measure_moments(sensor, counts, (1, 2)).covariance
+    covariance = measured_of(sensor, counts, (1, 2)).covariance
     assert np.linalg.eigvalsh(covariance).min() > 0
 
 
@@ -156,7 +163,7 @@ def test_taking_the_kernel_out_undoes_the_binomial():
 
 def test_a_flux_that_its_noise_drowns_is_not_divided_by():
     counts = frames(SENSOR, np.zeros((1, 200)), seed=1)
-    assert "flux" in measure_moments(SENSOR, counts, (1, 2), flux="measured")
+    assert "flux" in must_be(str, measure_moments(SENSOR, counts, (1, 2), flux="measured"))
 
 
 def test_a_spot_stands_out_and_its_absence_does_not():
@@ -186,6 +193,6 @@ def test_a_blank_frame_is_seldom_taken_for_a_spot_where_light_can_be_told_from_n
 def test_moments_do_not_depend_on_the_axes_beside_them(axes, flux):
     sensor = dataclasses.replace(SENSOR, field=(-0.6, 1.4), noise_density=1e-3)
     counts = frames(sensor, np.random.default_rng(1).uniform(0, 0.5, (64, 50)), seed=4)
-    many, few = measure_moments(sensor, counts, (1, 2), flux), measure_moments(sensor, counts[:axes], (1, 2), flux)
+    many, few = measured_of(sensor, counts, (1, 2), flux), measured_of(sensor, counts[:axes], (1, 2), flux)
     np.testing.assert_array_equal(few.value, many.value[:axes])
     np.testing.assert_array_equal(few.covariance, many.covariance[:axes])

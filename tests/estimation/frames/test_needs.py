@@ -7,6 +7,7 @@ from aolink.estimation import Measurement, Needs, Profile, SpotWindows
 from aolink.estimation.frames.measure import measure
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.kinds import spots_of
 
 
 def test_a_plant_that_moves_whole_spots_gives_each_kind():
@@ -18,7 +19,7 @@ def test_a_plant_that_moves_whole_spots_gives_each_kind():
     assert moments.value.shape == (axes, n_outputs)
     windows, _ = measure(rig, exposure, Needs(what="windows"))
     assert isinstance(windows, SpotWindows)
-    assert windows.density.shape == (axes, n_outputs // 2, *rig.sensor.window)
+    assert windows.density.shape == (axes, n_outputs // 2, *spots_of(rig).window)
     profile, _ = measure(rig, exposure, Needs(what="profile"))
     assert isinstance(profile, Profile)
     assert profile.density.shape == profile.mask.shape == (axes * n_outputs, rig.sensor.profile.pixels)

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import linalg
 
-from aolink.estimation import run
+from aolink.estimation import Measurement, run
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.centroid_noise import centroid_covariance
-from aolink.estimation.frames.frame_data import Needs
+from aolink.estimation.frames.frame_data import Flux, Needs
 from aolink.estimation.frames.moments import measure_moments, spot_significance
 from aolink.estimation.frames.plane_moments import measure_moments_2d
 from aolink.estimation.frames.spots import measure_spots, profiles
@@ -22,6 +23,7 @@ from aolink.optics.plane import kernel_covariance
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Plant, Rig, load_rig
 from aolink.simulation.model import simulate
+from tests.kinds import must_be
 
 RIG = load_rig("sh-4x4")
 NAMES = ("open-loop", "o1", "o2", "o3", "moments")
@@ -50,10 +52,13 @@ def counts_of(sensor: SpotSensor, frames: list[np.ndarray]) -> np.ndarray:
     return np.array([profiles(sensor, frame, whole).counts for frame in frames])
 
 
-def measured_of(sensor: SpotSensor, plant: Plant, frame: np.ndarray, orders=(1, 2), flux="known"):
+def measured_of(
+    sensor: SpotSensor, plant: Plant, frame: np.ndarray, orders: tuple[int, ...] = (1, 2), flux: Flux = "known"
+) -> tuple[Measurement, str]:
     everywhere = np.ones(frame.shape, dtype=bool)
     needs = Needs(what="moments", orders=orders, flux=flux)
-    return measure_spots(sensor, plant, frame, everywhere, needs, least_significance=4.0)
+    found, remark = measure_spots(sensor, plant, frame, everywhere, needs, least_significance=4.0)
+    return must_be(Measurement, found), remark
 
 
 @pytest.mark.parametrize("sensor", [ONE, replace(ONE, noise_density=0.0, counts_per_density=1.7)])
@@ -94,7 +99,7 @@ def test_moments_of_spots_are_those_of_the_plane_without_its_cross_terms(exposur
     edges, orders = SENSOR.profile.edges, [(1, 0), (2, 0), (0, 1), (0, 2)]
     density = spot_windows(SENSOR, to_density(SENSOR, exposures[0].pixels))
     kernel, noise = kernel_covariance(SENSOR.kernel.sigma * np.eye(2)), effective_noise_density(SENSOR)
-    theirs = measure_moments_2d(density, edges, edges, kernel, noise, orders, flux)
+    theirs = must_be(Measurement, measure_moments_2d(density, edges, edges, kernel, noise, orders, flux))
     np.testing.assert_allclose(measured.value.reshape(16, 4), theirs.value, atol=1e-12)
     for direction, block in enumerate((slice(0, 2), slice(2, 4))):
         expected = theirs.covariance[:, block, block]
@@ -118,12 +123,16 @@ def test_moments_of_both_directions_are_unbiased_and_scatter_as_they_say(flux):
     sensor = replace(ONE, noise_density=0.001)
     frames = noisy_frames(sensor, (0.4, -0.2), FRAMES)
     for direction, position in enumerate((0.4, -0.2)):
-        found = measure_moments(sensor.profile, counts_of(sensor, frames)[:, direction], (1, 2), flux)
-        assert not isinstance(found, str)
+        counts = counts_of(sensor, frames)[:, direction]
+        found = must_be(Measurement, measure_moments(sensor.profile, counts, (1, 2), flux))
         sd = np.sqrt(found.covariance[0].diagonal() / FRAMES)
         np.testing.assert_allclose(found.value.mean(axis=0), [position, position**2], atol=5 * sd.max())
         claimed = found.covariance.mean(axis=0)
         np.testing.assert_allclose(np.cov(found.value.T), claimed, atol=0.1 * np.abs(claimed).max())
+
+
+def twice(matrix: np.ndarray) -> np.ndarray:
+    return np.asarray(linalg.block_diag(matrix, matrix))
 
 
 def coupled() -> Rig:
@@ -131,13 +140,13 @@ def coupled() -> Rig:
     plant = replace(
         RIG.plant,
         axes=1,
-        A=np.kron(np.eye(2), RIG.plant.A),
-        B=np.kron(np.eye(2), RIG.plant.B),
-        B_w=np.kron(np.eye(2), RIG.plant.B_w),
-        C=np.kron(np.eye(2), RIG.plant.C),
+        A=twice(RIG.plant.A),
+        B=twice(RIG.plant.B),
+        B_w=twice(RIG.plant.B_w),
+        C=twice(RIG.plant.C),
         process_noise=np.array([[10.0, 6.0], [6.0, 10.0]]),
         initial_mean=np.zeros(4),
-        initial_covariance=np.kron(np.eye(2), RIG.plant.initial_covariance),
+        initial_covariance=twice(RIG.plant.initial_covariance),
     )
     one = load_rig("single-lenslet")
     return replace(one, plant=plant, sensor=ONE)
@@ -267,9 +276,10 @@ def test_a_window_without_light_costs_its_spot_alone(exposures, flux):
     pixels[24:48, 72:96] = round(SENSOR.black_level)  # spot 7
     measured, remark = measured_of(SENSOR, RIG.plant, pixels, flux=flux)
     assert remark == "2 of 32 axes predicted: 2 of 32 profiles show no spot"
-    np.testing.assert_array_equal(np.flatnonzero(~measured.usable), [14, 15])
+    usable = must_be(np.ndarray, measured.usable)
+    np.testing.assert_array_equal(np.flatnonzero(~usable), [14, 15])
     whole, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels, flux=flux)
-    assert np.array_equal(measured.value[measured.usable], whole.value[measured.usable])
+    assert np.array_equal(measured.value[usable], whole.value[usable])
     assert np.isfinite(measured.value).all()
 
 

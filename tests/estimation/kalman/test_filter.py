@@ -17,6 +17,7 @@ from aolink.estimation.kalman.update import blocked_update, joseph_update
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.plant.lifting import lift
 from aolink.rig import load_rig
+from tests.kinds import must_be
 
 LIVELY = load_rig("section-vi-lively")
 PLANT, N = LIVELY.plant, 200
@@ -26,11 +27,11 @@ ORDERS = {"o1": (1,), "o2": (2,), "o3": (1, 2)}
 
 def brute_moments(plant, x, u, orders):
     """Moments of the path of a state under inputs, step by step, an output's orders together."""
-    x, path = x.copy(), []
+    x, outputs = x.copy(), []
     for k in range(len(u)):
-        path.append(plant.C @ x)
+        outputs.append(plant.C @ x)
         x = plant.A @ x + plant.B @ u[k]
-    path = np.array(path)
+    path = np.array(outputs)
     return np.array([np.mean(path[:, o] ** p) for o in range(path.shape[1]) for p in orders])
 
 
@@ -70,7 +71,7 @@ def our_steps(plant, orders, u, moments, gain=None, **options):
 
 
 @pytest.mark.parametrize("name", ["o1", "o2", "o3"])
-def test_every_step_is_filterpys(name):
+def test_every_step_is_the_one_of_filterpy(name):
     u, moments, _ = scenario()
     orders, pick = ORDERS[name], selected(ORDERS[name])
     A_N, Q = lift(PLANT, N)
@@ -104,7 +105,8 @@ def test_steady_gain_is_where_filterpys_gain_settles():
     for _ in range(300):
         kf.update(np.zeros((1, 1)))
         kf.predict()
-    np.testing.assert_allclose(steady_gain(model, model.process_noise, R[:1, :1]), kf.K, atol=1e-10)
+    gain = must_be(np.ndarray, steady_gain(model, model.process_noise, R[:1, :1]))
+    np.testing.assert_allclose(gain, kf.K, atol=1e-10)
 
 
 def test_with_the_steady_gain_the_filter_settles_where_the_optimal_one_does():
@@ -418,6 +420,6 @@ def test_the_gain_of_many_outputs_is_that_of_all_of_them(mimo):
     model = exposure_model(dataclasses.replace(mimo, C=rng.standard_normal((12, 3))), 30)
     blocks = rng.standard_normal((6, 2, 2))
     noise = blocks @ blocks.swapaxes(1, 2) + 0.1 * np.eye(2)
-    ours = steady_gain(model, model.process_noise, noise)
-    theirs = steady_gain(model, model.process_noise, linalg.block_diag(*noise))
+    ours = must_be(np.ndarray, steady_gain(model, model.process_noise, noise))
+    theirs = must_be(np.ndarray, steady_gain(model, model.process_noise, linalg.block_diag(*noise)))
     np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-10)

@@ -73,11 +73,11 @@ def test_input_response_sums_are_those_over_the_steps(mimo, with_axes):
     response = model.response(inputs)
     for axis in range(3):
         x = np.zeros(3)
-        c = []
+        outputs = []
         for u in inputs[:, 2 * axis : 2 * axis + 2]:
-            c.append(plant.C @ x)
+            outputs.append(plant.C @ x)
             x = plant.A @ x + plant.B @ u
-        c = np.array(c)
+        c = np.array(outputs)
         np.testing.assert_allclose(response.path[axis], c.T, atol=1e-10)
         np.testing.assert_allclose(response.end[axis], x, atol=1e-10)
         np.testing.assert_allclose(response.mean[axis], c.mean(axis=0), atol=1e-10)
@@ -132,7 +132,8 @@ def test_a_plant_without_noise_has_no_noise_columns(mimo):
 def test_many_outputs_of_few_states_are_what_each_of_them_is_alone(mimo):
     """Their paths are made of the states' paths."""
     rng = np.random.default_rng(6)
-    plant = dataclasses.replace(mimo, C=rng.standard_normal((5, 3)))
+    rows = rng.standard_normal((5, 3))
+    plant = dataclasses.replace(mimo, C=rows)
     model, u = DenseModel(plant, 40), rng.standard_normal((40, mimo.axes * mimo.n_inputs))
     assert model.factors[0] is plant.C
     count = model.n_coefficients
@@ -145,7 +146,7 @@ def test_many_outputs_of_few_states_are_what_each_of_them_is_alone(mimo):
     variance = np.einsum("oij,ajk,oik->aoi", model.basis, covariance, model.basis)
     np.testing.assert_allclose(sd, np.sqrt(variance).reshape(sd.shape), rtol=1e-9)
     for o in range(5):
-        alone = DenseModel(dataclasses.replace(plant, C=plant.C[o : o + 1]), 40)
+        alone = DenseModel(dataclasses.replace(plant, C=rows[o : o + 1]), 40)
         columns = min(count, alone.n_coefficients)
         np.testing.assert_allclose(model.basis[o, :, :columns], alone.basis[0, :, :columns], atol=1e-11)
         np.testing.assert_allclose(response.slope[:, o], alone.response(u).slope[:, 0], atol=1e-11)

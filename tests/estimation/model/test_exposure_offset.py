@@ -16,6 +16,7 @@ from aolink.optics.frame import frame_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import Plant, Rig, load_rig, parse_rig
 from aolink.simulation.model import RigModel, simulate
+from tests.kinds import line_of, truth_of
 
 LIVELY = load_rig("section-vi-lively")
 FINE = 16
@@ -28,7 +29,7 @@ def held(samples, offset, n_steps):
     return np.repeat(samples, FINE, axis=-1)[..., late : late + FINE * n_steps]
 
 
-def shaken(offset, n_steps=8, V=1e-4) -> Rig:
+def shaken(offset: float, n_steps: int = 8, V: float = 1e-4) -> Rig:
     """A shake of 30 Hz, and exposures so short that a part of a step matters."""
     w = 2 * np.pi * 30
     A, B_w = linalg.expm(np.array([[0, 1], [-w * w, -0.02 * w]]) * 1e-3), np.array([[0.0], [1.0]])
@@ -84,7 +85,7 @@ def test_the_simulated_camera_sees_the_first_and_the_last_step_in_part(offset):
     rig = shaken(offset, 8, V=1e-12)
     exposures = simulate(rig, 5, seed=3, inputs=np.zeros((40, 1)))
     for exposure in exposures:
-        truth = exposure.truth
+        truth = truth_of(exposure)
         last = (rig.plant.C @ truth.end_state[..., None])[:, :, 0]
         fine = held(np.hstack([truth.path, last]), offset, 8)
         seen = (exposure.pixels - rig.sensor.black_level) / rig.sensor.counts_per_density
@@ -94,7 +95,7 @@ def test_the_simulated_camera_sees_the_first_and_the_last_step_in_part(offset):
         assert exposure.device_end_ns - exposure.device_start_ns == 8_000_000
     # Frame after frame: the step in which one ends is the next one's first.
     for before, after in itertools.pairwise(exposures):
-        assert np.array_equal(before.truth.end_state, after.truth.start_state)
+        assert np.array_equal(truth_of(before).end_state, truth_of(after).start_state)
 
 
 def test_windowed_moments_expect_what_finer_steps_show():
@@ -104,12 +105,12 @@ def test_windowed_moments_expect_what_finer_steps_show():
     z = np.zeros(model.n_coefficients)
     z[:2] = 0.1, 20.0
     path = nodes.basis[0] @ z
-    observation = WindowedMoments(rig.sensor)
+    observation = WindowedMoments(line_of(rig))
     W = observation.window_weights(path[None], np.zeros((1, len(path))), np.ones((1, 40), bool))
     zero = np.zeros((1, len(path), len(path)))
     expected = observation.regression(W, path[None], zero, nodes.basis[0], nodes.weights).expected[0]
     samples = np.append(model.basis[0] @ z, (rig.plant.C @ model.end_rows @ z)[0])
-    density = exposure_density(rig.sensor.kernel, rig.sensor.edges, held(samples, offset, 8))
+    density = exposure_density(rig.sensor.kernel, line_of(rig).edges, held(samples, offset, 8))
     np.testing.assert_allclose(expected, W[0] @ density * rig.sensor.pixel_width, atol=1e-12)
 
 
@@ -132,14 +133,14 @@ def test_offsets_that_change_from_frame_to_frame_are_each_frames_own():
     drifting = (np.arange(100) * 0.13) % 1
     exposures = []
     for e, offset in zip(simulate(rig, 100, seed=4, inputs=inputs), drifting, strict=True):
-        last = (rig.plant.C @ e.truth.end_state[..., None])[:, :, 0]
-        samples = np.hstack([e.truth.path, last])
+        last = (rig.plant.C @ truth_of(e).end_state[..., None])[:, :, 0]
+        samples = np.hstack([truth_of(e).path, last])
         light = frame_density(rig.sensor, samples[:, :8]) + offset / 8 * (
             frame_density(rig.sensor, samples[:, 8:]) - frame_density(rig.sensor, samples[:, :1])
         )
         counts = np.rint(rig.sensor.black_level + rig.sensor.counts_per_density * light).astype(np.uint16)
         exposures.append(dataclasses.replace(e, pixels=counts, start_offset=float(offset)))
-        states.append(e.truth.start_state)
+        states.append(truth_of(e).start_state)
     knowing = score(exposures, run(rig, exposures, ["moments"])["moments"], 20)
     late = [dataclasses.replace(e, start_offset=0.0) for e in exposures]
     assert knowing.path_rmse < 0.8 * score(late, run(rig, late, ["moments"])["moments"], 20).path_rmse

@@ -11,6 +11,7 @@ from aolink.estimation import make_estimator
 from aolink.estimation.exposure_scan import best, candidates, exposure_scan, with_exposure
 from aolink.rig import load_rig, parse_rig
 from aolink.simulation.model import simulate
+from tests.kinds import truth_of
 
 LIVELY = load_rig("section-vi-lively")
 
@@ -22,8 +23,8 @@ def ensemble(rig, n_steps, exposures, seed):
     path, end = [], []
     for exposure in simulate(rig, exposures, seed):
         estimate = estimator.step(exposure)
-        path.append(estimate.path - exposure.truth.path)
-        end.append((rig.plant.C @ (estimate.end_state - exposure.truth.end_state)[..., None]).ravel())
+        path.append(estimate.path - truth_of(exposure).path)
+        end.append((rig.plant.C @ (estimate.end_state - truth_of(exposure).end_state)[..., None]).ravel())
     return np.sqrt(np.mean(np.square(path[20:]))), np.sqrt(np.mean(np.square(end[20:])))
 
 

@@ -12,27 +12,27 @@ from aolink.estimation.model.factored import NOISE_LEFT_OUT, FactoredModel
 from aolink.plant import lifting
 from aolink.plant.alike import alike_systems
 from aolink.plant.lifting import input_response, lift
-from aolink.rig import Plant
+from aolink.rig import Plant, Rig
 
 N = 60
 
 
 @pytest.fixture(scope="module")
-def plant(small_membrane) -> Plant:
+def plant(small_membrane: Rig) -> Plant:
     """36 actuators, 72 states, 32 slopes; the noise of each actuator is another."""
     W = np.diag(np.random.default_rng(3).uniform(0.0, 300.0, 36))
     return dataclasses.replace(small_membrane.plant, process_noise=W)
 
 
 @pytest.fixture(scope="module")
-def model(plant) -> FactoredModel:
+def model(plant: Plant) -> FactoredModel:
     found = exposure_model(plant, N)
     assert isinstance(found, FactoredModel)
     return found
 
 
 @pytest.fixture(scope="module")
-def dense(plant) -> ExposureModel:
+def dense(plant: Plant) -> ExposureModel:
     return DenseModel(plant, N)
 
 
@@ -132,7 +132,7 @@ def test_noise_path_is_that_of_the_fast_steps_to_the_share_that_is_stated(plant,
     assert share == pytest.approx(best, rel=1e-3)
 
 
-def test_end_covariance_is_whole(plant, model):
+def test_the_end_has_the_whole_covariance_of_the_noise(plant, model):
     reached = model.end_rows[:, plant.n_states :]
     _, noise = lift(plant, N)
     np.testing.assert_allclose(reached @ reached.T + model.end_remainder, noise, atol=1e-12 * noise.max())

@@ -13,6 +13,7 @@ from aolink.estimation.pixels import likelihood
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import exposure_density
 from aolink.rig import load_rig
+from tests.kinds import line_of
 
 LIVELY, SHAKEN = load_rig("section-vi-lively"), load_rig("jitter")
 
@@ -32,7 +33,7 @@ def test_gauss_is_exact_for_polynomials(n_steps: int, count: int) -> None:
 
 
 @given(st.integers(1, 300), st.integers(1, 300))
-def test_blocks_keep_the_mean(n_steps: int, most: int) -> None:
+def test_blocks_of_steps_keep_the_mean_of_a_path(n_steps: int, most: int) -> None:
     q = quadrature.blocks(n_steps, most)
     path = np.random.default_rng(n_steps).standard_normal(n_steps)
     assert len(q.weights) <= max(most, 1)
@@ -126,13 +127,14 @@ def test_paths_without_light_say_nothing():
     assert len(found.levels[0].weights) > 50
 
 
-def test_wide_pixels_and_a_narrow_kernel():
-    sensor = dataclasses.replace(LIVELY.sensor, pixels=3, kernel=dataclasses.replace(LIVELY.sensor.kernel, sigma=0.01))
+def test_wide_pixels_and_a_narrow_kernel_have_a_resolution():
+    narrow = dataclasses.replace(LIVELY.sensor.kernel, sigma=0.01)
+    sensor = dataclasses.replace(line_of(LIVELY), pixels=3, kernel=narrow)
     assert likelihood.reduction(exposure_model(LIVELY.plant, 200), sensor).resolution.stride > 0
 
 
 @pytest.mark.parametrize("n_steps", [1, 2, 3, 4, 7])
-def test_short_exposures(n_steps):
+def test_weights_of_short_exposures_add_up_to_one(n_steps):
     found = likelihood.reduction(exposure_model(LIVELY.plant, n_steps), LIVELY.sensor).resolution
     for q in found.levels:
         assert q.weights.sum() == pytest.approx(1.0)

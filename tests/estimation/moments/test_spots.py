@@ -2,12 +2,13 @@
 against o1 and against its own claims, for plants of which one copy moves whole spots."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy import linalg
 
-from aolink.estimation import Status, exposure_model, make_estimator, run, score
+from aolink.estimation import BlurFilter, Measurement, Status, exposure_model, make_estimator, run, score
 from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
@@ -19,17 +20,18 @@ from aolink.optics.plane import exposure_density_2d, pixel_mass_2d
 from aolink.optics.sensor import Kernel, SpotSensor
 from aolink.rig import Plant, Rig, load_rig
 from aolink.simulation.model import simulate
+from tests.kinds import must_be, spots_of
 
 ONE = load_rig("single-lenslet")
 TILTED = Kernel(shape="gaussian", sigma=0.13, matrix=((0.15, 0.05), (0.05, 0.09)))
 
 
-def sensor_of(rig: Rig, **changes) -> SpotSensor:
+def sensor_of(rig: Rig, **changes: Any) -> SpotSensor:
     assert isinstance(rig.sensor, SpotSensor)
     return dataclasses.replace(rig.sensor, **changes)
 
 
-def rig_of(A, B_w, C, W, **sensor) -> Rig:
+def rig_of(A: np.ndarray, B_w: np.ndarray, C: np.ndarray, W: np.ndarray, **sensor: Any) -> Rig:
     """One copy of a plant; no inputs to speak of."""
     A, B_w, C = (np.asarray(m, dtype=float) for m in (A, B_w, C))
     n, spots = len(A), len(C) // 2
@@ -56,7 +58,7 @@ def oscillators(frequencies, damping, sd):
     return linalg.block_diag(*blocks), np.kron(np.eye(len(blocks)), [[0.0], [1.0]]), np.diag(noises)
 
 
-def tip_tilt(**sensor) -> Rig:
+def tip_tilt(**sensor: Any) -> Rig:
     """A mirror whose two modes lie across its axes, and are driven together."""
     plant = ONE.plant
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])
@@ -64,7 +66,7 @@ def tip_tilt(**sensor) -> Rig:
     return rig_of(np.kron(np.eye(2), plant.A), np.kron(np.eye(2), plant.B_w), np.kron(turn, plant.C), W, **sensor)
 
 
-def membrane(**sensor) -> Rig:
+def membrane(**sensor: Any) -> Rig:
     """Four spots on a small membrane: 12 states of 6 modes, 8 slopes, each a mixture of all modes."""
     A, B_w, W = oscillators([0.3, 0.5, 0.7, 1.0, 1.5, 2.5], damping=0.2, sd=0.1)
     shapes = np.random.default_rng(2).normal(0, 0.9, (8, 6))
@@ -105,7 +107,7 @@ def at_prior(rig, observation, prior, model):
 def test_regression_is_that_of_samples(kernel, basis):
     rig = tip_tilt(kernel=kernel)
     model, prior = spread_prior(rig)
-    observation = WindowedSpots(rig.sensor, 1, basis=basis)
+    observation = WindowedSpots(spots_of(rig), 1, basis=basis)
     nodes, whole, fit = at_prior(rig, observation, prior, model)
     rng, samples = np.random.default_rng(1), 1500
     z = rng.standard_normal((samples, len(prior.mean[0]))) @ np.linalg.cholesky(prior.covariance[0]).T
@@ -128,7 +130,7 @@ def test_regression_is_that_of_samples(kernel, basis):
 def test_slope_is_the_derivative_of_what_is_expected():
     rig = membrane(kernel=TILTED)
     model, prior = spread_prior(rig)
-    observation = WindowedSpots(rig.sensor, 4)
+    observation = WindowedSpots(spots_of(rig), 4)
     nodes, whole, _ = at_prior(rig, observation, prior, model)
     count = len(nodes.weights)
     rows = nodes.basis.reshape(4, 2, count, -1).swapaxes(1, 2).reshape(4 * count * 2, -1)
@@ -158,7 +160,7 @@ def test_expected_sums_are_those_of_a_noiseless_frame(flux):
     density = exposure_density_2d(TILTED.covariance, edges, edges, path.T[None])[None]
     mask = np.ones(density.shape, dtype=bool)
     mask[0, 0, 3, 7] = mask[0, 0, 10] = False
-    observation = WindowedSpots(rig.sensor, 1, flux=flux)
+    observation = WindowedSpots(spots_of(rig), 1, flux=flux)
     windows = observation.window_functions(path.T[None, None], np.zeros((1, 1, 200, 2)), mask)
     fit = observation.regression(
         *windows, path.T[None, None], np.zeros((1, 1, 200, 2, 1, 200, 2)), np.zeros((400, 3)), np.full(200, 1 / 200)
@@ -176,7 +178,7 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
     edges = rig.sensor.profile.edges
     clean = exposure_density_2d(rig.sensor.kernel.covariance, edges, edges, np.full((1, 1, 2), [0.3, -0.2]))
     sd = np.sqrt(pixel_noise_variance(rig.sensor, clean))
-    observation = WindowedSpots(rig.sensor, 1)
+    observation = WindowedSpots(spots_of(rig), 1)
     mask = np.ones((1, *clean.shape), dtype=bool)
     windows = observation.window_functions(np.full((1, 1, 1, 2), [0.3, -0.2]), np.full((1, 1, 1, 2), 0.01), mask)
     _, noise = observation.measured(*windows, clean[None])
@@ -210,7 +212,7 @@ def test_coupled_plants_are_seen_better_than_by_o1_and_with_the_certainty_that_i
 def test_copies_that_do_not_hang_together_are_as_one_plant_that_holds_them_all(monkeypatch):
     """Two spots by two copies, or by one plant with both blocks in it."""
     rig = tip_tilt(kernel=TILTED)
-    plant, one = rig.plant, dataclasses.replace(rig.sensor, grid=(1, 2))
+    plant, one = rig.plant, dataclasses.replace(spots_of(rig), grid=(1, 2))
     two = dataclasses.replace(rig, plant=dataclasses.replace(plant, axes=2), sensor=one)
     exposures = simulate(two, 12, seed=3, inputs=np.zeros((2400, 2)))
 
@@ -238,7 +240,7 @@ def test_o1_of_a_membrane_is_the_dense_least_squares_solution():
     exposures = simulate(rig, count, seed=3, inputs=np.zeros((200 * count, 1)))
     found = [estimator.step(e) for e in exposures]
     model, n = exposure_model(rig.plant, 200), rig.plant.n_states
-    measured = [measure(rig, e, estimator.filter.needs)[0] for e in exposures]
+    measured = [must_be(Measurement, measure(rig, e, estimator.filter.needs)[0]) for e in exposures]
     # States from x(0) and the noise that each exposure adds: x = F e.
     F = np.zeros(((count + 1) * n, (count + 1) * n))
     for j in range(count + 1):
@@ -257,7 +259,7 @@ def test_o1_of_a_membrane_is_the_dense_least_squares_solution():
 
 def path_error(rig, exposures, crosses):
     estimator = make_estimator(rig, "moments")
-    estimator.filter.observation = WindowedSpots(rig.sensor, 1, crosses=crosses)
+    must_be(BlurFilter, estimator.filter).observation = WindowedSpots(rig.sensor, 1, crosses=crosses)
     return score(exposures, [estimator.step(e) for e in exposures], 10).path_rmse
 
 

@@ -10,7 +10,7 @@ import pytest
 from scipy import linalg
 
 from aolink.errors import EstimatorError
-from aolink.estimation import Status, exposure_model, make_estimator, run, score, smooth
+from aolink.estimation import SpotWindows, Status, exposure_model, make_estimator, run, score, smooth
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman import information_form, path_moments, predict
@@ -35,13 +35,14 @@ from aolink.exposure import Exposure
 from aolink.optics.sensor import Kernel
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.simulation.model import simulate
+from tests.kinds import must_be, spots_of, truth_of
 
 NAMES = ("o1", "o3", "moments", "profile")
 TILTED = Kernel(shape="gaussian", sigma=0.9, matrix=((0.95, 0.25), (0.25, 0.8)))
 
 
 @pytest.fixture(scope="module", params=["round", "tilted, late"])
-def rig(small_membrane, request) -> Rig:
+def rig(small_membrane: Rig, request: pytest.FixtureRequest) -> Rig:
     if request.param == "round":
         return small_membrane
     timing = dataclasses.replace(small_membrane.timing, exposure_offset=0.4)
@@ -56,7 +57,7 @@ class Frame:
 
     model: FactoredModel
     exposure: Exposure
-    windows: object
+    windows: SpotWindows
     prior: Gaussian
     """Of the state, (1, n_states)."""
 
@@ -66,13 +67,13 @@ class Frame:
 
 
 @pytest.fixture(scope="module")
-def frame(rig) -> Frame:
+def frame(rig: Rig) -> Frame:
     estimator = make_estimator(rig, "moments")
     exposures = simulate(rig, 3, seed=4)
     for each in exposures[:2]:
         estimate = estimator.step(each)
-    windows, _ = measure(rig, exposures[2], estimator.filter.needs)
-    model = exposure_model(rig.plant, 200, exposures[2].start_offset)
+    windows = must_be(SpotWindows, measure(rig, exposures[2], estimator.filter.needs)[0])
+    model = must_be(FactoredModel, exposure_model(rig.plant, 200, exposures[2].start_offset))
     return Frame(model, exposures[2], windows, Gaussian(estimate.end_state, estimate.end_covariance))
 
 
@@ -94,7 +95,7 @@ def foreseen(frame: Frame, paths: JointPaths) -> JointPaths:
 def joint_view(rig: Rig, frame: Frame, paths: JointPaths) -> JointPixels:
     seen = frame.windows
     return JointPixels(
-        rig.sensor, paths.foreseen(np.zeros(paths.size), frame.response, 0), seen.density[0], seen.mask[0], None
+        spots_of(rig), paths.foreseen(np.zeros(paths.size), frame.response, 0), seen.density[0], seen.mask[0], None
     )
 
 
@@ -235,16 +236,13 @@ def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, 
 def test_the_gain_of_o1_solves_the_riccati_equation(small_membrane):
     plant = small_membrane.plant
     model, (R,) = exposure_model(plant, 200), centroid_covariance(small_membrane)
-    gain = steady_gain(model, model.process_noise, R)
+    gain = must_be(np.ndarray, steady_gain(model, model.process_noise, R))
     H, noise = model.mean_row, linalg.block_diag(*R)
     P = linalg.solve_discrete_are(model.transition.T, H.T, model.process_noise, noise)
     np.testing.assert_allclose(gain, P @ H.T @ np.linalg.inv(H @ P @ H.T + noise), atol=1e-6 * np.abs(gain).max())
     # A plant that keeps what it is never shown: two actuators in the place of each, of which only sums are seen.
-    A = np.kron(np.eye(80), [[1.0]])
-    assert (
-        information_form.steady_gain(A, np.kron(np.eye(40), [[1.0, 1.0]]), np.eye(80), np.tile(np.eye(2), (20, 1, 1)))
-        is None
-    )
+    sums = np.repeat(np.eye(40), 2, axis=1)
+    assert information_form.steady_gain(np.eye(80), sums, np.eye(80), np.tile(np.eye(2), (20, 1, 1))) is None
 
 
 @pytest.fixture(scope="module")
@@ -294,8 +292,7 @@ def test_partly_lit_lenslets_have_their_share_of_the_light():
     """A pupil before the small membrane: what the pixels are expected to hold is what they do."""
     text = load_rig("membrane-12x12").toml.replace("slope_unit_rad", "pupil_m = 3.0e-3\nslope_unit_rad")
     rig = parse_rig(text)
-    assert rig.sensor.spot_light is not None
-    assert rig.sensor.spot_light.min() < 0.9
+    assert must_be(np.ndarray, spots_of(rig).spot_light).min() < 0.9
     exposures = simulate(rig, 4)
     for name in ("moments", "profile"):
         estimates = run(rig, exposures, [name])[name]
@@ -359,7 +356,7 @@ def test_a_window_that_is_missing_costs_its_own_spot(small_membrane, name, flux)
     assert found.reason == "1 of 16 spots left out: 256 of 4096 pixels are missing"
     own = slice(8, 10)  # the fifth spot's slopes, known by those around it, and worse than before
     assert (found.path_sd[own] > whole.path_sd[own]).all()
-    truth = exposures[4].truth.path
+    truth = truth_of(exposures[4]).path
     assert np.sqrt(np.mean((found.path - truth) ** 2)) < 1.5 * np.sqrt(np.mean((whole.path - truth) ** 2))
     mask[:, :32] = False
     mask[:32] = False

@@ -4,8 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import linalg
 
-from aolink.estimation import exposure_model
+from aolink.estimation import Profile, SpotWindows, exposure_model
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.moments.spots import WindowedSpots
@@ -26,10 +27,12 @@ TILTED = Kernel(shape="gaussian", sigma=0.13, matrix=((0.15, 0.05), (0.05, 0.09)
 def tip_tilt(kernel):
     """One spot, both directions moved by one copy of a plant."""
     plant = PLANE.plant
+    A, B, B_w, C, initial_covariance = (
+        linalg.block_diag(each, each) for each in (plant.A, plant.B, plant.B_w, plant.C, plant.initial_covariance)
+    )
     both = dataclasses.replace(
-        plant, A=np.kron(np.eye(2), plant.A), B=np.kron(np.eye(2), plant.B), B_w=np.kron(np.eye(2), plant.B_w),
-        C=np.kron(np.eye(2), plant.C), process_noise=10 * np.eye(2), initial_mean=np.zeros(4),
-        initial_covariance=np.kron(np.eye(2), plant.initial_covariance), axes=1,
+        plant, A=A, B=B, B_w=B_w, C=C, process_noise=10 * np.eye(2), initial_mean=np.zeros(4),
+        initial_covariance=initial_covariance, axes=1,
     )  # fmt: skip
     return dataclasses.replace(PLANE, plant=both, sensor=dataclasses.replace(PLANE.sensor, kernel=kernel))
 
@@ -46,6 +49,7 @@ def view_of(rig, *, photoelectrons=0.0, seed=1, **how):
     measured, _ = measure(rig, exposure, looks.needs)
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor, **how)
+    assert isinstance(measured, SpotWindows if spots else Profile)
     return likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced), model
 
 

@@ -1,13 +1,13 @@
 """The sampler against the Kalman filter where all is linear, against itself, and by simulation-based calibration."""
 
 import dataclasses
+from typing import cast
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from aolink.estimation import exposure_model, make_estimator
-from aolink.estimation.frames.frame_data import Profile
+from aolink.estimation import Profile, exposure_model, make_estimator
 from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
@@ -18,6 +18,7 @@ from aolink.estimation.pixels.sampled import TemperedUpdater
 from aolink.estimation.pixels.tempering import fitted
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.kinds import must_be, truth_of
 
 RIG = load_rig("section-vi-lively")
 MODEL = exposure_model(RIG.plant, 200)
@@ -44,7 +45,8 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
     before = reduced.prior(PRIOR)
     truth = before.mean[0] + np.linalg.cholesky(before.covariance[0]) @ rng.standard_normal(reduced.size)
     view = LinearView(H, (H @ truth + 0.3 * rng.standard_normal(4))[None], 0.3, reduced)
-    t = TemperedUpdater(particles=4000).sample(view, single(PRIOR), 0)[0]
+    # It has all of a PixelView that is asked for.
+    t = TemperedUpdater(particles=4000).sample(cast(likelihood.PixelView, view), single(PRIOR), 0)[0]
     kalman = joseph_update(before, view.y - before.mean @ H.T, H[None], 0.09 * np.eye(4)[None]).posterior
     sd = np.sqrt(np.diag(kalman.covariance[0]))
     np.testing.assert_allclose((t.mean(axis=0) - kalman.mean[0]) / sd, 0, atol=0.1)
@@ -53,7 +55,7 @@ def test_it_is_the_kalman_filter_where_all_is_linear():
 
 
 def seen(rig, exposure):
-    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor).needs)
+    measured = must_be(Profile, measure(rig, exposure, WindowedMoments(rig.sensor).needs)[0])
     updates = TemperedUpdater()
     reduced = updates.reduction(MODEL, rig.sensor)
     return likelihood.PixelView(rig.sensor, MODEL, MODEL.response(exposure.inputs), measured, reduced)
@@ -63,7 +65,8 @@ def test_other_particles_and_twice_as_many_say_the_same():
     rig = dataclasses.replace(RIG, sensor=dataclasses.replace(RIG.sensor, noise_density=0.001))
     (exposure,) = simulate(rig, 1, seed=3)
     view = seen(rig, exposure)
-    prior = single(Gaussian(exposure.truth.start_state + np.array([0.01, 0.1]), RIG.plant.initial_covariance[None] / 9))
+    mean = truth_of(exposure).start_state + np.array([0.01, 0.1])
+    prior = single(Gaussian(mean, RIG.plant.initial_covariance[None] / 9))
     one, other, more = (
         TemperedUpdater(count, seed).sample(view, prior, 0)[0] for count, seed in ((600, 0), (600, 1), (1200, 2))
     )
@@ -133,4 +136,4 @@ def test_it_is_an_estimator_like_any_other():
     assert runs[0][-1].path.tobytes() != runs[2][-1].path.tobytes()
     for e, x in zip(runs[0], exposures, strict=True):
         assert e.status.name == "OK"
-        assert np.mean(np.abs(e.path - x.truth.path) < 3 * e.path_sd) > 0.9
+        assert np.mean(np.abs(e.path - truth_of(x).path) < 3 * e.path_sd) > 0.9

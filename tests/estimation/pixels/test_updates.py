@@ -21,6 +21,7 @@ from aolink.optics.camera import to_counts
 from aolink.optics.kernel import exposure_density
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.kinds import line_of, must_be, truth_of
 
 RIG = load_rig("section-vi-lively")
 UPDATES = {"profile": PROFILE, "mixture": MIXTURE}
@@ -34,13 +35,13 @@ def quiet(rig, V):
 def seen(rig=RIG, *, width=1.0, seed=3):
     """One exposure, with a prior of its start state so many times as wide as the plant's own, about the truth."""
     (exposure,) = simulate(rig, 1, seed=seed)
-    measured, _ = measure(rig, exposure, WindowedMoments(rig.sensor).needs)
+    measured = must_be(Profile, measure(rig, exposure, WindowedMoments(rig.sensor).needs)[0])
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor)
     view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
     P = rig.plant.initial_covariance * width**2
     offset = np.linalg.cholesky(P) @ np.random.default_rng(seed).standard_normal(len(P))
-    return view, Gaussian(exposure.truth.start_state + offset, P[None])
+    return view, Gaussian(truth_of(exposure).start_state + offset, P[None])
 
 
 def by_importance(view, state, count=60_000, seed=1):
@@ -216,13 +217,15 @@ def test_better_than_o1_and_right_about_it(V):
         result = score(exposures, found[name], 5)
         assert 1.0 < result.start_nees.mean < 3.2
         assert 1.0 < result.end_nees.mean < 3.2
-        inside = [np.abs(e.path - x.truth.path) < 1.96 * e.path_sd for x, e in zip(exposures, found[name], strict=True)]
+        inside = [
+            np.abs(e.path - truth_of(x).path) < 1.96 * e.path_sd for x, e in zip(exposures, found[name], strict=True)
+        ]
         assert 0.9 < np.mean(inside[5:]) < 0.995
         assert {e.status for e in found[name]} == {Status.OK}
 
 
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_order_matters(name):
+def test_frames_in_another_order_ruin_the_estimate(name):
     """Frames fed in another order must ruin the estimate: it is the frames that it lives by."""
     exposures = simulate(RIG, 24, seed=9)
     order = np.random.default_rng(1).permutation(24)
@@ -254,11 +257,11 @@ def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
     exposures = simulate(RIG, 24, seed=6)
     moved = exposures[:10]
     for e in exposures[10:]:
-        path = np.clip(e.truth.path - 0.8 * np.sign(e.truth.path.mean()), -0.9, 0.9)
+        path = np.clip(truth_of(e).path - 0.8 * np.sign(truth_of(e).path.mean()), -0.9, 0.9)
         noise = np.random.default_rng(e.frame_id).standard_normal((1, 40)) * np.sqrt(0.01 / 0.05)
         moved.append(
             dataclasses.replace(
-                e, pixels=to_counts(RIG.sensor, exposure_density(RIG.sensor.kernel, RIG.sensor.edges, path) + noise)
+                e, pixels=to_counts(RIG.sensor, exposure_density(RIG.sensor.kernel, line_of(RIG).edges, path) + noise)
             )
         )
     estimates = run(RIG, moved, [name])[name]
@@ -266,9 +269,9 @@ def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
     assert set(statuses[:10]) == {Status.OK}
     assert statuses[10] == Status.GATED
     assert {Status.DIVERGED, Status.REINITIALISED} & set(statuses[10:])
-    for e in estimates:
-        assert np.isfinite(e.path).all()
-        assert np.linalg.eigvalsh(e.coefficient_covariance[0]).min() > -1e-12
+    for estimate in estimates:
+        assert np.isfinite(estimate.path).all()
+        assert np.linalg.eigvalsh(estimate.coefficient_covariance[0]).min() > -1e-12
 
 
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
@@ -276,7 +279,7 @@ def test_a_spot_that_is_not_where_it_should_be_is_lost_and_found(name):
 def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
     rng = np.random.default_rng(4)
     paths = rng.uniform(-0.3, 0.3, (2, 40, 1)) + 0.1 * np.sin(np.linspace(0, 6, 200))
-    density = exposure_density(RIG.sensor.kernel, RIG.sensor.edges, paths) + 0.3 * rng.standard_normal((2, 40, 40))
+    density = exposure_density(RIG.sensor.kernel, line_of(RIG).edges, paths) + 0.3 * rng.standard_normal((2, 40, 40))
 
     def estimates(rows):
         plant = dataclasses.replace(RIG.plant, axes=len(range(*rows.indices(40))))
@@ -293,10 +296,10 @@ def test_an_axis_does_not_depend_on_those_beside_it(name, axes):
 
 
 @pytest.mark.parametrize("name", PIXEL_ESTIMATORS)
-def test_nor_do_its_nodes(name):
+def test_the_quadrature_of_an_axis_does_not_depend_on_those_beside_it(name):
     """One axis of three is commanded; the others are looked at as coarsely as alone."""
     density = np.random.default_rng(3).standard_normal((3, 40)) * 0.3 + exposure_density(
-        RIG.sensor.kernel, RIG.sensor.edges, np.zeros(2)
+        RIG.sensor.kernel, line_of(RIG).edges, np.zeros(2)
     )
     jump = np.zeros((200, 3))
     jump[60:, 1] = 2.0
@@ -332,7 +335,7 @@ def test_what_commands_left_in_the_state_is_foreseen(name):
     rig, inputs = dataclasses.replace(rig, plant=plant), np.zeros((12 * 200, 1))
     inputs[450] = 5.0
     exposures = simulate(rig, 12, seed=3, inputs=inputs)
-    assert np.mean([np.ptp(e.truth.path) for e in exposures[3:]]) > 6 * np.sqrt(rig.sensor.kernel.variance)
+    assert np.mean([np.ptp(truth_of(e).path) for e in exposures[3:]]) > 6 * np.sqrt(rig.sensor.kernel.variance)
     error = np.sqrt(squared(exposures, run(rig, exposures, [name])[name], 3).mean())
     assert error < 0.01
 
@@ -341,7 +344,7 @@ def test_what_commands_left_in_the_state_is_foreseen(name):
 def test_a_lost_mode_is_found_again(name):
     """Two exposures after a filter was made sure of the opposite; without doubt it takes four."""
     rig = load_rig("jitter")
-    how, found = WindowedMoments(rig.sensor).needs, []
+    how, found = WindowedMoments(line_of(rig)).needs, []
     for seed in range(1, 7):
         filter_, errors = MixtureFilter(rig.plant, rig.sensor, UPDATES[name]), []
         for k, exposure in enumerate(simulate(rig, 9, seed=seed)):
@@ -349,11 +352,11 @@ def test_a_lost_mode_is_found_again(name):
                 h = filter_.prior
                 filter_.prior = GaussianMixture(h.log_weight, -h.mean, 0.3 * h.covariance)
             model = exposure_model(rig.plant, exposure.n_steps)
-            measured, _ = measure(rig, exposure, how)
+            measured = must_be(Profile, measure(rig, exposure, how)[0])
             response = model.response(exposure.inputs)
             posterior = filter_.step(model, response, measured)
             path = model.path(posterior.coefficients.mean, response.path)
-            errors.append(np.sqrt(np.mean((path[0] - exposure.truth.path) ** 2)))
+            errors.append(np.sqrt(np.mean((path[0] - truth_of(exposure).path) ** 2)))
         found.append(max(errors[7:]) < 2.5 * np.sqrt(np.mean(np.square(errors[1:5]))))
     assert sum(found) >= 5
 
@@ -373,7 +376,7 @@ def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
 
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
 @pytest.mark.parametrize("temper", [False, True])
-def test_a_single_coefficient(updates, temper, monkeypatch):
+def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(updates, temper, monkeypatch):
     """Of one state without process noise the posterior is an integral over a line."""
     noise = 0.0 * RIG.plant.process_noise
     one = np.ones((1, 1))
@@ -407,7 +410,7 @@ def test_an_unstable_plant_does_not_end_in_infinity(name):
     )  # fmt: skip
     rig = dataclasses.replace(RIG, plant=plant)
     model = exposure_model(plant, 200)
-    density = exposure_density(rig.sensor.kernel, rig.sensor.edges, np.zeros((1, 200)))
+    density = exposure_density(rig.sensor.kernel, line_of(rig).edges, np.zeros((1, 200)))
     centred = Profile(density=density, mask=np.ones_like(density, dtype=bool))
     filter_ = MixtureFilter(plant, rig.sensor, UPDATES[name])
     for _ in range(150):

@@ -88,9 +88,9 @@ class Camera:
 
     def _move(self, first_step, n_steps):
         """The spot follows the mirror as the rig's plant says, step by step to the end of an exposure."""
-        plant, states, held = self._rig.plant, [], light.held or [self._rig.mirror.park]
+        plant, passed, held = self._rig.plant, [], light.held or [self._rig.mirror.park]
         for step in range(self._step, first_step + n_steps):
-            states.append(self._state)
+            passed.append(self._state)
             self._state = plant.A @ self._state + plant.B @ held[min(step, len(held) - 1)]
-        self._step, states = first_step + n_steps, np.array(states[-n_steps:])
+        self._step, states = first_step + n_steps, np.array(passed[-n_steps:])
         return Truth(start_state=states[:1], end_state=self._state[None], path=plant.C @ states.T)
