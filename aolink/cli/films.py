@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, load_checked, stderr, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, stderr, stdout
 from aolink.cli.terminal import progress_bar
 from aolink.errors import ImportingError
 
@@ -104,6 +104,7 @@ def import_(
     """Make a recording of a film: then estimate, replay, compare, deblur and view it like any other."""
     from aolink.importing.readers import open_film
     from aolink.importing.recording import import_film
+    from aolink.rig import load_rig
 
     start_ns = None
     if start is not None:
@@ -116,7 +117,7 @@ def import_(
         rate, frames, track, at, invert, gamma, exposure_s=exposure or None, start_ns=start_ns,
         subtract_median=background, scale=scale,
     )  # fmt: skip
-    loaded = load_checked(rig)
+    loaded = load_rig(rig)
     film = open_film(source, topic)
     with progress_bar(stderr, film.count // frames) as tell:
         account = import_film(

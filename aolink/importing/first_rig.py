@@ -17,9 +17,10 @@ from aolink.importing.tracking import STRAY, Survey, find_objects, reach, survey
 
 FloatArray = NDArray[np.float64]
 
-_COUNTS = 40_000
-"""Counts of the brightest pixel of a resting spot, above black; there are 65,535."""
-_BLACK = 8000
+_COUNTS = 62_000
+"""Counts of the brightest pixel of a resting spot with its noise; there are 65,535."""
+_NOISE_SDS = 6
+"""Standard deviations of a pixel's noise that fit below black and above the brightest pixel."""
 _LEAST_WINDOW = 12
 _ANYWHERE = 0.1
 """Variance of the place of an object in its window before it is seen, slope units squared."""
@@ -152,6 +153,8 @@ def _text(
     area = (2 / side) ** 2
     read, read_sd, electrons = _noise(known, 2 / side)
     peak = 1 / (2 * math.pi * (sigma**2 / 2 + area / 12))
+    noise = math.sqrt(read / area) if read else 0.0
+    counts = _COUNTS / (peak + 2 * _NOISE_SDS * noise)
     step_ns = round(1e9 / rate)
     walk = motion.a == 1
     if walk:
@@ -187,8 +190,8 @@ window = [{side}, {side}]
 field = [-1.0, 1.0]
 noise_density = {read:.6g}  # +- {read_sd:.2g}: what the Gaussian leaves of single frames
 bit_depth = 16
-black_level = {_BLACK}
-counts_per_density = {_COUNTS / peak:.6g}
+black_level = {math.ceil(_NOISE_SDS * noise * counts)}
+counts_per_density = {counts:.6g}
 photoelectrons = {electrons:.4g}
 
 [sensor.kernel]
