@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections import deque
 from collections.abc import Container, Iterator
@@ -144,6 +145,16 @@ class Recording:
     def n_frames(self) -> int:
         """How many of the camera's frames are in the file."""
         return self.counts.get(topics.IMAGE, 0)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the file's bytes, all of which are read for it: the recording's identity, under any name."""
+        digest = hashlib.sha256()
+        with open_recording(self.path) as file:
+            file.seek(0)
+            while block := file.read(1 << 20):
+                digest.update(block)
+        return digest.hexdigest()
 
     def skipped(self, estimator: str) -> frozenset[int]:
         """Frame ids of the exposures that an estimator had no time for in the session."""
