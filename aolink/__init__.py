@@ -16,6 +16,7 @@ from aolink.errors import AolinkError
 
 if TYPE_CHECKING:
     from aolink.estimation import Estimate
+    from aolink.exporting.series import Series
     from aolink.exposure import Exposures
     from aolink.recording.reader import Recording
     from aolink.rig import Rig, load_rig
@@ -41,7 +42,10 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
 
 
 def read(path: str | Path) -> Recording:
-    """Open a recording: what it gives when iterated over are its exposures, read one after the other.
+    """Open a recording: a series of exposures, read when they are asked for.
+
+    ``len(recording)``, ``recording[7]``, ``recording[-10:]`` and a loop give exposures; ``to_pandas()``,
+    ``to_xarray()`` and ``plot()`` what a notebook needs of them and of the estimates in the file.
 
     Raises
     ------
@@ -78,13 +82,13 @@ def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -
     return Exposures(rig, tuple(simulate_exposures(rig, n_exposures, seed)))
 
 
-def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> list[Estimate]:
+def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list[Estimate]:
     """Estimates of the motion inside each exposure.
 
     Parameters
     ----------
     exposures:
-        What `simulate` gave, or a recording or its path.
+        What `simulate` gave, or a recording, a slice of one, or its path.
     estimator:
         One of `aolink.estimation.ESTIMATOR_NAMES`.
 
@@ -103,7 +107,7 @@ def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> l
     return [result for _, (result,) in driver.steps(series)]
 
 
-def smooth(exposures: Exposures | Recording | str | Path, estimates: list[Estimate]) -> list[Estimate]:
+def smooth(exposures: Exposures | Series | str | Path, estimates: list[Estimate]) -> list[Estimate]:
     """Estimates of `estimate` corrected by all that came later: offline, with the same fields.
 
     Parameters

@@ -1,4 +1,4 @@
-"""One colour for each quantity, in the viewer and in every plot."""
+"""One colour for each estimator, in the viewer and in every plot."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from aolink.estimation import estimator_row
 
 Colour = tuple[int, int, int]
 
-TRUTH: Colour = (245, 200, 40)
 _OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120), (255, 160, 160), (140, 180, 255))
 
 

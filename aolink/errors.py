@@ -67,3 +67,9 @@ class RestorationError(AolinkError):
     """A picture or a point spread function that cannot be restored with, or not by the method asked for."""
 
     exit_code = 10
+
+
+class ExportError(AolinkError):
+    """Exposures that cannot be given to another program in the form asked for."""
+
+    exit_code = 12

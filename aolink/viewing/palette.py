@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from aolink.colours import TRUTH, Colour, estimator_colour
+from aolink.colours import Colour, estimator_colour
 from aolink.errors import EstimatorError
 from aolink.estimation import estimator_row
 
@@ -13,6 +13,7 @@ __all__ = [
     "Colour", "by_rank", "estimator_colour", "series_colour",
 ]  # fmt: skip
 
+TRUTH: Colour = (245, 200, 40)
 MEASURED: Colour = (165, 165, 165)
 COMMANDED: Colour = (150, 150, 255)
 APPLIED: Colour = (40, 200, 180)
