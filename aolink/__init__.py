@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from aolink.estimation import Estimate
+    from aolink.exporting.series import Series
     from aolink.exposure import Exposures
     from aolink.recording.reader import Recording
     from aolink.rig import Rig, load_rig
@@ -44,7 +45,10 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
 
 
 def read(path: str | Path) -> Recording:
-    """Open a recording. Iterating over it reads its exposures, one after the other.
+    """Open a recording: a series of exposures, read when they are asked for.
+
+    ``len(recording)``, ``recording[7]``, ``recording[-10:]`` and a loop give exposures; ``to_pandas()``,
+    ``to_xarray()`` and ``plot()`` what a notebook needs of them and of the estimates in the file.
 
     Raises
     ------
@@ -111,13 +115,13 @@ def exposures(
     return made(frames, rig if isinstance(rig, Rig) else load_rig(rig), inputs, start_steps)
 
 
-def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> list[Estimate]:
+def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list[Estimate]:
     """Estimates of the motion inside each exposure, in their order.
 
     Parameters
     ----------
     exposures:
-        What `simulate` gave, or a recording or its path.
+        What `simulate` gave, or a recording, a slice of one, or its path.
     estimator:
         One of `aolink.estimation.ESTIMATOR_NAMES`.
 
@@ -136,7 +140,7 @@ def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> l
     return [result for _, (result,) in driver.steps(series)]
 
 
-def smooth(exposures: Exposures | Recording | str | Path, estimates: list[Estimate]) -> list[Estimate]:
+def smooth(exposures: Exposures | Series | str | Path, estimates: list[Estimate]) -> list[Estimate]:
     """Rauch-Tung-Striebel smoother: estimates of `estimate`, each corrected by all later exposures. Offline only.
 
     Parameters

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections import deque
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, overload
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -19,16 +21,22 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel, exposure_model
+from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
+from aolink.recording.frame_index import FrameIndex, StepRun
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
+from aolink.recording.slices import RecordingSlice
 from aolink.rig import Rig, parse_rig
-from aolink.wire.messages_pb2 import Applied
+from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
 
 if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
+
+_END_OF_TIME = 1 << 64
+"""After every log time, ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +62,11 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class Recording:
+class Recording(Series):
     """A recording on disk, read piece by piece, so files may be larger than the memory.
+
+    It is a series of exposures: a loop over it gives them, and so do its length, numbers and slices. The numbers are
+    those of the frames in the file's index.
 
     A complete file is read by its index. One that was cut off or damaged is scanned for its undamaged parts; `losses`
     lists the others.
@@ -141,9 +152,24 @@ class Recording:
         return [name.removeprefix(topics.ESTIMATE) for name in self.counts if name.startswith(topics.ESTIMATE)]
 
     @property
+    def has_truth(self) -> bool:
+        """Whether what really happened is in the file."""
+        return topics.TRUTH in self.counts
+
+    @property
     def n_frames(self) -> int:
         """Number of the camera's frames in the file."""
         return self.counts.get(topics.IMAGE, 0)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the file's bytes, all of which are read for it: the recording's identity, under any name."""
+        digest = hashlib.sha256()
+        with open_recording(self.path) as file:
+            file.seek(0)
+            while block := file.read(1 << 20):
+                digest.update(block)
+        return digest.hexdigest()
 
     def skipped(self, estimator: str) -> frozenset[int]:
         """Frame ids of the exposures that an estimator had no time for in the session."""
@@ -200,9 +226,14 @@ class Recording:
     ) -> Iterator[RawMessage]:
         """As `messages`, as bytes, and those of other software too."""
         low = start_ns if start_ns is not None else 0
-        high = end_ns if end_ns is not None else 1 << 64
+        return self._raw(wanted, low, end_ns if end_ns is not None else _END_OF_TIME)
+
+    def _raw(
+        self, wanted: Container[str], low: int = 0, high: int = _END_OF_TIME, chunks: slice = slice(None)
+    ) -> Iterator[RawMessage]:
+        """The messages in some chunks of the index, if there is one; of all topics if none is ``wanted``."""
         channels = {k: names for k, names in self._channels.items() if not wanted or names[0] in wanted}
-        for record in self._records(channels, low, high):
+        for record in self._records(channels, low, high, chunks):
             if isinstance(record, McapMessage) and record.channel_id in channels and low <= record.log_time < high:
                 topic, schema = channels[record.channel_id]
                 yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
@@ -213,19 +244,54 @@ class Recording:
         The messages are those of the topics ``others`` (of all, if none is named), besides those that make exposures.
         Exposures that were still incomplete when the recording ended come last, with None.
         """
+        return self._assembled(others)
+
+    def _assembled(
+        self, others: tuple[str, ...], chunks: slice = slice(None)
+    ) -> Iterator[tuple[RecordedMessage | None, list[Exposure]]]:
         assembly = ExposureAssembly(self.rig)
-        for recorded in self.messages(*({*others, *_ASSEMBLED} if others else ())):
-            yield recorded, assembly.take(recorded.topic, recorded.message)
+        for raw in self._raw((*others, *_ASSEMBLED) if others else (), chunks=chunks):
+            if (message := self.decoded(raw)) is not None:
+                recorded = RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
+                yield recorded, assembly.take(recorded.topic, message)
         yield None, assembly.flush()
 
-    def __iter__(self) -> Iterator[Exposure]:
-        """Its exposures, from the first one on, as for the `Exposures` of `aolink.simulate`."""
-        return self.exposures()
+    def __len__(self) -> int:
+        return self.n_frames
 
-    def exposures(self) -> Iterator[Exposure]:
-        """The exposures in order, with their truth and their scene where the file has them."""
+    @overload
+    def __getitem__(self, index: int) -> Exposure: ...
+    @overload
+    def __getitem__(self, index: slice) -> RecordingSlice: ...
+    def __getitem__(self, index: int | slice) -> Exposure | RecordingSlice:
+        """An exposure by its number, or a slice, of which nothing is read before it is used.
+
+        Raises RecordingError for an exposure that is damaged.
+        """
+        if isinstance(index, slice):
+            return RecordingSlice(self, range(len(self))[index])
+        number = range(len(self))[index]
+        if (exposure := next(self.exposures(number, number + 1), None)) is None:
+            raise RecordingError(f"exposure {number} of {self.path} cannot be read: {self.damage or 'it is not whole'}")
+        return exposure
+
+    def facts(self) -> dict[str, str]:
+        """What the recording holds, in words."""
+        return super().facts() | ({"damage": self.damage} if self.damage else {})
+
+    def exposures(self, start: int = 0, stop: int | None = None) -> Iterator[Exposure]:
+        """The exposures in order, with their truth and their scene where the file has them.
+
+        With ``start`` and ``stop`` those with the numbers from the one to below the other, counted from 0 on.
+        """
+        if stop is not None and stop <= start:
+            return iter(())
+        chunk, before = self._beginning(start)
+        return islice(self._exposures(chunk), start - before, None if stop is None else stop - before)
+
+    def _exposures(self, chunk: int) -> Iterator[Exposure]:
         assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
-        for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE):
+        for raw in self._raw((*_ASSEMBLED, *_BESIDE), chunks=slice(chunk, None)):
             if (message := self.decoded_run(raw) or self.decoded(raw)) is None:
                 continue
             if raw.topic in _BESIDE:
@@ -234,6 +300,46 @@ class Recording:
                 yield from beside.add(completed)
         yield from beside.add(assembly.flush())
         yield from beside.flush()
+
+    def _beginning(self, number: int) -> tuple[int, int]:
+        """Where to read from so that an exposure is made as from the file's start: a chunk, and the frames before it.
+
+        An exposure's inputs go on where those of the one before it ended. That one is known for certain if the mirror
+        reported all of it; else its inputs may go on from what was before, and so on.
+        """
+        index, back = self._frame_index if number else None, 1
+        while index is not None and number - back > 0:
+            first = number - back
+            chunk = index.chunk_of(first)
+            infos = self._raw((topics.EXPOSURE,), chunks=slice(chunk, chunk + 1))
+            info = next(islice(map(self.decoded, infos), first - index.before[chunk], None), None)
+            if not isinstance(info, schemas_pb2.ExposureInfo):
+                break
+            present = [topic for topic in _RUNS if self.counts.get(topic)]
+            chunk = index.first_chunk(first, info.first_step, present, self._runs_in)
+            known = next(islice(self._exposures(chunk), first - index.before[chunk], None), None)
+            if known is None:
+                break
+            if not known.inputs_assumed:
+                return chunk, index.before[chunk]
+            back *= 2
+        return 0, 0
+
+    @cached_property
+    def _frame_index(self) -> FrameIndex | None:
+        """None where the file has no index, or one that cannot say which exposures there are."""
+        if self._index is None or self._losses or self.counts.get(topics.EXPOSURE) != self.n_frames:
+            return None
+        frames = {channel for channel, (topic, _) in self._channels.items() if topic == topics.EXPOSURE}
+        index = FrameIndex.of(self.path, self._index, frames)
+        return index if index is not None and index.before[-1] == self.n_frames else None
+
+    def _runs_in(self, chunk: int) -> Iterator[StepRun]:
+        """The commands and reports in a chunk."""
+        for raw in self._raw(tuple(_RUNS), chunks=slice(chunk, chunk + 1)):
+            message = self.decoded_run(raw) or self.decoded(raw)
+            if isinstance(message, Run | Applied | CommandBlock):
+                yield raw.topic, message.first_step + message.n_steps
 
     @property
     def true_scene(self) -> NDArray[np.uint16] | None:
@@ -266,27 +372,30 @@ class Recording:
         if info is not None:
             yield _restored(info, pictures)
 
-    def estimates(self, name: str) -> list[Estimate]:
-        """The estimates that are in the file under a name, in order. Raises RecordingError if there are none."""
-        topic = topics.estimate_topic(name)
-        if topic not in self.counts:
-            known = ", ".join(self.estimators) or "none"
-            raise RecordingError(
-                f"{self.path} holds no estimates of {name} (it has: {known}): `aolink estimate` makes them"
-            )
-        return list(self.iter_estimates(name))
+    def iter_estimates(self, name: str, start: int = 0, stop: int | None = None) -> Iterator[Estimate]:
+        """As `estimates`, one by one: the file is read only as far as they are asked for. None is no error here.
 
-    def iter_estimates(self, name: str) -> Iterator[Estimate]:
-        """As `estimates`, one by one: the file is read only as far as they are asked for. None is no error here."""
+        With ``start`` and ``stop`` those of the exposures that `exposures` gives for them.
+        """
+        if stop is not None and stop <= start:
+            return
+        chunk, before = self._beginning(start)
+        numbers = count(before)
         exposures: dict[int, Exposure] = {}
         waiting: deque[schemas_pb2.Estimate] = deque()
-        for recorded, completed in self.assembled(topics.estimate_topic(name), topics.estimation_topic(name)):
+        ended, done = False, -1
+        """Whether all of the exposures have come, and the last of them that has had its estimate."""
+        wanted = (topics.estimate_topic(name), topics.estimation_topic(name))
+        for recorded, completed in self._assembled(wanted, slice(chunk, None)):
             received = None if recorded is None else recorded.message
             if isinstance(received, schemas_pb2.Estimate):
                 waiting.append(received)
             elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
                 exposures.pop(received.frame_id, None)
-            exposures.update((exposure.frame_id, exposure) for exposure in completed)
+            for exposure, number in zip(completed, numbers, strict=False):
+                ended = stop is not None and number >= stop - 1
+                if start <= number and (stop is None or number < stop):
+                    exposures[exposure.frame_id] = exposure
             # At the end of the recording, an exposure that has not come will not; nor will one of the part before this.
             first = next(iter(exposures), 0)
             while waiting and (recorded is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
@@ -297,6 +406,10 @@ class Recording:
                 # Estimates come in the order of their exposures: what is before this one has had its own.
                 for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
                     del exposures[frame_id]
+                done = message.frame_id
+            last = next(reversed(exposures), done)
+            if ended and (last == done or (waiting and waiting[0].frame_id > last)):
+                return
 
     def _survey(self, *, check: bool) -> str | None:
         """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
@@ -362,14 +475,14 @@ class Recording:
             elif record.name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
                 self._channels.setdefault(int(values["id"]), (values.get("topic", ""), values.get("schema", "")))
 
-    def _records(self, channels: Container[int], low: int, high: int) -> Iterator[McapRecord]:
+    def _records(self, channels: Container[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""
         if self._index is None:
             for record, _ in self._scanned():
                 yield record
             return
         with open_recording(self.path) as file:
-            for index in self._index:
+            for index in self._index[chunks]:
                 held = index.message_index_offsets
                 if index.message_end_time < low or index.message_start_time >= high:
                     continue

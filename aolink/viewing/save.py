@@ -32,6 +32,8 @@ APPLICATION = "aolink"
 def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a recording as an .rrd file that any Rerun viewer opens with aolink's layout.
 
+    Its recording id in Rerun is the digest of the recording's bytes: the same recording opened twice is one there.
+
     Parameters
     ----------
     recording:
@@ -47,7 +49,7 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
         The file exists already or cannot be written, or the recording has nothing to show.
     """
     path = Path(path)
-    with new_rrd(APPLICATION, path, overwrite=overwrite, sources=[recording.path]) as stream:
+    with new_rrd(APPLICATION, path, overwrite=overwrite, sources=[recording.path], identity=recording.digest) as stream:
         contents = send_recording(stream, recording)
         # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
         stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
