@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,17 +41,24 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
         raise AttributeError(f"module 'aolink' has no attribute {name!r}")
 
 
-def read(path: str | Path) -> Recording:
+def read(path: str | Path, side: Sequence[str | Path] = ()) -> Recording:
     """Open a recording: what it gives when iterated over are its exposures, read one after the other.
+
+    Parameters
+    ----------
+    path:
+        A file, or a URL that fsspec knows (``pip install 'aolink[remote]'``).
+    side:
+        Side files of it, whose estimates stand in the place of its own.
 
     Raises
     ------
     RecordingError
-        It cannot be read, or is not a recording of aolink.
+        It cannot be read, or is not a recording of aolink; a side file is not of this recording.
     """
     from aolink.recording.reader import Recording
 
-    return Recording(path)
+    return Recording(path, side=side)
 
 
 def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Exposures:

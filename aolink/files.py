@@ -265,9 +265,10 @@ def _is_open_as(path: Path, descriptor: int) -> bool:
 
 def _others_write(target: Path, but: Path | None = None) -> bool:
     """Whether an unfinished file of ``target`` other than ``but`` is locked. Dead ones are removed."""
-    unfinished = re.compile(re.escape(_prefix_of(target)) + r"[0-9a-f]{16}\.partial")
+    prefix = _prefix_of(target)
+    unfinished = re.compile(re.escape(prefix) + r"[0-9a-f]{16}\.partial")
     try:
-        names = [name for name in os.listdir(target.parent) if unfinished.fullmatch(name)]
+        names = [name for name in os.listdir(target.parent) if name.startswith(prefix) and unfinished.fullmatch(name)]
     except OSError:  # a folder that may be written but not read
         return False
     found = False

@@ -52,11 +52,11 @@ def load_checked(path_or_name: str) -> Rig:
     return loaded
 
 
-def open_recording(file: Path, *, check: bool = False) -> Recording:
-    """Open a recording, and say so where it is not whole."""
+def open_recording(file: str | Path, *, check: bool = False, side: Sequence[Path] = ()) -> Recording:
+    """Open a recording with its side files, and say so where it is not whole."""
     from aolink.recording.reader import Recording
 
-    recording = Recording(file, check=check)
+    recording = Recording(file, check=check, side=side)
     if recording.damage:
         stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
     return recording

@@ -18,6 +18,10 @@ def view(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that --save has written.")
     ],
+    side: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[SIDE...]", help="Its side files: their estimates instead of its own."),
+    ] = None,
     save: Annotated[
         Path | None, typer.Option(metavar="X.rrd", help="Write a Rerun file instead of opening the viewer.")
     ] = None,
@@ -36,10 +40,10 @@ def view(
 
     for target, suffix in ((save, ".rrd"), (screenshot, ".png")):
         if target is not None:
-            check_target(target, overwrite=overwrite, sources=[file], suffix=suffix)
-    recording = None if file.suffix == ".rrd" else open_recording(file)
-    if recording is None and save is not None:
-        raise typer.BadParameter(f"{file} is a Rerun file already: --save is for a recording")
+            check_target(target, overwrite=overwrite, sources=[file, *(side or ())], suffix=suffix)
+    recording = None if file.suffix == ".rrd" else open_recording(file, side=side or ())
+    if recording is None and (save is not None or side):
+        raise typer.BadParameter(f"{file} is a Rerun file already: --save and side files are for a recording")
     if not (web or save or screenshot):
         viewing.check_display()  # before the recording is read, which may take minutes
     with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
