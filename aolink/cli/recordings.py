@@ -48,7 +48,7 @@ class Engine(StrEnum):
 
 @app.command(epilog="Example: aolink info session.mcap --json")
 def info(
-    file: FileArgument,
+    file: Annotated[str, typer.Argument(help="A recording: a file, or a URL.", metavar="FILE")],
     check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -70,7 +70,7 @@ def info(
     "  |  aolink estimate *.mcap -e moments --set plant.process_noise=0.2,0.4 --jobs 2 -o results/"
 )
 def estimate(
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="One recording or many; with --side URLs too.")],
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="One recording or many, or their URLs.")],
     estimator: EstimatorOption = None,
     target: Annotated[
         str | None,
@@ -135,17 +135,20 @@ def estimate(
     from aolink.cli import tables
     from aolink.jobs import batch
     from aolink.jobs.tables import fill_table
+    from aolink.recording.remote import location
 
     models = batch_models(rig, settings)
     if len(files) == 1 and len(models) == 1 and not is_folder:
         if parquet or jobs > 1:
             raise typer.BadParameter("--parquet and --jobs are for many files or models, with -o DIR/")
         _estimate_one(
-            Path(files[0]), models[0], estimator, output, engine, only=only, overwrite=overwrite, as_json=as_json
+            files[0], models[0], estimator, output, engine, only=only, overwrite=overwrite, as_json=as_json
         )  # fmt: skip
         return
     if output is None or (output.suffix == ".mcap" and not is_folder):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
+    if urls := [each for each in map(location, files) if not isinstance(each, Path)]:
+        raise typer.BadParameter(f"{urls[0]} is a URL: of many recordings behind URLs --side makes side files")
     todo = batch.jobs(
         [*map(Path, files)], models, estimator or [], output, engine.value, only=only, overwrite=overwrite
     )  # fmt: skip
@@ -254,7 +257,7 @@ def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _estimate_one(
-    file: Path, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
+    file: str, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
     only: bool, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli import tables
@@ -306,7 +309,7 @@ def _estimate_one(
             if recording.estimators and not recording.rig_is_recorded:
                 beside = "; the estimates that were there are of another rig file, and left out"
             stdout.print(f"written: {output}{beside}", markup=False)
-    check_measured(file, scores)
+    check_measured(recording.path, scores)
 
 
 CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from the recording's start.")]
@@ -314,9 +317,9 @@ CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from t
 
 @app.command(epilog="Example: aolink compare session.mcap again.mcap --topic /estimate/")
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="A", help="A recording.")],
+    first: Annotated[str, typer.Argument(metavar="A", help="A recording.")],
     second: Annotated[
-        Path | None,
+        str | None,
         typer.Argument(
             metavar="[B]",
             help="Another, or a side file of A; without it, A with its estimates made again by this aolink.",
@@ -352,7 +355,7 @@ def compare(
         raise RecordingError(f"{first} holds no estimates to make again: give a second recording")
     with TemporaryDirectory(prefix="aolink-") as folder:
         if second is None:
-            second = Path(folder) / first.name
+            second = f"{folder}/{one.path.name}"
             with progress_bar(stderr, one.n_frames) as tell:
                 write_reestimated(one, one.estimators, second, progress=lambda n: tell("estimate", n), as_recorded=True)
         two = open_recording(second)
@@ -380,8 +383,10 @@ def compare(
         if accept and not same:
             if damage:
                 raise RecordingError(f"{damage[0]}: a damaged recording is not accepted; `aolink recover` it first")
-            with writing(first, overwrite=True, sources=[second], error=RecordingError) as partial:
-                shutil.copyfile(second, partial)
+            if not (isinstance(one.path, Path) and isinstance(two.path, Path)):
+                raise typer.BadParameter("--accept is for files of this machine, not for URLs")
+            with writing(one.path, overwrite=True, sources=[two.path], error=RecordingError) as partial:
+                shutil.copyfile(two.path, partial)
             stdout.print(f"accepted: {first} is replaced", markup=False)
             return
     if not as_json:

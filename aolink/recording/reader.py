@@ -25,7 +25,7 @@ from aolink.estimation import Estimate, ExposureModel, exposure_model
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
-from aolink.recording.remote import Url, location
+from aolink.recording.remote import Url, location, only_paths
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.rig import Rig, parse_rig
 from aolink.wire.messages_pb2 import Applied
@@ -159,7 +159,7 @@ class Recording:
     @property
     def files(self) -> list[Path]:
         """The files of this machine that it is read from: nothing that is made of it may take their place."""
-        return [each for each in (self.path, *(side.path for side in self._side)) if isinstance(each, Path)]
+        return only_paths([self.path, *(side.path for side in self._side)])
 
     @cached_property
     def size(self) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path, PurePosixPath
@@ -31,6 +31,11 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
 def location(path: str | Path | Url) -> Path | Url:
     """A path, or a URL where it is one: ``s3://bucket/session.mcap``, ``https://...``, ``memory://...``."""
     return Url(path) if isinstance(path, str) and _URL.match(path) else path if isinstance(path, Url) else Path(path)
+
+
+def only_paths(places: Iterable[Path | Url]) -> list[Path]:
+    """Those that are files of this machine."""
+    return [each for each in places if isinstance(each, Path)]
 
 
 class Url:
@@ -133,15 +138,21 @@ class Url:
             yield
         except RecordingError:
             raise
-        except FileNotFoundError:
-            raise RecordingError(f"there is no {self}, or nobody may know of it") from None
         except Exception as error:
-            refused = isinstance(error, PermissionError) or getattr(error, "status", 0) in (401, 403)
-            if refused or type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
+            cause = error.__cause__ or error  # some file systems say that nothing is there, whatever is the matter
+            denied = isinstance(error, PermissionError) or getattr(cause, "status", 0) in (401, 403)
+            if denied or type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
                 why = "no right to read it; give the credentials that its server wants, as AWS_PROFILE for s3"
+            elif isinstance(error, FileNotFoundError):
+                what = "" if cause is error else f" ({_first_line(cause)})"
+                why = f"there is no such file, or nobody may know of it{what}"
             else:
-                why = (str(error) or type(error).__name__).splitlines()[0]
+                why = _first_line(error)
             raise RecordingError(f"cannot read {self}: {why}") from None
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
 
 
 class RangeFile(io.RawIOBase):
@@ -183,6 +194,7 @@ class RangeFile(io.RawIOBase):
             if start <= position < start + len(data):
                 return start, data
         start, stop = self._range(position, end)
+        stop = min([stop, *(there for there in self._url.ends if there > position)])  # that is known already
         self._kept.append((start, self._url.read(start, stop)))
         return self._kept[-1]
 
