@@ -109,6 +109,9 @@ def estimate(
     shard: Annotated[
         str | None, typer.Option(metavar="I/N", help="With --side: part I of N of the recordings, for a job array.")
     ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="With --side: on the workers of this Dask scheduler.")
+    ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -125,11 +128,11 @@ def estimate(
             )
         _estimate_beside(
             files, batch_models(rig, settings), estimator or ["o3"], output, engine,
-            jobs=jobs, table=table, shard=shard, overwrite=overwrite, as_json=as_json,
+            jobs=jobs, table=table, shard=shard, scheduler=scheduler, overwrite=overwrite, as_json=as_json,
         )  # fmt: skip
         return
-    if table or shard:
-        raise typer.BadParameter("--table and --shard are for side files: give --side too")
+    if table or shard or scheduler:
+        raise typer.BadParameter("--table, --shard and --scheduler are for side files: give --side too")
     if only and output is None:
         raise typer.BadParameter("--only is about the copy that -o writes: give -o too")
     from aolink.cli import tables
@@ -177,7 +180,7 @@ def batch_models(rig: str | None, settings: Sequence[str] | None) -> list[Model]
 
 def _estimate_beside(
     files: Sequence[str], models: Sequence[Model], estimators: Sequence[str], folder: Path, engine: Engine, *,
-    jobs: int, table: Path | None, shard: str | None, overwrite: bool, as_json: bool,
+    jobs: int, table: Path | None, shard: str | None, scheduler: str | None, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli import tables
     from aolink.jobs import batch
@@ -187,6 +190,8 @@ def _estimate_beside(
         check_target(table, overwrite=True, suffix=".parquet")
         parquet()
     sources = batch.shard(files, shard) if shard else files
+    if scheduler:  # the workers have other folders
+        sources, folder = [batch.absolute(each) for each in sources], folder.absolute()
     todo = batch.side_jobs(
         sources, models, estimators, folder, engine.value, table=table is not None, overwrite=overwrite
     )  # fmt: skip
@@ -196,7 +201,16 @@ def _estimate_beside(
     # The table is held from the start, so that the same part that is begun twice is refused.
     with writing(target, overwrite=True) as partial:
         with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
-            done = _told(batch.run(todo, jobs, stop=stop, progress=lambda n: tell("estimate", n)))
+
+            def progress(count: int) -> None:
+                tell("estimate", count)
+
+            if scheduler:
+                from aolink.jobs.cluster import run_on
+
+                done = _told(run_on(scheduler, todo, stop=stop, progress=progress))
+            else:
+                done = _told(batch.run(todo, jobs, stop=stop, progress=progress))
         rows = batch.table_rows(done)
         fill_table(partial, rows, target.suffix)
         if table is not None:

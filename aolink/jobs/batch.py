@@ -25,7 +25,7 @@ from aolink.jobs.unit import Model, Settings, estimated
 from aolink.numerics.workers import processes
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures, fill_reestimated
-from aolink.recording.remote import location
+from aolink.recording.remote import Url, location
 
 _IN_EVERY_ROW = {"recording", "model", "estimator", "exposures", "output"}
 
@@ -253,6 +253,11 @@ def shard(sources: Sequence[str], part: str) -> list[str]:
     return sorted(set(sources))[number - 1 :: count]
 
 
+def absolute(source: str) -> str:
+    """A path as a process in another folder needs it; a URL as it is."""
+    return source if isinstance(location(source), Url) else str(Path(source).absolute())
+
+
 def run(
     todo: Sequence[Job | SideJob],
     workers: int,
@@ -273,7 +278,7 @@ def run(
             yield before
     count = len(todo) - len(fresh)
     progress(count)
-    each = map(_do, itertools.takewhile(lambda job: not stop(), fresh))
+    each = map(do, itertools.takewhile(lambda job: not stop(), fresh))
     for done in each if workers == 1 or len(fresh) < 2 else _in_parallel(fresh, workers, stop):
         yield done
         progress(count := count + 1)
@@ -290,7 +295,7 @@ def _in_parallel(todo: Sequence[Job | SideJob], workers: int, stop: Callable[[],
                     # No more than can run: what waits in a pool cannot be taken back.
                     while queue and not lost and len(running) < workers and not stop():
                         try:
-                            running[pool.submit(_do, queue[0])] = queue[0]
+                            running[pool.submit(do, queue[0])] = queue[0]
                         except BrokenProcessPool:
                             lost = True
                         else:
@@ -348,8 +353,8 @@ def _record(path: Path) -> dict[str, Any] | None:
     return None
 
 
-def _do(job: Job | SideJob) -> Done:
-    """Estimate a recording again; whatever goes wrong is the result."""
+def do(job: Job | SideJob) -> Done:
+    """Do a job; whatever goes wrong is the result."""
     try:
         rows, before = job.rows()
     except (AolinkError, OSError) as error:
