@@ -44,20 +44,27 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
         raise AttributeError(f"module 'aolink' has no attribute {name!r}")
 
 
-def read(path: str | Path) -> Recording:
+def read(path: str | Path, side: Sequence[str | Path] = ()) -> Recording:
     """Open a recording: a series of exposures, read when they are asked for.
 
     ``len(recording)``, ``recording[7]``, ``recording[-10:]`` and a loop give exposures; ``to_pandas()``,
     ``to_xarray()`` and ``plot()`` what a notebook needs of them and of the estimates in the file.
 
+    Parameters
+    ----------
+    path:
+        A file, or a URL that fsspec knows (``pip install 'aolink[remote]'``).
+    side:
+        Side files of it, whose estimates stand in the place of its own.
+
     Raises
     ------
     RecordingError
-        The file cannot be read, or is not a recording of aolink.
+        It cannot be read, or is not a recording of aolink; a side file is not of this recording.
     """
     from aolink.recording.reader import Recording
 
-    return Recording(path)
+    return Recording(path, side=side)
 
 
 def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Exposures:

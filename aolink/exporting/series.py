@@ -5,8 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from html import escape
-from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 from aolink.errors import RecordingError
 from aolink.estimation.estimate import Estimate
@@ -27,8 +26,8 @@ class Series(ABC):
     """
 
     rig: Rig
-    path: Path
-    """The file that they are in."""
+    path: Any
+    """The file that they are in: a path, or the location of one behind a URL."""
     metadata: dict[str, str]
     """Facts about the session."""
 
