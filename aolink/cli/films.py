@@ -112,7 +112,7 @@ def import_(
             moment = datetime.fromisoformat(start)
         except ValueError:
             raise ImportingError(f"--start {start} is no date: give one such as 2026-11-22T09:30:00") from None
-        start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()) * 1_000_000_000
+        start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
     settings = film_settings(
         rate, frames, track, at, invert, gamma, exposure_s=exposure or None, start_ns=start_ns,
         subtract_median=background, scale=scale,
