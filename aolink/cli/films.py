@@ -121,8 +121,9 @@ def import_(
     film = open_film(source, topic)
     with progress_bar(stderr, film.count // frames) as tell:
         account = import_film(
-            film, loaded, settings, output, overwrite=overwrite, progress=lambda done: tell("import", done)
-        )
+            film, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
+            progress=lambda done: tell("import", done),
+        )  # fmt: skip
     if as_json:
         print(json.dumps({"out": str(output), **vars(account)}))
         return
