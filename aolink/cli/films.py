@@ -112,7 +112,7 @@ def import_(
             moment = datetime.fromisoformat(start)
         except ValueError:
             raise ImportingError(f"--start {start} is no date: give one such as 2026-11-22T09:30:00") from None
-        start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()) * 1_000_000_000
+        start_ns = round((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp() * 1e6) * 1000
     settings = film_settings(
         rate, frames, track, at, invert, gamma, exposure_s=exposure or None, start_ns=start_ns,
         subtract_median=background, scale=scale,
@@ -121,8 +121,9 @@ def import_(
     film = open_film(source, topic)
     with progress_bar(stderr, film.count // frames) as tell:
         account = import_film(
-            film, loaded, settings, output, overwrite=overwrite, progress=lambda done: tell("import", done)
-        )
+            film, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
+            progress=lambda done: tell("import", done),
+        )  # fmt: skip
     if as_json:
         print(json.dumps({"out": str(output), **vars(account)}))
         return

@@ -5,20 +5,19 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.message import DecodeError
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film, Frame
+from aolink.importing.film import Film, Frame, grey
+from aolink.optics.pictures import image_pixels
 
 _ENCODINGS = {
     "mono8": "u1", "8uc1": "u1", "mono16": "<u2", "16uc1": "<u2", "32fc1": "<f4", "64fc1": "<f8",
@@ -36,6 +35,7 @@ class _Stamped:
     """Its own stamp, or 0 where it has none."""
     arrival_ns: int
     picture: Frame
+    """(rows, columns) or (rows, columns, 3 or 4)."""
     lossy: bool
 
 
@@ -44,49 +44,50 @@ def mcap_film(path: Path, topic: str | None) -> Film:
 
     def channels() -> dict[str, str]:
         with path.open("rb") as file:
-            summary = make_reader(file).get_summary()
+            summary = make_reader(file, validate_crcs=True).get_summary()
         if summary is None:
             raise ImportingError(f"{path} has no index: `aolink recover` or `mcap recover` makes one")
-        schemas = {number: schema.name for number, schema in summary.schemas.items()}
-        return {each.topic: schemas.get(each.schema_id, "") for each in summary.channels.values()}
+        schemas = summary.schemas
+        return {
+            each.topic: f"{schemas[each.schema_id].name} in {each.message_encoding}"
+            for each in summary.channels.values()
+            if each.schema_id in schemas
+        }
 
-    try:
-        chosen = _chosen(channels(), topic, path)
+    kinds = channels()
+    chosen = _chosen(kinds, topic, path)
+    read = _DECODERS[kinds[chosen]]
 
-        def messages() -> Iterator[_Stamped]:
-            with path.open("rb") as file:
-                for schema, _, message in make_reader(file).iter_messages(topics=[chosen]):
-                    read = _DECODERS[schema.name if schema else ""]
-                    yield read(message.data, message.publish_time or message.log_time)
+    def messages() -> Iterator[_Stamped]:
+        with path.open("rb") as file:
+            for _, _, message in make_reader(file, validate_crcs=True).iter_messages(topics=[chosen]):
+                yield read(message.data, message.publish_time or message.log_time)
 
-        return _film(path, chosen, messages)
-    except (McapError, DecodeError) as error:
-        raise ImportingError(f"{path} is damaged or no MCAP file: {error}") from None
+    return _film(path, chosen, messages)
 
 
 def ros_film(path: Path, topic: str | None) -> Film:
     """The pictures on one topic of a ROS 1 or ROS 2 bag. Raises ImportingError."""
     with needs_extra("ros", ImportingError):
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
+        from rosbags.highlevel import AnyReader
 
     def opened() -> Any:
-        return AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        return AnyReader([path], default_typestore=_typestore("LATEST"))
 
-    try:
+    with opened() as bag:
+        encoding = "cdr" if bag.is2 else "ros1"
+        types = {each.topic: f"{each.msgtype} in {encoding}" for each in bag.connections}
+        if not bag.is2:
+            types = {name: kind.replace("/msg/", "/") for name, kind in types.items()}
+    chosen = _chosen(types, topic, path)
+
+    def messages() -> Iterator[_Stamped]:
         with opened() as bag:
-            types = {each.topic: each.msgtype.replace("/msg/", "/") for each in bag.connections}
-        chosen = _chosen(types, topic, path)
+            wanted = [each for each in bag.connections if each.topic == chosen]
+            for connection, arrival_ns, data in bag.messages(connections=wanted):
+                yield _ros(bag.deserialize(data, connection.msgtype), arrival_ns)
 
-        def messages() -> Iterator[_Stamped]:
-            with opened() as bag:
-                wanted = [each for each in bag.connections if each.topic == chosen]
-                for connection, arrival_ns, data in bag.messages(connections=wanted):
-                    yield _ros(bag.deserialize(data, connection.msgtype), arrival_ns)
-
-        return _film(path, chosen, messages)
-    except AnyReaderError as error:
-        raise ImportingError(f"{path} cannot be read as a ROS bag: {error}") from None
+    return _film(path, chosen, messages)
 
 
 def _chosen(types: dict[str, str], topic: str | None, path: Path) -> str:
@@ -106,8 +107,11 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
     stamps, arrivals, lossy = [], [], False
     for each in messages():
         first = each.picture if first is None else first
-        if each.picture.shape != first.shape:
-            raise ImportingError(f"{path}: pictures on {topic} change their size from {first.shape}: give one film")
+        if each.picture.shape != first.shape or each.picture.dtype != first.dtype:
+            raise ImportingError(
+                f"{path}: pictures on {topic} change from {first.dtype} of shape {first.shape} to {each.picture.dtype}"
+                f" of shape {each.picture.shape}: a film has frames of one size and type"
+            )
         stamps.append(each.time_ns)
         arrivals.append(each.arrival_ns)
         lossy |= each.lossy
@@ -117,14 +121,15 @@ def _film(path: Path, topic: str, messages: Callable[[], Iterator[_Stamped]]) ->
     times = np.array(stamps if stamped else arrivals, dtype=np.int64)
     return Film(
         name=f"{path.name}:{topic}", shape=(int(first.shape[0]), int(first.shape[1])), dtype=first.dtype,
-        count=len(times), frames=lambda: (each.picture for each in messages()), start_ns=int(times[0]), times_ns=times,
+        count=len(times), frames=lambda: (grey(each.picture, path) for each in messages()), start_ns=int(times[0]),
+        times_ns=times,
         nonlinear=_LOSSY if lossy else "",
         notes=() if stamped else ("the pictures have no times of their own: those of their arrival are used",),
     )  # fmt: skip
 
 
 def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, big_endian: bool = False) -> Frame:
-    """Pixels of a raw picture in grey, (rows, columns). Raises ImportingError."""
+    """Pixels of a raw picture, (rows, columns) or (rows, columns, 3 or 4). Raises ImportingError."""
     encoding = encoding.lower()
     if encoding not in _ENCODINGS:
         raise ImportingError(f"pictures are encoded as {encoding!r}: {', '.join(_ENCODINGS)} can be read")
@@ -136,21 +141,16 @@ def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, 
     rows = np.lib.stride_tricks.as_strided(np.frombuffer(data, np.uint8), (height, row), (step, 1))
     pixels = np.ascontiguousarray(rows).view(kind)
     if encoding in _COLOURS:
-        return np.asarray(pixels.reshape(height, width, -1)[..., :3].mean(axis=2))
+        return pixels.reshape(height, width, -1)
     return np.asarray(pixels.astype(kind.newbyteorder("=")))
 
 
-def compressed_picture(data: bytes) -> tuple[NDArray[Any], bool]:
-    """Pixels of a JPEG or PNG in grey, (rows, columns), and whether it is lossy. Raises ImportingError."""
+def compressed_picture(data: bytes) -> tuple[Frame, bool]:
+    """Pixels of a JPEG or PNG, (rows, columns) or (rows, columns, 3 or 4), and whether it is lossy."""
     from PIL import Image
 
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            lossy = image.format != "PNG"
-            pixels = np.asarray(image)
-    except (OSError, ValueError) as error:
-        raise ImportingError(f"a compressed picture cannot be read: {error}") from None
-    return (pixels[..., :3].mean(axis=2) if pixels.ndim == 3 else pixels), lossy
+    with Image.open(io.BytesIO(data)) as image:
+        return image_pixels(image), image.format != "PNG"
 
 
 def _foxglove_raw(data: bytes, arrival_ns: int) -> _Stamped:
@@ -166,20 +166,23 @@ def _foxglove_compressed(data: bytes, arrival_ns: int) -> _Stamped:
 
 def _ros1(kind: str) -> Callable[[bytes, int], _Stamped]:
     def read(data: bytes, arrival_ns: int) -> _Stamped:
-        with needs_extra("ros", ImportingError):
-            from rosbags.typesys import Stores, get_typestore
-        return _ros(get_typestore(Stores.ROS1_NOETIC).deserialize_ros1(data, f"sensor_msgs/msg/{kind}"), arrival_ns)
+        return _ros(_typestore("ROS1_NOETIC").deserialize_ros1(data, f"sensor_msgs/msg/{kind}"), arrival_ns)
 
     return read
 
 
 def _ros2(kind: str) -> Callable[[bytes, int], _Stamped]:
     def read(data: bytes, arrival_ns: int) -> _Stamped:
-        with needs_extra("ros", ImportingError):
-            from rosbags.typesys import Stores, get_typestore
-        return _ros(get_typestore(Stores.LATEST).deserialize_cdr(data, f"sensor_msgs/msg/{kind}"), arrival_ns)
+        return _ros(_typestore("LATEST").deserialize_cdr(data, f"sensor_msgs/msg/{kind}"), arrival_ns)
 
     return read
+
+
+@cache
+def _typestore(name: str) -> Any:
+    with needs_extra("ros", ImportingError):
+        from rosbags.typesys import Stores, get_typestore
+    return get_typestore(Stores[name])
 
 
 def _ros(image: Any, arrival_ns: int) -> _Stamped:
@@ -193,11 +196,11 @@ def _ros(image: Any, arrival_ns: int) -> _Stamped:
 
 
 _DECODERS: dict[str, Callable[[bytes, int], _Stamped]] = {
-    "foxglove.RawImage": _foxglove_raw,
-    "foxglove.CompressedImage": _foxglove_compressed,
-    "sensor_msgs/Image": _ros1("Image"),
-    "sensor_msgs/CompressedImage": _ros1("CompressedImage"),
-    "sensor_msgs/msg/Image": _ros2("Image"),
-    "sensor_msgs/msg/CompressedImage": _ros2("CompressedImage"),
+    "foxglove.RawImage in protobuf": _foxglove_raw,
+    "foxglove.CompressedImage in protobuf": _foxglove_compressed,
+    "sensor_msgs/Image in ros1": _ros1("Image"),
+    "sensor_msgs/CompressedImage in ros1": _ros1("CompressedImage"),
+    "sensor_msgs/msg/Image in cdr": _ros2("Image"),
+    "sensor_msgs/msg/CompressedImage in cdr": _ros2("CompressedImage"),
 }
-"""By the name of the schema."""
+"""By the schema and the encoding of its messages."""

@@ -19,7 +19,6 @@ from aolink.assembly import Frame as RigFrame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures, Truth
 from aolink.importing.film import Film, Frame
-from aolink.importing.readers import array_film
 from aolink.rig import Rig
 from aolink.wire.messages_pb2 import Applied
 
@@ -36,11 +35,11 @@ class Settings:
     """How a film is read."""
 
     rate_hz: float | None = None
-    """Frames a second, where the film does not say it."""
+    """Frames a second, where the film does not say it or is wrong."""
     exposure_s: float | None = None
-    """Exposure time of a frame, where the film does not say it."""
+    """Exposure time of a frame, where the film does not say it or is wrong."""
     start_ns: int | None = None
-    """When it began, ns since 1970, where the film does not say it."""
+    """When it began, ns since 1970, where the film does not say it or is wrong."""
     gamma: float = 1.0
     """What light was raised to the inverse of before it was stored: 2.2 for most JPEG and video."""
     scale: float | None = None
@@ -118,6 +117,8 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
     notes = []
     rate = film.rate_hz
     if settings.rate_hz is not None:
+        if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
+            notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
         rate = settings.rate_hz
     periods = np.arange(film.count, dtype=np.int64)
     if film.times_ns is not None and film.count > 1:
@@ -156,7 +157,11 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
             f"--sum {K} makes exposures of {K} fast steps without dead time: set timing.exposure_steps = {K} and"
             f" frame_period_steps = {K} in the rig file {rig.name}"
         )
-    exposure_s = settings.exposure_s or film.exposure_s
+    exposure_s = film.exposure_s
+    if settings.exposure_s is not None:
+        if exposure_s is not None and abs(exposure_s / settings.exposure_s - 1) > _CLOSE:
+            notes.append(f"the film says {exposure_s:g} s a frame; {settings.exposure_s:g} s as given are taken")
+        exposure_s = settings.exposure_s
     if exposure_s is not None and K == 1:
         own_s = timing.exposure_steps * timing.fast_step_s
         if abs(exposure_s / own_s - 1) > _CLOSE:
@@ -205,7 +210,7 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     light = Light(film, settings)
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)
-    inputs = _Inputs(film, rig)
+    inputs = _Inputs(film, rig, settings, periods)
     for group in grouped(film, settings.frames_per_exposure, periods):
         each = [light.of(frame) for frame in group.frames]
         mean = np.mean([one for one, _ in each], axis=0)
@@ -244,11 +249,6 @@ def grouped(film: Film, count: int, periods: NDArray[np.int64]) -> Iterator[Grou
     group: list[Frame] = []
     first = 0
     for k, frame in enumerate(film.frames()):
-        if frame.shape != film.shape:
-            raise ImportingError(
-                f"{film.name}: frame {k} is {frame.shape[0]} x {frame.shape[1]} pixels, those before it"
-                f" {film.shape[0]} x {film.shape[1]}: a film has frames of one size"
-            )
         if group and periods[k] != periods[k - 1] + 1:
             group = []
         if not group:
@@ -264,9 +264,8 @@ def grouped(film: Film, count: int, periods: NDArray[np.int64]) -> Iterator[Grou
 class _Inputs:
     """What the mirror held; its parked input where the film does not know."""
 
-    def __init__(self, film: Film, rig: Rig) -> None:
+    def __init__(self, film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64]) -> None:
         self._rows, self._park, self._next = film.inputs, rig.mirror.park, 0
-        self._held = 1
         if film.inputs is None:
             return
         if film.inputs.shape[1] != rig.n_inputs:
@@ -274,8 +273,17 @@ class _Inputs:
                 f"{film.name} has {film.inputs.shape[1]} inputs in each step, the rig file {rig.name} {rig.n_inputs}:"
                 " change its [plant]"
             )
+        timing, K = rig.timing, settings.frames_per_exposure
+        last = int(periods[-1]) * (timing.frame_period_steps // K)  # first step of the last frame
+        end = last + (timing.exposure_steps if K == 1 else 1)
         if len(film.inputs) == film.count:  # one for each frame, held until the next
-            self._held = rig.timing.frame_period_steps
+            steps = np.diff(periods, append=periods[-1] + 1) * (timing.frame_period_steps // K)
+            self._rows = np.repeat(film.inputs, steps, axis=0)
+        elif len(film.inputs) < end:
+            raise ImportingError(
+                f"{film.name} has inputs of {len(film.inputs)} steps: give one for each of its {film.count} frames, or"
+                f" one for each of its {end} fast steps"
+            )
 
     def until(self, end: int) -> FloatArray:
         """Inputs of the steps from where the last call ended, (steps, n_inputs)."""
@@ -283,7 +291,7 @@ class _Inputs:
         self._next = end
         if self._rows is None:
             return np.tile(self._park, (len(steps), 1))
-        return np.asarray(self._rows[np.minimum(steps // self._held, len(self._rows) - 1)])
+        return np.asarray(self._rows[steps])
 
 
 def rig_frame(
@@ -292,7 +300,8 @@ def rig_frame(
     """The frame of an exposure that begins so many of the rig's frame periods after the film."""
     timing = rig.timing
     first = period * timing.frame_period_steps
-    start_ns = round((film.start_ns or settings.start_ns or 0) + first * timing.fast_step_s * 1e9)
+    began_ns = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
+    start_ns = began_ns + round(first * timing.fast_step_s * 1e9)
     end_ns = start_ns + timing.exposure_steps * timing.fast_step_ns
     return RigFrame(
         frame_id=period + 1, first_step=first, last_step=first + timing.exposure_steps - 1, pixels=pixels, mask=mask,
@@ -307,24 +316,32 @@ def exposures(
     frames: NDArray[Any], rig: Rig, inputs: NDArray[Any] | None = None, start_steps: Sequence[int] | None = None
 ) -> Exposures:
     """Exposures of frames in memory, as `aolink.exposures` gives them."""
-    count = len(frames)
-    starts = np.arange(count) * rig.timing.frame_period_steps if start_steps is None else np.asarray(start_steps)
-    if len(starts) != count or (np.diff(starts) < rig.timing.exposure_steps).any() or (count and starts[0] < 0):
-        raise ImportingError(
-            f"start_steps must be {count} fast steps, from 0 on, each at least {rig.timing.exposure_steps} (one"
-            " exposure) after the one before"
-        )
-    film = array_film(np.asarray(frames), "frames")
-    if film.shape != rig.sensor.shape:
-        raise ImportingError(f"the frames have {film.shape} pixels, the rig {rig.name} has {rig.sensor.shape}")
     values = np.asarray(frames)
+    if values.ndim != 3 or values.dtype.kind not in "biuf" or values.shape[1:] != rig.sensor.shape or not len(values):
+        rows, columns = rig.sensor.shape
+        raise ImportingError(
+            f"the frames are {values.dtype} of shape {values.shape}, expected counts of the rig {rig.name} of shape"
+            f" (frames, {rows}, {columns})"
+        )
     full = rig.sensor.full_scale
     if not np.isfinite(values).all() or values.min() < 0 or values.max() > full or (values != np.rint(values)).any():
         raise ImportingError(f"frames are counts of the rig's camera: whole numbers from 0 to {full}")
+    count, timing = len(values), rig.timing
+    starts = np.arange(count) * timing.frame_period_steps if start_steps is None else np.asarray(start_steps)
+    if (
+        starts.shape != (count,) or starts.dtype.kind not in "iu" or starts[0] < 0
+        or (np.diff(starts.astype(np.int64)) < timing.exposure_steps).any()
+    ):  # fmt: skip
+        raise ImportingError(
+            f"start_steps must be {count} fast steps, from 0 on, each at least {timing.exposure_steps} (one exposure)"
+            " after the one before"
+        )
     end = int(starts[-1]) + rig.timing.exposure_steps
     held = np.tile(rig.mirror.park, (end, 1)) if inputs is None else np.asarray(inputs, dtype=np.float64)
     if held.ndim != 2 or held.shape[1] != rig.n_inputs or len(held) < end:
         raise ImportingError(f"inputs must be ({end} fast steps or more, {rig.n_inputs}), found {held.shape}")
+    if not np.isfinite(held).all():
+        raise ImportingError("inputs must be finite numbers")
     assembler, made = Assembler(rig), list[Exposure]()
     mask = np.ones(rig.sensor.shape, dtype=np.bool_)
     step = 0

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.errors import ImportingError
+
 Frame = NDArray[np.generic]
 
 
@@ -39,3 +41,25 @@ class Film:
     """Why pixel values may not be proportional to light; empty where nothing speaks against it."""
     notes: tuple[str, ...] = field(default=())
     """What a user should know about how it was read."""
+
+
+def grey(picture: Frame, what: object) -> Frame:
+    """A picture (rows, columns) as it is, one with three or four channels as the mean of its colours.
+
+    The mean is proportional to light where the colours are. A pixel saturated in one colour is saturated.
+
+    Raises
+    ------
+    ImportingError
+        It is neither.
+    """
+    if picture.ndim == 3 and picture.shape[2] in (3, 4):
+        colours = picture[..., :3]
+        mean = np.asarray(colours.mean(axis=2, dtype=np.float64))
+        if colours.dtype.kind in "iu":
+            most = np.iinfo(colours.dtype.name).max
+            mean[(colours == most).any(axis=2)] = most
+        return mean
+    if picture.ndim != 2 or picture.dtype.kind not in "biuf":
+        raise ImportingError(f"{what} holds {picture.dtype} of shape {picture.shape}, expected a picture")
+    return picture

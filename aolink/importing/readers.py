@@ -7,10 +7,13 @@ start is taken from it; nothing is guessed.
 from __future__ import annotations
 
 import gzip
+import logging
 import math
 import mmap
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -18,15 +21,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.errors import FrameError, ImportingError, RestorationError
+from aolink.errors import AolinkError, FrameError, ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film, Frame
+from aolink.importing.film import Film, Frame, grey
 from aolink.optics.frame_file import parse_fits_array
-from aolink.optics.pictures import read_picture
+from aolink.optics.pictures import image_pixels, read_picture
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy", ".fits", ".fit", ".pgm")
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".gif", ".wmv")
 _LOSSY_TIFF = (6, 7)  # JPEG
+_PILLOW_TIFF = (5, *_LOSSY_TIFF)  # LZW and JPEG, which tifffile reads with a further package only
 _COMPRESSED = "JPEG and video hold light after a gamma curve and lossy compression"
 
 
@@ -51,20 +55,55 @@ def open_film(source: str | Path, topic: str | None = None) -> Film:
         raise ImportingError(f"cannot read {path}: there is no such file or folder")
     suffix = "".join(path.suffixes[-2:]) if path.suffix == ".gz" else path.suffix
     suffix = suffix.lower().removesuffix(".gz")
-    try:
+    with _one_error(path):
         if path.is_dir():
-            return _bag(path, topic) if (path / "metadata.yaml").exists() else _folder(path)
-        if suffix in _READERS:
-            return _READERS[suffix](path)
-        if suffix in (".mcap", ".bag"):
-            return _mcap(path, topic) if suffix == ".mcap" else _bag(path, topic)
-        if suffix in _VIDEOS:
-            return _video(path)
-    except (OSError, EOFError) as error:
-        what = getattr(error, "strerror", None) or str(error)
-        raise ImportingError(f"cannot read {path}: {what.lower()}") from None
-    known = ", ".join([*_READERS, ".mcap", ".bag", *_VIDEOS])
-    raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
+            film = _bag(path, topic) if (path / "metadata.yaml").exists() else _folder(path)
+        elif suffix in _READERS:
+            film = _READERS[suffix](path)
+        elif suffix in (".mcap", ".bag"):
+            film = _mcap(path, topic) if suffix == ".mcap" else _bag(path, topic)
+        elif suffix in _VIDEOS:
+            film = _video(path)
+        else:
+            known = ", ".join([*_READERS, ".mcap", ".bag", *_VIDEOS])
+            raise ImportingError(f"{path} is no kind of film that is known: give {known} or a folder of pictures")
+    return replace(film, frames=lambda: _checked(film, path))
+
+
+@contextmanager
+def _one_error(path: Path) -> Iterator[None]:
+    """Whatever another package raises on a file that is damaged becomes an ImportingError of one line."""
+    try:
+        yield
+    except AolinkError as error:
+        named = str(path) in str(error)
+        if isinstance(error, ImportingError) and named:
+            raise
+        raise ImportingError(str(error) if named else f"{path}: {error}") from error
+    except OSError as error:
+        raise ImportingError(f"cannot read {path}: {error.strerror or _first_line(error)}") from error
+    except Exception as error:
+        raise ImportingError(f"{path} is damaged, or not what its name says: {_first_line(error)}") from error
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), "") or type(error).__name__
+
+
+def _checked(film: Film, path: Path) -> Iterator[Frame]:
+    """The frames of a film, of the size and as many as it announced."""
+    count = 0
+    with _one_error(path):
+        for frame in film.frames():
+            if frame.shape != film.shape:
+                raise ImportingError(
+                    f"{path}: frame {count} is {frame.shape[0]} x {frame.shape[1]} pixels, those before it"
+                    f" {film.shape[0]} x {film.shape[1]}: a film has frames of one size"
+                )
+            yield frame
+            count += 1
+    if count != film.count:
+        raise ImportingError(f"{path} announces {film.count} frames and has {count}: it is damaged")
 
 
 def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
@@ -83,16 +122,22 @@ def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
         raise ImportingError(
             f"{name} holds {frames.dtype} of shape {frames.shape}, expected numbers as (frames, rows, columns)"
         )
+    times = known.get("times_ns")
+    if times is not None and times.shape != (len(frames),):
+        raise ImportingError(f"{name} has {len(frames)} frames and times of shape {times.shape}: give one for each")
     shape = (int(frames.shape[1]), int(frames.shape[2]))
     return Film(name=name, shape=shape, dtype=frames.dtype, count=len(frames), frames=lambda: iter(frames), **known)
 
 
 def _npy(path: Path) -> Film:
-    return array_film(_loaded(path, mmap_mode="r"), path.name)
+    with path.open("rb") as file:
+        np.lib.format.read_magic(file)  # `load` takes archives and pickles by this name, too
+    return array_film(np.load(path, mmap_mode="r", allow_pickle=False), path.name)
 
 
 def _npz(path: Path) -> Film:
-    arrays = _loaded(path)
+    with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
+        arrays = {name: np.asarray(archive[name]) for name in archive}
     stacks = [name for name in arrays if name == "frames"] or [n for n in arrays if arrays[n].ndim in (3, 4)]
     if len(stacks) != 1:
         have = ", ".join(f"{name} {arrays[name].shape}" for name in arrays) or "nothing"
@@ -100,49 +145,80 @@ def _npz(path: Path) -> Film:
     known: dict[str, Any] = {}
     for key in ("rate_hz", "exposure_s"):
         if key in arrays:
-            known[key] = float(arrays[key])
+            known[key] = float(_numbers(path, arrays, key, ndims=(0,)))
+            if known[key] <= 0:
+                raise ImportingError(f"{path}: {key} is {known[key]:g}, expected a number above 0")
     if "times_s" in arrays:
-        known["times_ns"] = np.round(np.asarray(arrays["times_s"], dtype=np.float64) * 1e9).astype(np.int64)
+        known["times_ns"] = np.round(_numbers(path, arrays, "times_s", ndims=(1,)) * 1e9).astype(np.int64)
     if "inputs" in arrays:
-        known["inputs"] = np.atleast_2d(np.asarray(arrays["inputs"], dtype=np.float64).T).T
+        inputs = _numbers(path, arrays, "inputs", ndims=(1, 2))
+        known["inputs"] = inputs[:, None] if inputs.ndim == 1 else inputs
     return array_film(arrays[stacks[0]], path.name, **known)
 
 
-def _loaded(path: Path, **options: Any) -> Any:
-    try:
-        return np.load(path, allow_pickle=False, **options)
-    except (ValueError, EOFError) as error:
-        raise ImportingError(f"{path} is damaged or not NumPy's: {error}") from None
+def _numbers(path: Path, arrays: dict[str, NDArray[Any]], key: str, ndims: tuple[int, ...]) -> NDArray[np.float64]:
+    found = arrays[key]
+    if found.ndim not in ndims or found.dtype.kind not in "iuf" or not np.isfinite(found).all():
+        axes = " or ".join(map(str, ndims))
+        raise ImportingError(f"{path}: {key} is {found.dtype} of shape {found.shape}, expected numbers of {axes} axes")
+    return np.asarray(found, dtype=np.float64)
 
 
 def _tiff(path: Path) -> Film:
     with needs_extra("tiff", ImportingError):
         import tifffile
-    try:
-        with tifffile.TiffFile(path) as file:
-            series = file.series[0]
-            shape, dtype = series.shape, np.dtype(series.dtype)
-            interval = (file.imagej_metadata or {}).get("finterval")
-            lossy = int(file.pages.first.compression) in _LOSSY_TIFF
-        if len(shape) == 2:
-            shape = (1, *shape)
-        if len(shape) != 3:
-            raise ImportingError(f"{path} holds {dtype} of shape {shape}, expected (frames, rows, columns) in grey")
-    except (tifffile.TiffFileError, ValueError, IndexError) as error:
-        raise ImportingError(f"{path} is damaged or no TIFF file: {error}") from None
+    with _complaints(path), tifffile.TiffFile(path) as file:
+        series = file.series[0]
+        axes, shape, dtype = series.axes, series.shape, np.dtype(series.dtype)
+        interval = (file.imagej_metadata or {}).get("finterval")
+        compression = int(file.pages.first.compression)
+    colours = axes.endswith("S")  # samples of a pixel
+    size = shape[:-1] if colours else shape
+    size = (1, *size) if len(size) == 2 else size
+    if len(size) != 3 or "S" in axes[:-1]:
+        raise ImportingError(f"{path} holds {dtype} of shape {shape}, expected (frames, rows, columns)")
 
-    def frames() -> Iterator[Frame]:
+    def pictures() -> Iterator[Frame]:
+        if compression in _PILLOW_TIFF:
+            from PIL import Image, ImageSequence
+
+            with Image.open(path) as image:
+                yield from map(image_pixels, ImageSequence.Iterator(image))
+            return
         with tifffile.TiffFile(path) as file:
             pages = file.series[0].pages
-            if len(pages) == shape[0]:
-                yield from (page.asarray() for page in pages if page is not None)
+            if len(pages) == size[0]:
+                for page in pages:
+                    if page is None or math.prod(page.chunked) > len(page.dataoffsets):  # it would count them all
+                        raise ImportingError(f"{path} is damaged: a page lacks some of its pixels")
+                    yield page.asarray()
             else:  # ImageJ keeps a large stack as one page
-                yield from file.series[0].asarray().reshape(shape)
+                yield from file.series[0].asarray().reshape(size[0], *shape[-3 if colours else -2 :])
 
     return Film(
-        name=path.name, shape=(shape[1], shape[2]), dtype=dtype, count=shape[0], frames=frames,
-        rate_hz=1 / float(interval) if interval else None, nonlinear=_COMPRESSED if lossy else "",
+        name=path.name, shape=(size[1], size[2]), dtype=dtype, count=size[0],
+        frames=lambda: (grey(picture, path) for picture in pictures()),
+        rate_hz=1 / float(interval) if interval else None,
+        nonlinear=_COMPRESSED if compression in _LOSSY_TIFF else "",
     )  # fmt: skip
+
+
+@contextmanager
+def _complaints(path: Path) -> Iterator[None]:
+    """Take what tifffile only logs, that a stack is cut off, as an error; damage to a tag is none to the pictures."""
+    said: list[str] = []
+    listener = logging.Handler(logging.ERROR)
+    listener.emit = lambda record: said.append(record.getMessage())  # type: ignore[method-assign]
+    log = logging.getLogger("tifffile")
+    log.addHandler(logging.NullHandler())  # later, too, nothing goes to the terminal
+    log.addHandler(listener)
+    try:
+        yield
+    finally:
+        log.removeHandler(listener)
+    damage = [each for each in said if "TiffTag" not in each]
+    if damage:
+        raise ImportingError(f"{path} is damaged: {damage[0].splitlines()[0]}")
 
 
 def _folder(path: Path) -> Film:
@@ -150,47 +226,45 @@ def _folder(path: Path) -> Film:
     if not files:
         raise ImportingError(f"{path} holds no pictures ({', '.join(_PICTURES)})")
     first = _picture(files[0])
+    rows, columns = grey(first, files[0]).shape
 
     def frames() -> Iterator[Frame]:
         for file in files:
             picture = _picture(file)
-            if picture.shape != first.shape:
+            if picture.shape[:2] != first.shape[:2] or picture.dtype != first.dtype:
                 raise ImportingError(
-                    f"{file} is {picture.shape[0]} x {picture.shape[1]} pixels, the pictures before it are"
-                    f" {first.shape[0]} x {first.shape[1]}: a film has frames of one size"
+                    f"{file} has {_described(picture)}, those before it have {_described(first)}: a film has frames of"
+                    " one size and type"
                 )
-            yield picture
+            yield grey(picture, file)
 
     lossy = any(each.suffix.lower() in (".jpg", ".jpeg") for each in files)
     return Film(
-        name=path.name, shape=(int(first.shape[0]), int(first.shape[1])), dtype=first.dtype, count=len(files),
+        name=path.name, shape=(rows, columns), dtype=first.dtype, count=len(files),
         frames=frames, nonlinear=_COMPRESSED if lossy else "",
         notes=(f"pictures in the order of their names, {files[0].name} to {files[-1].name}",),
     )  # fmt: skip
 
 
-def _number_order(path: Path) -> list[Any]:
+def _number_order(path: Path) -> tuple[list[tuple[str, int]], str]:
     """frame2 comes before frame10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+    parts = re.findall(r"([^0-9]*)([0-9]*)", path.name)
+    return [(text, int(digits or 0)) for text, digits in parts], path.name
 
 
 def _picture(path: Path) -> Frame:
+    """A picture as it is stored, (rows, columns) or (rows, columns, 3 or 4)."""
+    if path.suffix.lower() not in (".fits", ".fit"):
+        return read_picture(path)
     try:
-        if path.suffix.lower() in (".fits", ".fit"):
-            _, stored, scale, zero = parse_fits_array(path.read_bytes())
-            return _grey(_values(stored, scale, zero), path)
-        return _grey(read_picture(path), path)
-    except (RestorationError, FrameError) as error:
+        _, stored, scale, zero = parse_fits_array(path.read_bytes())
+    except FrameError as error:
         raise ImportingError(f"{path}: {error}") from None
+    return _values(stored, scale, zero)
 
 
-def _grey(picture: Frame, what: object) -> Frame:
-    """Colours become their mean, which is proportional to light where they are; (rows, columns)."""
-    if picture.ndim == 3 and picture.shape[2] in (3, 4):
-        return np.asarray(picture[..., :3].mean(axis=2))
-    if picture.ndim != 2 or picture.dtype.kind not in "biuf":
-        raise ImportingError(f"{what} holds {picture.dtype} of shape {picture.shape}, expected a picture")
-    return picture
+def _described(picture: Frame) -> str:
+    return f"{' x '.join(map(str, picture.shape[:2]))} pixels of {picture.dtype}"
 
 
 def _values(stored: NDArray[Any], scale: float, zero: float) -> NDArray[Any]:
@@ -249,16 +323,24 @@ def _date(text: str | None) -> int | None:
 def _video(path: Path) -> Film:
     with needs_extra("video", ImportingError):
         import imageio.v3 as iio
-    try:
-        about = iio.immeta(path)
-        first = next(iio.imiter(path))
-        count = sum(1 for _ in iio.imiter(path))
-    except (OSError, ValueError, RuntimeError, StopIteration, IndexError) as error:
-        raise ImportingError(f"{path} cannot be read as a video: {str(error).splitlines()[0]}") from None
-    rate = about.get("fps") or (1000 / about["duration"] if about.get("duration") and path.suffix == ".gif" else None)
+        import imageio_ffmpeg  # noqa: F401 # imageio would say only that it found nothing that reads the file
+
+    def pictures() -> Iterator[Frame]:
+        with iio.imopen(path, "r") as file:
+            yield from file.iter()
+
+    with iio.imopen(path, "r") as file:
+        about = file.metadata()
+    first, count = None, 0
+    for picture in pictures():
+        first, count = picture, count + 1
+    if first is None:
+        raise ImportingError(f"{path} has no pictures")
+    is_gif = path.suffix.lower() == ".gif"
+    rate = 1000 / about["duration"] if is_gif and about.get("duration") else about.get("fps")
     return Film(
         name=path.name, shape=(int(first.shape[0]), int(first.shape[1])), dtype=first.dtype, count=count,
-        frames=lambda: (_grey(frame, path) for frame in iio.imiter(path)), rate_hz=float(rate) if rate else None,
+        frames=lambda: (grey(picture, path) for picture in pictures()), rate_hz=float(rate) if rate else None,
         nonlinear=_COMPRESSED,
     )  # fmt: skip
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -27,9 +27,11 @@ _AT_ONCE = 65_536
 
 def import_film(
     film: Film, rig: Rig, settings: Settings, path: Path, *, overwrite: bool = False,
-    progress: Callable[[int], None] = lambda exposures: None,
+    sources: Iterable[Path] = (), progress: Callable[[int], None] = lambda exposures: None,
 ) -> Account:  # fmt: skip
     """Write the exposures of a film as a recording of a rig. The same film and settings give the same bytes.
+
+    ``sources`` are files that it never replaces.
 
     Raises
     ------
@@ -38,7 +40,7 @@ def import_film(
     RecordingError
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
-    check_target(path, overwrite=overwrite, error=RecordingError)
+    check_target(path, overwrite=overwrite, sources=sources, error=RecordingError)
     account = Account()
     made = imported(film, rig, settings, account)
     first = next(made, None)  # what is wrong with the whole shows before the file is made
@@ -55,7 +57,7 @@ def import_film(
         "mirror": "none" if film.inputs is None else f"imported from {film.name}",
         "import_settings": str(settings),
     }
-    with writing(path, overwrite=overwrite, error=RecordingError) as partial:
+    with writing(path, overwrite=overwrite, sources=sources, error=RecordingError) as partial:
         file = McapFile(partial, WriteOptions(), descriptor=open_unfinished(partial))
         try:
             begin_recording(file, rig, facts, first.frame.host_start_ns, {})

@@ -25,10 +25,7 @@ def aot_film(path: Path) -> Film:
     """
     with needs_extra("aot", ImportingError):
         import aotpy
-    try:
-        system = aotpy.AOSystem.read_from_file(path)
-    except Exception as error:  # whatever another package raises on a file that is not its own
-        raise ImportingError(f"{path} cannot be read as AOT telemetry: {error}") from None
+    system = aotpy.AOSystem.read_from_file(path)
     pictured = [each for each in system.wavefront_sensors if each.detector and each.detector.pixel_intensities]
     if not pictured:
         slopes = [each.uid for each in system.wavefront_sensors if each.measurements]
@@ -45,7 +42,9 @@ def aot_film(path: Path) -> Film:
         known["start_ns"] = round(system.date_beginning.timestamp() * 1e9)
     notes = [f"pictures of the wavefront sensor {sensor.uid}"]
     commands = [
-        each.commands.data for each in system.loops if each.commands is not None and each.input_sensor is sensor
+        each.commands.data
+        for each in system.loops
+        if isinstance(each, aotpy.ControlLoop) and each.commands is not None and each.input_sensor is sensor
     ]
     if commands and all(len(each) == len(pictures.data) for each in commands):
         known["inputs"] = np.hstack([np.asarray(each, np.float64).reshape(len(each), -1) for each in commands])

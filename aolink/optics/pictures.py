@@ -5,13 +5,16 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RestorationError
 from aolink.files import writing
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 
 def read_picture(path: Path) -> NDArray[Any]:
@@ -30,15 +33,20 @@ def read_picture(path: Path) -> NDArray[Any]:
 
     try:
         with Image.open(path) as image:
-            if image.mode in ("1", "LA"):
-                return np.asarray(image.convert("L"))
-            if image.mode not in ("L", "F", "I", "RGB", "RGBA") and not image.mode.startswith("I;16"):
-                return np.asarray(image.convert("RGB"))
-            return np.asarray(image)
+            return image_pixels(image)
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise RestorationError(
             f"{path} cannot be read as a picture ({error}): give a .png, .tif, .jpg or .npy"
         ) from error
+
+
+def image_pixels(image: Image.Image) -> NDArray[Any]:
+    """Pixels of an image of Pillow's, as `read_picture` gives them."""
+    if image.mode in ("1", "LA"):
+        return np.asarray(image.convert("L"))
+    if image.mode not in ("L", "F", "I", "RGB", "RGBA") and not image.mode.startswith("I;16"):
+        return np.asarray(image.convert("RGB"))
+    return np.asarray(image)
 
 
 def finite_pixels(picture: NDArray[Any]) -> NDArray[np.bool_] | None:

@@ -1,0 +1,175 @@
+"""`aolink import` as a process: what it writes, what it says, and how it refuses."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.recording.reader import Recording
+from tests.importing import others
+from tests.importing.others import KINDS, numbers
+from tests.importing.rigs import small_rig
+
+FRAMES = np.minimum(numbers(np.uint8, 7, 8, 8), 254)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> str:
+    """A rig file of 50 frames/s of 8 x 8 pixels."""
+    (tmp_path / "rig.toml").write_text(small_rig().toml)
+    return "rig.toml"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_film_of_every_kind_becomes_a_recording(kind, aolink, rig, tmp_path):
+    source = KINDS[kind](tmp_path, FRAMES)
+    made = aolink("import", source, "-o", "session.mcap", "--rig", rig, "--rate", "50", "--exposure", "0.01")
+    assert (made.returncode, made.stderr) == (0, "")
+    assert made.stdout.endswith("session.mcap: 7 exposures of 7 frames\n")
+    pixels = [each.pixels for each in Recording(tmp_path / "session.mcap")]
+    np.testing.assert_array_equal(pixels, FRAMES.astype(int) * 256)
+
+
+def test_the_recording_is_one_like_any_other(aolink, rig, tmp_path):
+    source = others.written_npy(tmp_path, FRAMES)
+    start = ["--start", "2026-09-21T10:30:00.25"]
+    assert aolink("import", source, "-o", "a.mcap", "--rig", rig, "--rate", "50", *start).returncode == 0
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.complete
+    assert next(iter(recording)).host_start_ns == 1_789_986_600_250_000_000
+    for command in (["info", "a.mcap"], ["estimate", "a.mcap", "-e", "o1", "-o", "b.mcap"], ["compare", "b.mcap"]):
+        done = aolink(*command)
+        assert (done.returncode, done.stderr) == (0, ""), command
+    assert len(Recording(tmp_path / "b.mcap").estimates("o1")) == 7
+
+
+def test_notes_and_warnings_are_printed(aolink, rig, tmp_path):
+    frames = FRAMES.copy()
+    frames[3, :2, :2] = 255
+    source = others.written_npy(tmp_path, frames)
+    made = aolink("import", source, "-o", "a.mcap", "--rig", rig)
+    assert made.stdout.splitlines() == [
+        "note: nothing says the frame rate: that of the rig file is assumed, 50 frames/s",
+        "warning: 4 pixels (0.89%) are saturated in the film: they are masked",
+        "a.mcap: 7 exposures of 7 frames",
+    ]
+    made = aolink("import", source, "-o", "b.mcap", "--rig", rig, "--scale", "300", "--json")
+    said = json.loads(made.stdout)
+    assert said["out"] == "b.mcap"
+    assert (said["frames"], said["exposures"], said["pixels"], said["saturated"]) == (7, 7, 448, 4)
+    assert said["clipped"] == np.count_nonzero((frames > 65_535 / 300) & (frames < 255))
+
+
+def test_frames_are_summed(aolink, tmp_path):
+    (tmp_path / "rig.toml").write_text(small_rig(3, 3).toml)
+    source = others.written_npy(tmp_path, FRAMES)
+    made = aolink("import", source, "-o", "a.mcap", "--rig", "rig.toml", "--sum", "3", "--rate", "1000")
+    assert made.stdout == "a.mcap: 2 exposures of 6 frames\n"
+    first = next(iter(Recording(tmp_path / "a.mcap")))
+    np.testing.assert_array_equal(first.pixels, np.rint(FRAMES[:3].mean(axis=0) * 256))
+
+
+def test_one_of_two_topics_is_imported(aolink, rig, tmp_path):
+    topics = {name: [others.foxglove_raw(each, "mono8") for each in FRAMES] for name in ("/a", "/b")}
+    source = others.write_mcap(tmp_path / "two.mcap", topics)
+    refused = aolink("import", source, "-o", "a.mcap", "--rig", rig)
+    assert refused.returncode == 11
+    assert "say which with --topic" in refused.stderr
+    assert aolink("import", source, "-o", "a.mcap", "--rig", rig, "--topic", "/b").returncode == 0
+
+
+def test_a_target_is_replaced_only_on_request_and_never_the_source(aolink, rig, tmp_path):
+    source = others.written_mcap(tmp_path, FRAMES)
+    before = source.read_bytes()
+    taken = aolink("import", source, "-o", source, "--rig", rig, "--overwrite")
+    assert taken.returncode == 5
+    assert "is what the new file is made from" in taken.stderr
+    shutil.copy(source, tmp_path / "copy.mcap")
+    taken = aolink("import", source, "-o", "copy.mcap", "--rig", rig)
+    assert taken.returncode == 5
+    assert "--overwrite" in taken.stderr
+    assert (tmp_path / "copy.mcap").read_bytes() == source.read_bytes() == before
+    assert aolink("import", source, "-o", "copy.mcap", "--rig", rig, "--overwrite").returncode == 0
+    assert len(list(Recording(tmp_path / "copy.mcap"))) == 7
+
+
+def mixed(folder: Path) -> Path:
+    """Pictures of two sizes."""
+    path = others.write_pictures(folder / "film", FRAMES)
+    others.write_pictures(folder / "more", numbers(np.uint8, 1)).joinpath("frame5.png").rename(path / "frame99.png")
+    return path
+
+
+def damaged(folder: Path) -> Path:
+    """A film whose end is missing."""
+    path = others.written_npz(folder, FRAMES)
+    path.write_bytes(path.read_bytes()[:-200])
+    return path
+
+
+def of_words(folder: Path) -> Path:
+    (folder / "film.mp4").write_text("Dear reader, this is no film.\n")
+    return folder / "film.mp4"
+
+
+def in_words(folder: Path) -> Path:
+    (folder / "film.docx").write_text("Dear reader, this is no film.\n")
+    return folder / "film.docx"
+
+
+def of_other_size(folder: Path) -> Path:
+    return others.written_npy(folder, numbers(np.uint8))
+
+
+def of_slopes(folder: Path) -> Path:
+    return others.write_aot(folder / "film.fits", None)
+
+
+def good(folder: Path) -> Path:
+    return others.written_npy(folder, FRAMES)
+
+
+def timed(folder: Path) -> Path:
+    """Frames whose times and whose rate contradict each other."""
+    np.savez(folder / "film.npz", frames=FRAMES, rate_hz=50, times_s=np.arange(7) / 40)
+    return folder / "film.npz"
+
+
+def missing(folder: Path) -> Path:
+    return folder / "film.tif"
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "code", "says"),
+    [
+        (missing, [], 11, "there is no such file or folder"),
+        (in_words, [], 11, "is no kind of film that is known"),
+        (of_words, [], 11, "film.mp4"),
+        (damaged, [], 11, "is damaged, or not what its name says"),
+        (mixed, [], 11, "frame99.png has 6 x 9 pixels of uint8, those before it have 8 x 8 pixels"),
+        (of_other_size, [], 11, "frames of 6 x 9 pixels, the rig file single-lenslet describes 8 x 8"),
+        (of_slopes, [], 11, "has slopes of SH, but no pictures"),
+        (timed, [], 11, "50 frames/s contradict its times, which say 40"),
+        (good, ["--rate", "60"], 11, "change its [timing], or give the right --rate"),
+        (good, ["--rate", "0"], 11, "--rate 0 must be above 0"),
+        (good, ["--exposure", "0.02"], 11, "change timing.exposure_steps, or give the right --exposure"),
+        (good, ["--start", "yesterday"], 11, "--start yesterday is no date: give one such as"),
+        (good, ["--sum", "9"], 11, "--sum 9 makes exposures of 9 fast steps"),
+        (good, ["--at", "here"], 11, "--at here is no place: give X,Y in pixels"),
+        (good, ["--track", "3"], 11, "--track 3 needs a rig file with 3 spots"),
+        (good, ["-o", "nowhere/a.mcap"], 5, "there is no folder nowhere; make it first"),
+        (good, ["--rig", "none.toml"], 2, "none.toml"),
+    ],
+)
+def test_bad_input_gets_one_line_and_leaves_nothing(source, options, code, says, aolink, rig, tmp_path):
+    path = source(tmp_path)
+    refused = aolink("import", path, "-o", "a.mcap", "--rig", rig, *options)
+    assert refused.returncode == code
+    assert says in refused.stderr.replace("\n", " ")
+    assert refused.stderr.count("\n") == 1
+    assert refused.stdout == ""
+    assert not list(tmp_path.rglob("*.mcap")) + list(tmp_path.rglob("*.partial"))

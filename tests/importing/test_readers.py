@@ -1,0 +1,403 @@
+"""Films that somebody else's writer wrote, read back: pixel by pixel, with what their files say of their times."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import tifffile
+from astropy.io import fits
+from numpy.typing import NDArray
+from PIL import Image
+
+from aolink.errors import ImportingError
+from aolink.importing.film import Film
+from aolink.importing.readers import open_film
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from tests.importing import others
+from tests.importing.others import KINDS, ROS1, ROS2, STAMPS, START_NS, numbers, refused, smooth
+
+
+def check(film: Film, frames: NDArray[Any], dtype: Any = None) -> None:
+    """The film has these frames, bit for bit, and gives them again when it is asked again."""
+    assert film.count == len(frames)
+    assert film.shape == frames.shape[1:]
+    assert film.dtype.newbyteorder("=") == np.dtype(dtype or frames.dtype)
+    for _ in range(2):
+        np.testing.assert_array_equal(np.array(list(film.frames())), frames)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frames_of_every_kind_are_read_bit_for_bit(kind, tmp_path):
+    frames = numbers(np.uint8)
+    check(open_film(KINDS[kind](tmp_path, frames)), frames)
+
+
+@pytest.mark.parametrize("dtype", [np.bool_, np.uint16, np.int32, np.float32, np.float64])
+def test_npy_keeps_its_type(dtype, tmp_path):
+    frames = numbers(np.uint8) > 99 if dtype is np.bool_ else numbers(dtype)
+    film = open_film(others.written_npy(tmp_path, frames))
+    check(film, frames)
+    assert (film.rate_hz, film.exposure_s, film.start_ns, film.times_ns, film.nonlinear) == (None, None, None, None, "")
+
+
+def test_npz_says_what_it_knows(tmp_path):
+    frames, times = numbers(np.uint16), np.arange(7) * 0.02 + 3
+    inputs = np.linspace(0, 1, 14).reshape(7, 2)
+    np.savez(
+        tmp_path / "a.npz", film=frames, rate_hz=50, exposure_s=0.015, times_s=times, inputs=inputs, gain=np.eye(3)
+    )  # fmt: skip
+    film = open_film(tmp_path / "a.npz")
+    check(film, frames)
+    assert film.rate_hz == 50
+    assert film.exposure_s == 0.015
+    np.testing.assert_array_equal(film.times_ns, 3_000_000_000 + np.arange(7) * 20_000_000)
+    np.testing.assert_array_equal(film.inputs, inputs)
+
+
+def test_one_input_needs_no_second_axis(tmp_path):
+    np.savez(tmp_path / "a.npz", frames=numbers(np.uint8), inputs=np.arange(7))
+    inputs = open_film(tmp_path / "a.npz").inputs
+    np.testing.assert_array_equal(inputs, np.arange(7.0)[:, None])
+
+
+def test_films_of_several_spots_stand_side_by_side(tmp_path):
+    spots = np.stack([numbers(np.uint8, seed=k) for k in range(3)])
+    np.savez(tmp_path / "a.npz", frames=spots)
+    film = open_film(tmp_path / "a.npz")
+    check(film, np.concatenate(list(spots), axis=2))
+    assert "3 spots stand side by side" in film.notes[0]
+
+
+def test_of_several_stacks_the_one_called_frames_is_the_film(tmp_path):
+    frames, more = numbers(np.uint8), numbers(np.uint8, seed=2)
+    np.savez(tmp_path / "a.npz", darks=more, frames=frames)
+    check(open_film(tmp_path / "a.npz"), frames)
+    np.savez(tmp_path / "b.npz", darks=more, light=frames)
+    text = refused(tmp_path / "b.npz")
+    assert "darks (7, 6, 9), light (7, 6, 9)" in text
+    assert "name the array with the film 'frames'" in text
+
+
+@pytest.mark.parametrize(
+    ("arrays", "says"),
+    [
+        ({"times_s": np.arange(6)}, "7 frames and times of shape (6,)"),
+        ({"times_s": np.array(["now"] * 7)}, "times_s is <U3 of shape (7,)"),
+        ({"times_s": np.full(7, np.nan)}, "times_s is float64"),
+        ({"rate_hz": np.array([50, 60])}, "rate_hz is int64 of shape (2,)"),
+        ({"rate_hz": 0}, "rate_hz is 0, expected a number above 0"),
+        ({"exposure_s": "long"}, "exposure_s is <U4"),
+        ({"inputs": np.zeros((7, 1, 1))}, "inputs is float64 of shape (7, 1, 1)"),
+        ({"frames": np.zeros((3, 4))}, "shape (3, 4), expected numbers as (frames, rows, columns)"),
+        ({"frames": np.zeros((0, 4, 4))}, "shape (0, 4, 4)"),
+        ({"frames": np.zeros((3, 4, 4), complex)}, "complex128"),
+        ({"frames": np.array([None])}, "Object arrays cannot be loaded"),
+    ],
+)  # fmt: skip
+def test_wrong_arrays_are_refused(arrays, says, tmp_path):
+    np.savez(tmp_path / "a.npz", **{"frames": numbers(np.uint8), **arrays})
+    assert says in refused(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+@pytest.mark.parametrize("count", [1, 7])
+def test_tiff_stacks(dtype, count, tmp_path):
+    frames = numbers(dtype, count)
+    tifffile.imwrite(tmp_path / "a.tiff", frames, photometric="minisblack")
+    film = open_film(tmp_path / "a.tiff")
+    check(film, frames)
+    assert film.rate_hz is None
+
+
+def test_an_imagej_stack_says_its_rate(tmp_path):
+    frames = numbers(np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", frames, imagej=True, metadata={"axes": "TYX", "finterval": 0.04})
+    film = open_film(tmp_path / "a.tif")
+    check(film, frames)
+    assert film.rate_hz == pytest.approx(25)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_tiff_stack_compressed_by_lzw(dtype, tmp_path):
+    frames = numbers(dtype)
+    first, *rest = (Image.fromarray(frame) for frame in frames)
+    first.save(tmp_path / "a.tif", save_all=True, append_images=rest, compression="tiff_lzw")
+    film = open_film(tmp_path / "a.tif")
+    check(film, frames)
+    assert film.nonlinear == ""
+
+
+def test_a_tiff_stack_of_jpegs_is_no_linear_light(tmp_path):
+    frames = smooth(7, 32, 48)
+    first, *rest = (Image.fromarray(frame) for frame in frames)
+    first.save(tmp_path / "a.tif", save_all=True, append_images=rest, compression="jpeg", quality=95)
+    film = open_film(tmp_path / "a.tif")
+    assert (film.count, film.shape) == (7, (32, 48))
+    assert "JPEG" in film.nonlinear
+    assert abs(np.array(list(film.frames())) - frames.astype(float)).max() < 8
+
+
+def test_a_tiff_stack_in_colour_becomes_grey(tmp_path):
+    colours = np.stack([numbers(np.uint8, seed=k) for k in range(3)], axis=-1)
+    tifffile.imwrite(tmp_path / "a.tif", colours, photometric="rgb")
+    check(open_film(tmp_path / "a.tif"), colours.mean(axis=3), np.uint8)
+    tifffile.imwrite(tmp_path / "b.tif", colours[0], photometric="rgb")
+    check(open_film(tmp_path / "b.tif"), colours[:1].mean(axis=3), np.uint8)
+
+
+def test_a_stack_of_stacks_is_refused(tmp_path):
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((2, 3, 8, 8), np.uint8), imagej=True, metadata={"axes": "TZYX"})
+    assert "expected (frames, rows, columns)" in refused(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_pictures_are_in_the_order_of_their_numbers(dtype, tmp_path):
+    frames = numbers(dtype, count=12)
+    film = open_film(others.write_pictures(tmp_path / "film", frames))
+    check(film, frames)
+    assert film.notes == ("pictures in the order of their names, frame5.png to frame16.png",)
+
+
+def test_pictures_of_other_formats(tmp_path):
+    frames = numbers(np.uint16, count=3)
+    folder = tmp_path / "film"
+    folder.mkdir()
+    np.save(folder / "1.npy", frames[0])
+    others.write_fits(folder / "2.fits", frames[1])
+    tifffile.imwrite(folder / "3.tif", frames[2])
+    (folder / "notes.txt").write_text("no picture")
+    check(open_film(folder), frames)
+
+
+def test_a_pixel_saturated_in_one_colour_is_saturated(tmp_path):
+    colours = np.full((1, 2, 2, 3), 90, np.uint8)
+    colours[0, 0, 0] = (255, 90, 90)
+    film = open_film(others.write_pictures(tmp_path / "film", colours))
+    check(film, np.array([[[255, 90], [90, 90]]], float), np.uint8)
+
+
+def test_pictures_that_are_not_alike_are_refused(tmp_path):
+    sizes = others.write_pictures(tmp_path / "sizes", numbers(np.uint8, 3))
+    Image.fromarray(numbers(np.uint8)[0, :5]).save(sizes / "frame99.png")
+    with pytest.raises(
+        ImportingError, match=r"frame99.png has 5 x 9 pixels of uint8, those before it have 6 x 9 pixels"
+    ):
+        list(open_film(sizes).frames())
+    types = others.write_pictures(tmp_path / "types", numbers(np.uint8, 3))
+    Image.fromarray(numbers(np.uint16)[0]).save(types / "frame99.png")
+    with pytest.raises(ImportingError, match="pixels of uint16, those before it have 6 x 9 pixels of uint8"):
+        list(open_film(types).frames())
+
+
+def test_a_folder_without_pictures_is_refused(tmp_path):
+    assert "holds no pictures" in refused(tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.uint16, np.int32, np.uint32, np.float32, np.float64])
+def test_fits_cubes(dtype, tmp_path):
+    frames = numbers(dtype)
+    check(open_film(others.write_fits(tmp_path / "a.fits", frames)), frames)
+    check(open_film(others.write_fits(tmp_path / "b.fit.gz", frames)), frames)
+
+
+def test_a_fits_image_is_a_film_of_one_frame(tmp_path):
+    frames = numbers(np.uint16, 1)
+    check(open_film(others.write_fits(tmp_path / "a.fits", frames[0])), frames)
+
+
+def test_fits_numbers_with_a_scale(tmp_path):
+    frames = numbers(np.int16)
+    primary = fits.PrimaryHDU(frames)
+    primary.header["BSCALE"], primary.header["BZERO"] = 0.5, 100.0
+    # Written as it is: astropy would undo the scale.
+    data = frames.astype(">i2").tobytes()
+    (tmp_path / "a.fits").write_bytes(
+        primary.header.tostring().encode() + data + bytes(-len(data) % 2880)
+    )  # fmt: skip
+    check(open_film(tmp_path / "a.fits"), frames * 0.5 + 100)
+
+
+def test_a_fits_header_says_times(tmp_path):
+    header = {"EXPTIME": 0.015, "FRATE": 50.0, "DATE_OBS": "2026-09-21T10:30:00.250"}
+    film = open_film(others.write_fits(tmp_path / "a.fits", numbers(np.uint16), **header))
+    assert (film.rate_hz, film.exposure_s, film.start_ns) == (50, 0.015, 1_789_986_600_250_000_000)
+    film = open_film(others.write_fits(tmp_path / "b.fits", numbers(np.uint16), KINTIME=0.04, EXPOSURE=0.03))
+    assert (film.rate_hz, film.exposure_s) == (25, 0.03)
+    film = open_film(others.write_fits(tmp_path / "c.fits", numbers(np.uint16), EXPTIME="long", DATE_OBS="May"))
+    assert (film.rate_hz, film.exposure_s, film.start_ns) == (None, None, None)
+
+
+def test_fits_without_a_cube_is_refused(tmp_path):
+    assert "there is no picture" in refused(others.write_fits(tmp_path / "a.fits", None))  # type: ignore[arg-type]
+    four = others.write_fits(tmp_path / "b.fits", np.zeros((2, 3, 4, 5)))
+    assert "shape (2, 3, 4, 5), expected (frames, rows, columns)" in refused(four)
+
+
+# imageio-ffmpeg leaves the ends of its pipes to the collection of garbage.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
+def test_a_video(name, tmp_path):
+    frames = smooth(9, 48, 64)
+    film = open_film(others.write_video(tmp_path / name, np.repeat(frames[..., None], 3, axis=3)))
+    assert (film.count, film.shape, film.dtype.name) == (9, (48, 64), "uint8")
+    assert film.rate_hz == pytest.approx(20, rel=1e-3)
+    assert "video" in film.nonlinear
+    read = np.array(list(film.frames()))
+    assert abs(read.mean(axis=(1, 2)) - frames.mean(axis=(1, 2))).max() < 2
+    assert abs(read - frames).max() < 16
+
+
+def test_a_gif(tmp_path):
+    frames = smooth(5, 24, 32) // 10 * 10
+    iio.imwrite(tmp_path / "a.GIF", frames, duration=40, loop=0, plugin="pillow", extension=".gif")
+    film = open_film(tmp_path / "a.GIF")
+    assert (film.count, film.shape, film.rate_hz) == (5, (24, 32), 25)
+    read = np.array(list(film.frames()))
+    assert abs(read - frames).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("encoding", "dtype"),
+    [("mono8", "u1"), ("8UC1", "u1"), ("mono16", "<u2"), ("16UC1", "<u2"), ("32FC1", "<f4"), ("64FC1", "<f8")],
+)
+@pytest.mark.parametrize("padding", [0, 6])
+def test_foxglove_raw_images(encoding, dtype, padding, tmp_path):
+    frames = numbers(np.dtype(dtype))
+    images = [others.foxglove_raw(f, encoding, int(t), padding) for f, t in zip(frames, STAMPS, strict=True)]
+    film = open_film(others.write_mcap(tmp_path / "a.mcap", {"/camera": images}, first_ns=5))
+    check(film, frames)
+    assert film.start_ns == START_NS
+    np.testing.assert_array_equal(film.times_ns, STAMPS)
+    assert film.notes == ()
+
+
+@pytest.mark.parametrize(("encoding", "channels"), [("rgb8", 3), ("bgr8", 3), ("rgba8", 4), ("bgra8", 4)])
+def test_colours_of_raw_images_become_grey(encoding, channels, tmp_path):
+    colours = np.stack([numbers(np.uint8, seed=k) for k in range(channels)], axis=-1)
+    images = [others.foxglove_raw(each, encoding, padding=5) for each in colours]
+    film = open_film(others.write_mcap(tmp_path / "a.mcap", {"/camera": images}))
+    check(film, colours[..., :3].mean(axis=3), np.uint8)
+
+
+def test_pictures_without_stamps_have_the_times_of_their_arrival(tmp_path):
+    film = open_film(others.written_mcap(tmp_path, numbers(np.uint8)))
+    np.testing.assert_array_equal(film.times_ns, STAMPS)
+    assert "those of their arrival are used" in film.notes[0]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_foxglove_compressed_images_as_png(dtype, tmp_path):
+    frames = numbers(dtype)
+    images = [others.foxglove_compressed(f, "png", int(t)) for f, t in zip(frames, STAMPS, strict=True)]
+    film = open_film(others.write_mcap(tmp_path / "a.mcap", {"/camera": images}))
+    check(film, frames)
+    np.testing.assert_array_equal(film.times_ns, STAMPS)
+    assert film.nonlinear == ""
+
+
+def test_foxglove_compressed_images_as_jpeg(tmp_path):
+    frames = smooth(7, 32, 48)
+    images = [others.foxglove_compressed(f, "jpeg", int(t)) for f, t in zip(frames, STAMPS, strict=True)]
+    film = open_film(others.write_mcap(tmp_path / "a.mcap", {"/camera": images}))
+    assert "JPEG" in film.nonlinear
+    assert abs(np.array(list(film.frames())) - frames.astype(float)).max() < 8
+
+
+def test_an_encoding_that_is_not_known_is_refused(tmp_path):
+    path = others.write_mcap(
+        tmp_path / "a.mcap", {"/camera": [others.foxglove_raw(numbers(np.uint8)[0], "bayer_rggb8")]}
+    )
+    assert "'bayer_rggb8': mono8" in refused(path)
+
+
+def test_pictures_that_change_their_size_are_refused(tmp_path):
+    frames = numbers(np.uint8)
+    images = [others.foxglove_raw(frames[0], "mono8"), others.foxglove_raw(frames[1, :5], "mono8")]
+    text = refused(others.write_mcap(tmp_path / "a.mcap", {"/camera": images}))
+    assert "from uint8 of shape (6, 9) to uint8 of shape (5, 9)" in text
+
+
+WRITERS = {
+    "ROS 1 bag": (ROS1, "a.bag", others.write_ros1),
+    "ROS 2 bag": (ROS2, "a", others.write_ros2),
+    "ROS 2 bag in MCAP": (ROS2, "a", lambda path, topics: others.write_ros2(path, topics, "mcap")),
+    "ROS 2 MCAP": (ROS2, "a.mcap", lambda path, topics: others.write_cdr_mcap(path, topics["/camera"])),
+    "ROS 1 MCAP": (ROS1, "a.mcap", lambda path, topics: others.write_ros1_mcap(path, topics["/camera"])),
+}
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_ros_images(kind, tmp_path):
+    store, name, write = WRITERS[kind]
+    frames = numbers(np.uint16)
+    for folder, stored, big_endian in (("little", frames.astype("<u2"), False), ("big", frames.astype(">u2"), True)):
+        (tmp_path / folder).mkdir()
+        images = others.ros_images(store, stored, "mono16", big_endian=big_endian)
+        film = open_film(write(tmp_path / folder / name, {"/camera": images}))
+        check(film, frames)
+        assert film.start_ns == START_NS
+        np.testing.assert_array_equal(film.times_ns, STAMPS)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_ros_compressed_images(kind, tmp_path):
+    store, name, write = WRITERS[kind]
+    frames = numbers(np.uint8)
+    images = [others.ros_compressed(store, f, "png", int(t)) for f, t in zip(frames, STAMPS, strict=True)]
+    film = open_film(write(tmp_path / name, {"/camera": images}))
+    check(film, frames)
+    np.testing.assert_array_equal(film.times_ns, STAMPS)
+
+
+@pytest.mark.parametrize("kind", ["MCAP", "ROS 1 bag", "ROS 2 bag"])
+def test_of_two_topics_with_pictures_one_is_chosen(kind, tmp_path):
+    first, second = numbers(np.uint8), numbers(np.uint8, seed=2)
+    if kind == "MCAP":
+        both = {name: [others.foxglove_raw(f, "mono8") for f in film] for name, film in (("/a", first), ("/b", second))}
+        path = others.write_mcap(tmp_path / "two.mcap", both)
+    else:
+        store, name, write = WRITERS[kind]
+        both = {"/a": others.ros_images(store, first, "mono8"), "/b": others.ros_images(store, second, "mono8")}
+        path = write(tmp_path / name, both)
+    assert "has pictures on /a, /b: say which with --topic" in refused(path)
+    check(open_film(path, "/b"), second)
+    assert "no pictures on /c: it has /a (" in refused(path, "/c")
+
+
+def test_a_file_without_pictures_says_what_it_has(tmp_path):
+    path = others.write_ros1(tmp_path / "a.bag", {"/said": [ROS1.types["std_msgs/msg/String"](data="hello")]})
+    assert "no pictures on any topic: it has /said (std_msgs/String" in refused(path)
+
+
+def test_our_own_recording_is_an_mcap_film(recorded):
+    film = open_film(recorded.path, topics.IMAGE)
+    exposures = list(Recording(recorded.path).exposures())
+    check(film, np.array([each.pixels for each in exposures]))
+    assert film.times_ns is not None
+    assert abs(np.diff(film.times_ns) / 1e9 - 0.2).max() < 1e-3  # by the clock of its host
+
+
+def test_telemetry_with_commands_and_times(tmp_path):
+    frames, commands = numbers(np.uint16), np.arange(14, dtype=np.float32).reshape(7, 2)
+    times = [1_790_000_000 + k / 64 for k in range(7)]
+    film = open_film(others.write_aot(tmp_path / "a.fits", frames, commands=commands, times_s=times))
+    check(film, frames)
+    assert (film.rate_hz, film.exposure_s, film.start_ns) == (50, 0.02, 1_790_000_000_000_000_000)
+    np.testing.assert_array_equal(film.times_ns, np.arange(7) * 15_625_000)
+    np.testing.assert_array_equal(film.inputs, commands)
+
+
+def test_telemetry_without_times_begins_at_its_date(tmp_path):
+    film = open_film(others.write_aot(tmp_path / "a.fits", numbers(np.uint16), commands=np.ones((5, 2), np.float32)))
+    assert film.start_ns == 1_789_986_600_000_000_000
+    assert film.times_ns is None
+    assert film.inputs is None  # there is no command for each picture
+
+
+def test_telemetry_of_slopes_only_says_why_it_is_refused(tmp_path):
+    text = refused(others.write_aot(tmp_path / "a.fits", None))
+    assert "has slopes of SH, but no pictures: the blur that estimators read is in the pixels" in text
