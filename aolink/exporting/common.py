@@ -67,6 +67,15 @@ def time_ns(series: Series, exposure: Exposure, clock: str) -> int:
     return int(getattr(exposure, clock)) if clock else exposure.first_step * series.rig.timing.fast_step_ns
 
 
+def check_frame(series: Series, exposure: Exposure) -> None:
+    """Raise ExportError for a frame that is not of the rig's sensor."""
+    if exposure.pixels.shape != series.rig.sensor.shape:
+        raise ExportError(
+            f"frame {exposure.frame_id} of {series.path} has {exposure.pixels.shape} pixels, the sensor of the rig file"
+            f" in it {series.rig.sensor.shape}: it was recorded with another rig file"
+        )
+
+
 def facts(series: Series) -> dict[str, str]:
     """Where it all comes from: what every export carries along, if it can."""
     return {

@@ -24,7 +24,7 @@ def to_xarray(series: Series, estimators: Sequence[str] | None = None, progress:
         name: (each.dims, each.values, {"long_name": each.text} | ({"units": each.unit} if each.unit else {}))
         for name, each in found.items()
     }
-    step_s = np.arange(series.rig.timing.exposure_steps) * series.rig.timing.fast_step_s
+    step_s = np.arange(found["inputs"].values.shape[1]) * series.rig.timing.fast_step_s
     parts["rig_toml"] = ((), np.array(series.rig.toml), {"long_name": "the rig file"})
     parts["step"] = (("step",), step_s, {"long_name": "time since the exposure's first fast step", "units": "s"})
     dataset: xr.Dataset = xarray.Dataset(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from aolink.colours import estimator_colour
 from aolink.errors import ExportError
 from aolink.estimation.frames.spots import profiles
-from aolink.exporting.common import needed, together
+from aolink.exporting.common import check_frame, needed, together
 from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
@@ -44,6 +44,7 @@ def plot(
     axis = output // series.rig.plant.n_outputs
     first_step = None
     for exposure, estimates in together(series, names):
+        check_frame(series, exposure)
         first_step = exposure.first_step if first_step is None else first_step
         begin = (exposure.first_step - first_step) * step_s
         begins += [begin, begin + exposure.n_steps * step_s]

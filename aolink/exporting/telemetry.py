@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from aolink.estimation.frames.spots import profiles
 from aolink.exporting.arrays import ESTIMATE, EXPOSURE, TRUTH, Variable, arrays
-from aolink.exporting.common import Progress, facts, needed
+from aolink.exporting.common import Progress, check_frame, facts, needed
 from aolink.exporting.series import Series
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
@@ -36,14 +36,15 @@ def write_fits(series: Series, names: Sequence[str], path: Path, progress: Progr
     aot = needed("aotpy", "aot", "AOT telemetry (.fits)")
     writer = needed("aotpy.io.fits.writer", "aot", "AOT telemetry (.fits)")
     fits = needed("astropy.io.fits", "aot", "AOT telemetry (.fits)")
-    found = arrays(series, names, progress)
+    found = arrays(series, names, progress)  # whose frames are all of one size
+    check_frame(series, next(series.exposures()))
     hdus = writer.AOTFITSWriter(_system(aot, series, found)).get_hdulist()
     hdus.append(_table(fits, "EXPOSURES", {k: found[k].values for k in EXPOSURE if k not in _IN_IMAGES}))
     if "truth_path" in found:
         hdus.append(_table(fits, "TRUTH", {k: found[k].values for k in TRUTH}))
     for k, name in enumerate(names):
         of_one = {"frame_id": found["frame_id"].values} | {each: found[each].values[k] for each in ESTIMATE}
-        hdus.append(_table(fits, f"ESTIMATE_{name}", of_one))
+        hdus.append(_table(fits, _header_text(f"ESTIMATE_{name}"), of_one))
     keys, texts = zip(*facts(series).items(), strict=True)
     hdus.append(_table(fits, "FACTS", {"key": np.array(keys), "value": np.array(texts)}))
     rig_file = np.frombuffer(series.rig.toml.encode(), dtype=np.uint8)
@@ -103,7 +104,8 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
         cameras.append(aot.ScoringCamera(uid="SCENE_CAMERA", detector=scene))
     first, last = (datetime.fromtimestamp(float(each), UTC) for each in (begun[0], begun[-1]))
     return aot.AOSystem(
-        ao_mode="SCAO", name=rig.name, config=_header_text(rig.summary), date_beginning=first, date_end=last,
+        ao_mode="SCAO", name=_header_text(rig.name), config=_header_text(rig.summary),
+        date_beginning=first, date_end=last,
         main_telescope=telescope, sources=[source], scoring_cameras=cameras, wavefront_sensors=[wavefront_sensor],
         wavefront_correctors=[mirror], loops=[loop],
     )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from bisect import bisect_right
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -57,28 +57,23 @@ class FrameIndex:
         """Number of the chunk that a frame, by its number from 0 on, is in."""
         return bisect_right(self.before, frame) - 1
 
-    def first_chunk(
-        self, frame: int, first_step: int, topics: Collection[str], runs_in: Callable[[int], Iterator[StepRun]]
-    ) -> int:
-        """Number of the chunk from which on all commands and reports of the steps from ``first_step`` on are.
-
-        Both come in the order of their steps: before a chunk in which all of a topic end before that step, there is
-        nothing of it.
+    def first_chunk(self, frame: int, reach: Mapping[str, int], runs_in: Callable[[int], Iterator[StepRun]]) -> int:
+        """Number of the chunk from which on all commands and reports are that a frame is made with.
 
         Parameters
         ----------
         frame:
-            The frame that begins with ``first_step``.
-        topics:
-            Those of the commands and reports.
+            Its number.
+        reach:
+            By topic: before a message whose steps end at this step or earlier, there is nothing that the frame needs.
         runs_in:
             What of these topics is in a chunk.
         """
-        missing, chunk = set(topics), self.chunk_of(frame)
+        missing, chunk = set(reach), self.chunk_of(frame)
         while missing and chunk > 0:
             latest: dict[str, int] = {}
             for topic, end in runs_in(chunk):
                 latest[topic] = max(end, latest.get(topic, 0))
-            missing -= {topic for topic, end in latest.items() if end <= first_step}
+            missing -= {topic for topic, end in latest.items() if end <= reach[topic]}
             chunk -= bool(missing)
         return chunk

@@ -381,8 +381,11 @@ class Recording(Series):
             info = next(islice(map(self.decoded, infos), first - index.before[chunk], None), None)
             if not isinstance(info, schemas_pb2.ExposureInfo):
                 break
-            present = [topic for topic in _RUNS if self.counts.get(topic)]
-            chunk = index.first_chunk(first, info.first_step, present, self._runs_in)
+            # Reports come in the order of their steps. Commands may be replaced by others of the same steps, but none
+            # is of a step that the mirror's queue did not reach yet.
+            reach = {topics.APPLIED: info.first_step, topics.COMMAND: info.first_step - self.rig.mirror.queue_steps}
+            reach = {topic: step for topic, step in reach.items() if self.counts.get(topic)}
+            chunk = index.first_chunk(first, reach, self._runs_in)
             known = next(islice(self._timed(chunk), first - index.before[chunk], None), None)
             if known is None:
                 break

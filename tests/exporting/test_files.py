@@ -9,13 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap_protobuf.writer import Writer
 
 import aolink
 from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays
 from aolink.exporting.files import WRITERS, export
 from aolink.exporting.series import Series
-from aolink.rig import parse_rig
+from aolink.recording import topics
+from aolink.recording.editing import RecordingCopy
+from aolink.recording.schemas_pb2 import ExposureInfo
+from aolink.rig import load_rig, parse_rig
 from tests.recording.small import write_small
 
 
@@ -128,8 +133,8 @@ def test_a_target_that_exists_is_replaced_only_if_told_so(lively: Series, suffix
     assert target.read_bytes()[:4] != b"mine"
 
 
-def test_frames_of_other_sizes_go_into_a_table_only(tmp_path: Path, recording_with_a_longer_exposure: Path) -> None:
-    recording = aolink.read(recording_with_a_longer_exposure)
+def test_frames_of_other_sizes_go_into_a_table_only(tmp_path: Path, recording_with_a_shorter_exposure: Path) -> None:
+    recording = aolink.read(recording_with_a_shorter_exposure)
     with pytest.raises(ExportError, match=r"frame 3 .* they make no array; a table \(\.csv, \.parquet\) takes both"):
         export(recording, tmp_path / "out.npz")
     export(recording, tmp_path / "out.csv")
@@ -137,13 +142,28 @@ def test_frames_of_other_sizes_go_into_a_table_only(tmp_path: Path, recording_wi
         assert [row["n_steps"] for row in csv.DictReader(file)] == ["200", "200", "100"]
 
 
-@pytest.fixture
-def recording_with_a_longer_exposure(tmp_path: Path) -> Path:
-    """Three exposures of another length: the last ends in its middle."""
-    from aolink.recording import topics
-    from aolink.recording.editing import RecordingCopy
-    from aolink.recording.schemas_pb2 import ExposureInfo
+def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    """A recording of 20,000 frames of 900 spots, as far as the check sees it: its pictures have one pixel each."""
+    large = tmp_path / "large.mcap"
+    rig = load_rig("sh-30x30")
+    with large.open("wb") as file:
+        writer = Writer(file)
+        writer._writer.add_attachment(0, 0, "rig.toml", "application/toml", rig.toml.encode())
+        image = RawImage(width=1, height=1, encoding="mono16", step=2, data=bytes(2))
+        for number in range(1, 20_001):
+            writer.write_message("/camera/exposure", ExposureInfo(frame_id=number), number, number)
+            writer.write_message("/camera/image", image, number, number)
+        writer.finish()
+    recording = aolink.read(large)
+    with pytest.raises(ExportError, match=r"would take \d+ GiB of memory, at most 8 .* \(`aolink cut`\), or a table"):
+        export(recording, tmp_path / "out.npz")
+    with pytest.raises(ExportError, match=r"\(1, 1\) pixels, the sensor .*: it was recorded with another rig file"):
+        export(recording[:2], tmp_path / "out.fits")
 
+
+@pytest.fixture
+def recording_with_a_shorter_exposure(tmp_path: Path) -> Path:
+    """Three exposures, the last of which ends in its middle."""
     source, target = aolink.read(write_small(tmp_path / "small.mcap", 3)), tmp_path / "other.mcap"
     target.touch()
     copy = RecordingCopy(source, target, {})

@@ -138,7 +138,7 @@ def test_a_slice_reads_little_of_a_long_file(long_recording: Path) -> None:
     whole = bytes_read(lambda: list(recording))
     part = bytes_read(lambda: list(recording[60:64]))
     assert len(recording) == 100
-    assert part < 0.2 * whole
+    assert part < 0.4 * whole
 
 
 @pytest.fixture(scope="module")
