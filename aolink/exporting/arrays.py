@@ -190,8 +190,13 @@ def _variable(row: _Row, values: NDArray[Any], *before: str) -> Variable:
 
 
 def _filled(row: _Row, values: Sequence[Any], sizes: Mapping[str, int]) -> NDArray[Any]:
-    """The values as an array, with NaN or an empty text for None."""
+    """The values as an array, with NaN or an empty text for None. Raises ExportError if they are of several sizes."""
     missing = "" if row.in_words else np.full([sizes[dim] for dim in row.dims], np.nan)
+    if odd := {np.shape(each) for each in values if each is not None} - {np.shape(missing)}:
+        raise ExportError(
+            f"the recording has a {row.text} of {odd.pop()} {' x '.join(row.dims)}, where its rig file and its"
+            f" exposures have {np.shape(missing)}: it is damaged, or was recorded with another rig file"
+        )
     return np.array([missing if each is None else each for each in values])
 
 

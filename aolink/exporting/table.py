@@ -143,7 +143,7 @@ def _of_estimate(estimate: Estimate, exposure: Exposure, lists: bool) -> dict[st
     found |= {name: values.tolist() for name, values in estimate_scalars(estimate).items()}
     if lists:
         found["path_sd"] = estimate.path_sd.reshape(axes, -1)
-    if exposure.truth is not None:
+    if exposure.truth is not None and exposure.truth.path.shape == estimate.path.shape:
         found["path_error_rms"] = rms_by_axis(estimate.path - exposure.truth.path, axes).tolist()
     return found
 

@@ -21,6 +21,7 @@ from aolink.recording import topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.schemas_pb2 import ExposureInfo
 from aolink.rig import load_rig, parse_rig
+from aolink.wire.messages_pb2 import Truth
 from tests.recording.small import write_small
 
 
@@ -159,6 +160,20 @@ def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path)
         export(recording, tmp_path / "out.npz")
     with pytest.raises(ExportError, match=r"\(1, 1\) pixels, the sensor .*: it was recorded with another rig file"):
         export(recording[:2], tmp_path / "out.fits")
+
+
+def test_a_truth_of_another_length_is_said(tmp_path: Path) -> None:
+    source, target = aolink.read(write_small(tmp_path / "small.mcap", 3, truth=True)), tmp_path / "other.mcap"
+    target.touch()
+    copy = RecordingCopy(source, target, {})
+    for raw in source.raw_messages():
+        truth = Truth.FromString(raw.data) if raw.topic == topics.TRUTH else None
+        if truth is not None and truth.frame_id == 2:
+            del truth.path[150:]
+        copy.add(raw if truth is None else raw._replace(data=truth.SerializeToString()))
+    copy.finish([])
+    with pytest.raises(ExportError, match=r"a true path of \(1, 150\) output x step, where .* have \(1, 200\)"):
+        export(aolink.read(target), tmp_path / "out.nc")
 
 
 @pytest.fixture
