@@ -22,6 +22,9 @@ from typing import NoReturn
 TIMEOUT_S = 300
 _MODULES = (
     "aolink.cli",
+    "aolink.importing.bags",
+    "aolink.importing.readers",
+    "aolink.importing.recording",
     "aolink.jobs.batch",
     "aolink.jobs.calibrate",
     "aolink.jobs.demo",
@@ -38,6 +41,7 @@ _MODULES = (
     "aolink.estimation.pixels.filter",
     "aolink.estimation.pixels.updates",
     "aolink.estimation.pixels.sampled",
+    "pydantic.type_adapter",  # with which typer reads options
 )
 """What most commands load; nothing that starts threads."""
 
