@@ -22,7 +22,13 @@ from typing import NoReturn
 TIMEOUT_S = 300
 _MODULES = (
     "aolink.cli",
+<<<<<<< HEAD
     "aolink.exporting.files",
+=======
+    "aolink.importing.bags",
+    "aolink.importing.readers",
+    "aolink.importing.recording",
+>>>>>>> imptests
     "aolink.jobs.batch",
     "aolink.jobs.calibrate",
     "aolink.jobs.demo",
@@ -39,6 +45,7 @@ _MODULES = (
     "aolink.estimation.pixels.filter",
     "aolink.estimation.pixels.updates",
     "aolink.estimation.pixels.sampled",
+    "pydantic.type_adapter",  # with which typer reads options
 )
 """What most commands load; nothing that starts threads."""
 

