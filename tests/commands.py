@@ -22,13 +22,10 @@ from typing import NoReturn
 TIMEOUT_S = 300
 _MODULES = (
     "aolink.cli",
-<<<<<<< HEAD
     "aolink.exporting.files",
-=======
     "aolink.importing.bags",
     "aolink.importing.readers",
     "aolink.importing.recording",
->>>>>>> imptests
     "aolink.jobs.batch",
     "aolink.jobs.calibrate",
     "aolink.jobs.demo",

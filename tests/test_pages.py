@@ -103,6 +103,12 @@ NO_CODE = {
 """How indented blocks begin that are no commands, and what holds them."""
 SHELL = [block for block in BLOCKS if not block.language and not block.text.startswith(tuple(NO_CODE))]
 PYTHON = [block for block in BLOCKS if block.language == "python"]
+ENGINES = {
+    "slurm": ("task.sh", "SLURM_ARRAY_TASK_ID=1 sh task.sh && SLURM_ARRAY_TASK_ID=2 sh task.sh", ""),
+    "snakemake": ("Snakefile", "snakemake --cores 2", "snakemake"),
+    "ray": ("block.py", "python block.py", "ray"),
+}
+"""How a block for an engine is run: as which file, by which command, and the module that has to be installed."""
 TOML = [block for block in BLOCKS if block.language == "toml"]
 
 
@@ -210,8 +216,22 @@ def test_a_block_of_toml_is_of_a_rig_file_or_of_the_example_package(block: CodeB
         parse_rig(f"{before}\n{block.text}")
 
 
+@pytest.mark.parametrize("block", [block for block in BLOCKS if block.language in ENGINES], ids=str)
+def test_a_block_for_an_engine_works(block: CodeBlock, laboratory: Path, tmp_path: Path) -> None:
+    """Where the engine is installed; of Slurm only what a task is needs to be there. All recordings have side files."""
+    folder = tmp_path / "here"
+    shutil.copytree(laboratory, folder)
+    name, command, module = ENGINES[block.language]
+    if module:
+        pytest.importorskip(module, reason="what runs in batches is aolink's; the engine is tried where it is")
+    (folder / name).write_text(block.text)
+    done = run(command, folder)
+    assert done.returncode == 0, f"{block}\n{done.stdout}{done.stderr}"
+    assert {each.name for each in folder.glob("results/*.mcap")} == {f"session-{k}.o3.mcap" for k in ("001", "002")}
+
+
 def test_every_block_is_of_a_kind_that_is_tried() -> None:
-    assert {block.language for block in BLOCKS} == {"", "python", "toml", "text"}, "text is for equations"
+    assert {block.language for block in BLOCKS} == {"", "python", "toml", "text", *ENGINES}, "text is for equations"
     assert SHELL
     assert PYTHON
     for start in NO_CODE:
