@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from aolink.estimation import Estimate
+    from aolink.exporting.series import Series
     from aolink.exposure import Exposures
     from aolink.recording.reader import Recording
     from aolink.rig import Rig, load_rig
@@ -43,17 +44,27 @@ if not TYPE_CHECKING:  # the type checker would believe in any name
         raise AttributeError(f"module 'aolink' has no attribute {name!r}")
 
 
-def read(path: str | Path) -> Recording:
-    """Open a recording. Iterating over it reads its exposures, one after the other.
+def read(path: str | Path, side: Sequence[str | Path] = ()) -> Recording:
+    """Open a recording: a series of exposures, read when they are asked for.
+
+    ``len(recording)``, ``recording[7]``, ``recording[-10:]`` and a loop give exposures; ``to_pandas()``,
+    ``to_xarray()`` and ``plot()`` what a notebook needs of them and of the estimates in the file.
+
+    Parameters
+    ----------
+    path:
+        A file, or a URL that fsspec knows (``pip install 'aolink[remote]'``).
+    side:
+        Side files of it, whose estimates stand in the place of its own.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or is not a recording of aolink.
+        It cannot be read, or is not a recording of aolink; a side file is not of this recording.
     """
     from aolink.recording.reader import Recording
 
-    return Recording(path)
+    return Recording(path, side=side)
 
 
 def simulate(rig: Rig | str | Path, n_exposures: int, seed: int | None = None) -> Exposures:
@@ -111,13 +122,13 @@ def exposures(
     return made(frames, rig if isinstance(rig, Rig) else load_rig(rig), inputs, start_steps)
 
 
-def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> list[Estimate]:
+def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list[Estimate]:
     """Estimates of the motion inside each exposure, in their order.
 
     Parameters
     ----------
     exposures:
-        What `simulate` gave, or a recording or its path.
+        What `simulate` gave, or a recording, a slice of one, or its path.
     estimator:
         One of `aolink.estimation.ESTIMATOR_NAMES`.
 
@@ -136,7 +147,7 @@ def estimate(exposures: Exposures | Recording | str | Path, estimator: str) -> l
     return [result for _, (result,) in driver.steps(series)]
 
 
-def smooth(exposures: Exposures | Recording | str | Path, estimates: list[Estimate]) -> list[Estimate]:
+def smooth(exposures: Exposures | Series | str | Path, estimates: list[Estimate]) -> list[Estimate]:
     """Rauch-Tung-Striebel smoother: estimates of `estimate`, each corrected by all later exposures. Offline only.
 
     Parameters

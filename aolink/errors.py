@@ -73,3 +73,9 @@ class ImportingError(AolinkError):
     """A film or a telemetry file that cannot be read, or that is not what the rig file describes."""
 
     exit_code = 11
+
+
+class ExportError(AolinkError):
+    """Exposures that cannot be given to another program in the form asked for."""
+
+    exit_code = 12

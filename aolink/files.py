@@ -35,6 +35,8 @@ _STEP_BACK_S = 0.05
 """The longest of the random waits in between."""
 _LONGEST_NAME = 200
 """Bytes of the target's name that the unfinished file has in its own; file systems allow 255 for the whole."""
+_UNFINISHED = re.compile(r"[0-9a-f]{16}\.partial")
+"""What their names end with."""
 _NO_LINKS = {errno.EPERM, errno.EOPNOTSUPP, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK}
 """What a file system says that has no hard links."""
 _KINDS = {
@@ -265,9 +267,13 @@ def _is_open_as(path: Path, descriptor: int) -> bool:
 
 def _others_write(target: Path, but: Path | None = None) -> bool:
     """Whether an unfinished file of ``target`` other than ``but`` is locked. Dead ones are removed."""
-    unfinished = re.compile(re.escape(_prefix_of(target)) + r"[0-9a-f]{16}\.partial")
+    prefix = _prefix_of(target)
     try:
-        names = [name for name in os.listdir(target.parent) if unfinished.fullmatch(name)]
+        names = [
+            name
+            for name in os.listdir(target.parent)
+            if name.startswith(prefix) and _UNFINISHED.fullmatch(name[len(prefix) :])
+        ]
     except OSError:  # a folder that may be written but not read
         return False
     found = False

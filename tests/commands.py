@@ -22,6 +22,7 @@ from typing import NoReturn
 TIMEOUT_S = 300
 _MODULES = (
     "aolink.cli",
+    "aolink.exporting.files",
     "aolink.importing.bags",
     "aolink.importing.readers",
     "aolink.importing.recording",

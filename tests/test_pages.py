@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 import typer
 from PIL import Image
 from typer.core import TyperGroup
@@ -30,6 +31,8 @@ from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
+from aolink.simulation.model import simulate
+from tests.importing.synthetic import random_walk, spot_film
 from tests.kinds import must_be
 
 ROOT = Path(__file__).parents[1]
@@ -134,6 +137,11 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).write_bytes(gzip.decompress((mmirs / source).read_bytes()))
     scene = np.asarray(Image.open(rigs / "moving-scene.png").convert("L").resize((96, 96)))
     Image.fromarray(scene).save(folder / "moved.png")
+    frames = np.stack([each.pixels for each in simulate(rig, 6)])
+    np.savez(folder / "film.npz", frames=frames, rate_hz=1 / (rig.timing.frame_period_steps * rig.timing.fast_step_s))
+    rng = np.random.default_rng(1)
+    beads = spot_film(rng, random_walk(rng, 80, 2, 0.5), np.array([[24.0, 32.0], [70.0, 30.0]]))
+    tifffile.imwrite(folder / "beads.tif", beads.frames)
     np.savetxt(folder / "psf.csv", np.full((1, 9), 1 / 9), delimiter=",")
     return folder
 

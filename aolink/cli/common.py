@@ -17,6 +17,7 @@ from aolink.errors import EstimatorError, RigError
 if TYPE_CHECKING:
     from aolink.estimation import Score
     from aolink.recording.reader import Recording
+    from aolink.recording.remote import Url
     from aolink.rig import Rig
 
 app = typer.Typer(
@@ -53,17 +54,17 @@ def load_checked(path_or_name: str) -> Rig:
     return loaded
 
 
-def open_recording(file: Path, *, check: bool = False) -> Recording:
-    """Open a recording, and say so where it is not whole."""
+def open_recording(file: str | Path | Url, *, check: bool = False, side: Sequence[Path | Url] = ()) -> Recording:
+    """Open a recording with its side files, and say so where it is not whole."""
     from aolink.recording.reader import Recording
 
-    recording = Recording(file, check=check)
+    recording = Recording(file, check=check, side=side)
     if recording.damage:
-        stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
+        stderr.print(f"aolink: warning: {recording.path}: {recording.damage}", markup=False)
     return recording
 
 
-def check_measured(file: Path, scores: Mapping[str, Score]) -> None:
+def check_measured(file: Path | Url, scores: Mapping[str, Score]) -> None:
     """Raise EstimatorError if an estimator that takes measurements could not use a single exposure."""
     for name, score in scores.items():
         if score.nothing_measured:

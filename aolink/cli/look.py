@@ -15,9 +15,13 @@ from aolink.files import check_target
 
 @app.command(epilog="Example: aolink view session.mcap --screenshot session.png")
 def view(
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that --save has written.")
+    recorded: Annotated[
+        str, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that --save has written.")
     ],
+    side: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[SIDE...]", help="Its side files: their estimates instead of its own."),
+    ] = None,
     save: Annotated[
         Path | None, typer.Option(metavar="X.rrd", help="Write a Rerun file instead of opening the viewer.")
     ] = None,
@@ -33,17 +37,19 @@ def view(
     import tempfile
 
     from aolink import viewing
+    from aolink.recording.remote import location, only_paths
 
+    file, *sides = map(location, [recorded, *(side or ())])
     for target, suffix in ((save, ".rrd"), (screenshot, ".png")):
         if target is not None:
-            check_target(target, overwrite=overwrite, sources=[file], suffix=suffix)
-    recording = None if file.suffix == ".rrd" else open_recording(file)
-    if recording is None and save is not None:
-        raise typer.BadParameter(f"{file} is a Rerun file already: --save is for a recording")
+            check_target(target, overwrite=overwrite, sources=only_paths([file, *sides]), suffix=suffix)
+    recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
+    if recording is None and (save is not None or side):
+        raise typer.BadParameter(f"{file} is a Rerun file already: --save and side files are for a recording")
     if not (web or save or screenshot):
         viewing.check_display()  # before the recording is read, which may take minutes
     with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
-        rrd = file
+        rrd = Path(recorded)
         if recording is not None:
             rrd = save or Path(folder) / f"{file.stem}.rrd"
             viewing.save_rrd(recording, rrd, overwrite=overwrite)

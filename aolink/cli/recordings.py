@@ -26,7 +26,7 @@ from aolink.cli.common import (
 )
 from aolink.cli.terminal import progress_bar
 from aolink.errors import AolinkError, EstimatorError, RecordingError
-from aolink.files import writing
+from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
-    from aolink.jobs.batch import Model
+    from aolink.jobs.batch import Done
+    from aolink.jobs.unit import Model
     from aolink.recording.editing import Edited
 
 
@@ -47,7 +48,7 @@ class Engine(StrEnum):
 
 @app.command(epilog="Example: aolink info session.mcap --json")
 def info(
-    file: FileArgument,
+    file: Annotated[str, typer.Argument(help="A recording: a file, or a URL.", metavar="FILE")],
     check: Annotated[bool, typer.Option("--check", help="Read every byte, not the index alone.")] = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -69,7 +70,7 @@ def info(
     "  |  aolink estimate *.mcap -e moments --set plant.process_noise=0.2,0.4 --jobs 2 -o results/"
 )
 def estimate(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="One recording or many.")],
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="One recording or many, or their URLs.")],
     estimator: EstimatorOption = None,
     target: Annotated[
         str | None,
@@ -95,6 +96,23 @@ def estimate(
     only: Annotated[bool, typer.Option("--only", help="Leave the recording's own estimates out of the copy.")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="How many recordings to estimate at once.")] = 1,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write the table as Parquet, not as CSV.")] = False,
+    side: Annotated[
+        bool,
+        typer.Option("--side", help="Write side files into DIR: estimates alone, one file for each -e, no copies."),
+    ] = False,
+    table: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="X.parquet",
+            help="With --side: the table of the recordings, and X.exposures.parquet with a row for each exposure.",
+        ),
+    ] = None,
+    shard: Annotated[
+        str | None, typer.Option(metavar="I/N", help="With --side: part I of N of the recordings, for a job array.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="With --side: on the workers of this Dask scheduler.")
+    ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -105,13 +123,26 @@ def estimate(
     A file that fails does not stop the others (exit code 1). Exit code 6 if no exposure gave a measurement.
     """
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
+    if side:
+        if output is None or only or parquet:
+            raise typer.BadParameter(
+                "--side needs -o DIR, and goes with --table X.parquet, not with --only or --parquet"
+            )
+        _estimate_beside(
+            files, batch_models(rig, settings), estimator or ["o3"], output, engine,
+            jobs=jobs, table=table, shard=shard, scheduler=scheduler, overwrite=overwrite, as_json=as_json,
+        )  # fmt: skip
+        return
+    if table or shard or scheduler:
+        raise typer.BadParameter("--table, --shard and --scheduler are for side files: give --side too")
     if only and output is None:
         raise typer.BadParameter("--only is for the copy that -o writes: give -o too")
     from aolink.cli import tables
     from aolink.jobs import batch
-    from aolink.rig import load_rig
+    from aolink.jobs.tables import fill_table
+    from aolink.recording.remote import location
 
-    models = batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
+    models = batch_models(rig, settings)
     if len(files) == 1 and len(models) == 1 and not is_folder:
         if parquet or jobs > 1:
             raise typer.BadParameter("--parquet and --jobs are for many files or models, with -o DIR/")
@@ -121,30 +152,107 @@ def estimate(
         return
     if output is None or (output.suffix == ".mcap" and not is_folder):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
-    todo = batch.jobs(files, models, estimator or [], output, engine.value, only=only, overwrite=overwrite)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise AolinkError(f"cannot make the folder {output}: {(error.strerror or str(error)).lower()}") from None
-    done = []
+    if urls := [each for each in map(location, files) if not isinstance(each, Path)]:
+        raise typer.BadParameter(f"{urls[0]} is a URL: of many recordings behind URLs --side makes side files")
+    todo = batch.jobs(
+        [*map(Path, files)], models, estimator or [], output, engine.value, only=only, overwrite=overwrite
+    )  # fmt: skip
+    _make_folder(output)
     table = output / ("results.parquet" if parquet else "results.csv")
     with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
-        for each in batch.run(todo, jobs, stop=stop, progress=lambda n: tell("estimate", n)):
-            done.append(each)
-            of = f"{each.job.source} {each.job.model.name}".strip()
-            if each.error:
-                stderr.print(f"aolink: {of}: {each.error}", markup=False)
-            for warning in each.warnings:
-                stderr.print(f"aolink: warning: {of}: {warning}", markup=False)
+        done = _told(batch.run(todo, jobs, stop=stop, progress=lambda n: tell("estimate", n)))
     rows = batch.table_rows(done, output)
-    batch.write_table(table, rows)
+    with writing(table, overwrite=True) as partial:
+        fill_table(partial, rows, table.suffix)
     if as_json:
         print(json.dumps(rows, allow_nan=False))
     else:
         stdout.print(tables.batch(rows))
         _draw(rows, output / "results.png")
+    _end_batch(done, len(todo), stop, table, quiet=as_json)
+
+
+def batch_models(rig: str | None, settings: Sequence[str] | None) -> list[Model]:
+    """What --rig and --set ask for."""
+    from aolink.jobs import batch
+    from aolink.rig import load_rig
+
+    return batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
+
+
+def _estimate_beside(
+    files: Sequence[str], models: Sequence[Model], estimators: Sequence[str], folder: Path, engine: Engine, *,
+    jobs: int, table: Path | None, shard: str | None, scheduler: str | None, overwrite: bool, as_json: bool,
+) -> None:  # fmt: skip
+    from aolink.cli import tables
+    from aolink.jobs import batch
+    from aolink.jobs.tables import fill_table, join_tables, parquet, table_beside
+
+    if table is not None:
+        check_target(table, overwrite=True, suffix=".parquet")
+        parquet()
+    sources = batch.shard(files, shard) if shard else files
+    if scheduler:  # the workers have other folders
+        sources, folder = [batch.absolute(each) for each in sources], folder.absolute()
+    todo = batch.side_jobs(
+        sources, models, estimators, folder, engine.value, table=table is not None, overwrite=overwrite
+    )  # fmt: skip
+    _make_folder(folder)
+    part = f"-{shard.replace('/', '-of-')}" if shard else ""
+    target = table or folder / f"results{part}.csv"
+    # The table is held from the start, so that the same part that is begun twice is refused.
+    with writing(target, overwrite=True) as partial:
+        with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
+
+            def progress(count: int) -> None:
+                tell("estimate", count)
+
+            if scheduler:
+                from aolink.jobs.cluster import run_on
+
+                done = _told(run_on(scheduler, todo, stop=stop, progress=progress))
+            else:
+                done = _told(batch.run(todo, jobs, stop=stop, progress=progress))
+        rows = batch.table_rows(done)
+        fill_table(partial, rows, target.suffix)
+        if table is not None:
+            parts = [table_beside(each.job.output) for each in done if not each.error]
+            join_tables(sorted(parts), table.with_suffix(".exposures.parquet"))
+    if as_json:
+        print(json.dumps(rows, allow_nan=False))
+    elif len(rows) <= _MOST_ROWS_SHOWN:
+        stdout.print(tables.batch(rows))
+    _end_batch(done, len(todo), stop, target, quiet=as_json)
+
+
+_MOST_ROWS_SHOWN = 40
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
+
+
+def _told(each_done: Iterable[Done]) -> list[Done]:
+    """What jobs came to, with what went wrong printed as it comes."""
+    done = []
+    for each in each_done:
+        done.append(each)
+        of = f"{each.job.source} {each.job.model.name}".strip()
+        if each.error:
+            stderr.print(f"aolink: {of}: {each.error}", markup=False)
+        for warning in each.warnings:
+            stderr.print(f"aolink: warning: {of}: {warning}", markup=False)
+    return done
+
+
+def _end_batch(done: Sequence[Done], count: int, stop: StopRequest, table: Path, *, quiet: bool) -> None:
+    """Say how a batch went, and end as its exit code says."""
+    if not quiet:
         failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
-        text = f"{len(done)} of {len(todo)} done, {skipped} of them before, {failed} failed; table: {table}"
+        text = f"{len(done)} of {count} done, {skipped} of them before, {failed} failed; table: {table}"
         stdout.print(text, markup=False)
     stop.raise_if_asked()
     if any(each.error for each in done):
@@ -165,7 +273,7 @@ def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _estimate_one(
-    file: Path, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
+    file: str, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
     only: bool, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli import tables
@@ -218,7 +326,7 @@ def _estimate_one(
             if recording.estimators and not recording.rig_is_recorded:
                 beside = "; the recording's own estimates were made with another rig file and are left out"
             stdout.print(f"written: {output}{beside}", markup=False)
-    check_measured(file, scores)
+    check_measured(recording.path, scores)
 
 
 CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from the recording's start.")]
@@ -226,10 +334,13 @@ CutTime = Annotated[float | None, typer.Option(metavar="S", help="Seconds from t
 
 @app.command(epilog="Example: aolink compare session.mcap again.mcap --topic /estimate/")
 def compare(
-    first: Annotated[Path, typer.Argument(metavar="A", help="A recording.")],
+    first: Annotated[str, typer.Argument(metavar="A", help="A recording.")],
     second: Annotated[
-        Path | None,
-        typer.Argument(metavar="[B]", help="Another; without it, A with its estimates made again by this aolink."),
+        str | None,
+        typer.Argument(
+            metavar="[B]",
+            help="Another, or a side file of A; without it, A with its estimates made again by this aolink.",
+        ),
     ] = None,
     topic: Annotated[
         list[str] | None,
@@ -242,11 +353,16 @@ def compare(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say field by field what differs between two recordings. Exit code 1 if something does."""
+    """Say field by field what differs between two recordings. Exit code 1 if something does.
+
+    A side file is compared with the recording's own estimates by the same names.
+    """
     from tempfile import TemporaryDirectory
 
     from aolink.cli import tables
+    from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
+    from aolink.recording.reader import check_is_side_of
     from aolink.recording.reestimate import write_reestimated
 
     one = open_recording(first)
@@ -256,10 +372,15 @@ def compare(
         raise RecordingError(f"{first} holds no estimates to make again: give a second recording")
     with TemporaryDirectory(prefix="aolink-") as folder:
         if second is None:
-            second = Path(folder) / first.name
+            second = f"{folder}/{one.path.name}"
             with progress_bar(stderr, one.n_frames) as tell:
                 write_reestimated(one, one.estimators, second, progress=lambda n: tell("estimate", n), as_recorded=True)
         two = open_recording(second)
+        if two.side_of and not one.side_of:
+            check_is_side_of(two, one)
+            if accept:
+                raise typer.BadParameter(f"{second} is a side file, which cannot take the place of {first}")
+            topic = topic or [topics.estimate_topic(name) for name in two.estimators]
         total = sum(one.counts.values()) + sum(two.counts.values())
         with progress_bar(stderr, total) as tell:
             found = compare_recordings(
@@ -279,8 +400,10 @@ def compare(
         if accept and not same:
             if damage:
                 raise RecordingError(f"{damage[0]}: a damaged recording is not accepted; `aolink recover` it first")
-            with writing(first, overwrite=True, sources=[second], error=RecordingError) as partial:
-                shutil.copyfile(second, partial)
+            if not (isinstance(one.path, Path) and isinstance(two.path, Path)):
+                raise typer.BadParameter("--accept is for files of this machine, not for URLs")
+            with writing(one.path, overwrite=True, sources=[two.path], error=RecordingError) as partial:
+                shutil.copyfile(two.path, partial)
             stdout.print(f"accepted: {first} is replaced", markup=False)
             return
     if not as_json:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import optimize, signal
 
 from aolink.errors import ImportingError
 from aolink.importing.exposures import Settings
@@ -21,6 +21,8 @@ _COUNTS = 62_000
 """Counts of the brightest pixel of a resting spot with its noise; there are 65,535."""
 _NOISE_SDS = 6
 """Standard deviations of a pixel's noise that fit below black and above the brightest pixel."""
+_SETTLED = 1e-9
+"""Change of a gain that is none."""
 _LEAST_WINDOW = 12
 _ANYWHERE = 0.1
 """Variance of the place of an object in its window before it is seen, slope units squared."""
@@ -62,10 +64,13 @@ def fit_motion(places: FloatArray) -> Motion:
     steps = np.diff(places, axis=0)
     start = math.log(max(float(np.nanvar(steps)), 1e-12))
 
+    # What is between two gaps is a series of its own; an Ornstein-Uhlenbeck process is about its mean.
+    runs = [(one, one.mean(axis=0)) for one in _runs(places)]
+
     def cost(values: FloatArray, bound: bool) -> float:
         q, r = math.exp(values[0]), math.exp(values[1])
         a = 1 / (1 + math.exp(-values[2])) if bound else 1.0
-        return _negative_log_likelihood(places, a, q, r)
+        return sum(_negative_log_likelihood(one - (means if a < 1 else 0.0), a, q, r) for one, means in runs)
 
     walk = optimize.minimize(cost, [start, start - 2], args=(False,), method="Nelder-Mead")
     bound = optimize.minimize(cost, [*walk.x, 3.0], args=(True,), method="Nelder-Mead", options={"maxiter": 600})
@@ -81,22 +86,36 @@ def fit_motion(places: FloatArray) -> Motion:
     return Motion(a=a, a_sd=a_sd, q=q, q_sd=q * math.sqrt(variances[0]), r=math.exp(best[1]), spread=spread)
 
 
-def _negative_log_likelihood(places: FloatArray, a: float, q: float, r: float) -> float:
-    """Of a Kalman filter for all series at once; an Ornstein-Uhlenbeck process is about each series' mean."""
-    y = places - np.nanmean(places, axis=0) if a < 1 else places
-    seen = np.isfinite(y)
-    first = np.argmax(seen, axis=0)
-    x = np.where(seen.any(axis=0), y[first, np.arange(y.shape[1])], 0.0) if a == 1 else np.zeros(y.shape[1])
-    P = np.full(y.shape[1], q / (1 - a * a) if a < 1 else r + q)
-    total = 0.0
-    for k, row in enumerate(y):
-        use = seen[k] & (k > first) if a == 1 else seen[k]
+def _runs(places: FloatArray) -> list[FloatArray]:
+    """Series without their gaps: what has the same length in one array, (frames, series)."""
+    whole = np.isfinite(places).all(axis=0)
+    runs = [places[:, whole]] if whole.any() else []
+    for one in places[:, ~whole].T:
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(one), [False]]).astype(np.int8)))
+        runs += [one[first:end, None] for first, end in edges.reshape(-1, 2) if end - first > 1]
+    return runs
+
+
+def _negative_log_likelihood(y: FloatArray, a: float, q: float, r: float) -> float:
+    """Negative log-likelihood of series (frames, series) by a Kalman filter, which settles after some frames."""
+    walk = a == 1
+    first = int(walk)  # the first place of a walk may be anywhere
+    x = y[0] if walk else np.zeros(y.shape[1])
+    P, gain, total, k = (r + q if walk else q / (1 - a * a)), math.nan, 0.0, first
+    while k < len(y):
         S = P + r
-        innovation = np.where(use, row - x, 0.0)
-        total += float((np.log(2 * np.pi * S) + innovation**2 / S)[use].sum()) / 2
-        gain = np.where(use, P / S, 0.0)
-        x, P = a * (x + gain * innovation), a * a * P * (1 - gain) + q
-    return total
+        before, gain = gain, P / S
+        innovation = y[k] - x
+        total += float((innovation**2).sum()) / S + y.shape[1] * math.log(2 * math.pi * S)
+        x, P, k = a * (x + gain * innovation), a * a * P * (1 - gain) + q, k + 1
+        if abs(gain - before) < _SETTLED:
+            break
+    if k < len(y):
+        pole = a * (1 - gain)
+        seen, _ = signal.lfilter([0.0, a * gain], [1.0, -pole], y[k:], axis=0, zi=x[None])
+        innovations = y[k:] - seen
+        total += float((innovations**2).sum()) / S + innovations.size * math.log(2 * math.pi * S)
+    return total / 2
 
 
 def _inverse_curvature(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ without an error. Where the objects are in the single frames is the true path of
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -54,7 +55,7 @@ _SAMPLES = 100
 STRAY = 1 / 8
 """Share of a window by which an object may be off its middle before the window moves."""
 _REST = 2.5
-"""Standard deviations of an object, and of its walk in an exposure, beyond which light is that of others."""
+"""Standard deviations of where an object's light may be, its walk in an exposure included: beyond is that of others."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +133,9 @@ def trackpy_locator(sd: float) -> Callable[[FloatArray], FloatArray] | None:
     diameter = 2 * math.ceil(2 * sd) + 1
 
     def locate(light: FloatArray) -> FloatArray:
-        found = trackpy.locate(np.maximum(light, 0.0), diameter)
+        with warnings.catch_warnings():  # of pandas, about how trackpy calls it
+            warnings.simplefilter("ignore")
+            found = trackpy.locate(np.maximum(light, 0.0), diameter)
         return np.asarray(found[["x", "y"]].to_numpy(dtype=np.float64))
 
     return locate
@@ -299,7 +302,7 @@ def _steps(places: FloatArray) -> tuple[float, float]:
 
 def reach(known: Survey, frames: int) -> float:
     """How far from where it was last an object's light may be after an exposure of so many frames, pixels."""
-    return _REST * (known.sd + math.sqrt(known.walk * frames))
+    return _REST * math.sqrt(known.sd**2 + known.walk * frames)
 
 
 def tracked(
@@ -381,7 +384,7 @@ class _Windows:
     def positions(self, places: FloatArray) -> FloatArray:
         """Places on the picture (frames, n, 2) as outputs of the rig, slope units, (2 n, frames)."""
         inside = (places - self._corners + 0.5) * self._sensor.pixel_width + self._sensor.field[0]
-        return np.asarray(inside.reshape(len(places), -1).T)
+        return np.asarray(inside.reshape(len(places), 2 * len(self._corners)).T)
 
     def cut(
         self, picture: FloatArray, usable: BoolArray, places: FloatArray

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import itertools
 import json
 import re
 import time
 import tomllib
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -22,46 +21,14 @@ from aolink.errors import AolinkError, RecordingError, RigError
 from aolink.estimation import Engine, Scorer
 from aolink.estimation.registry import DEFAULT_ESTIMATOR
 from aolink.files import remove_unfinished, writing
+from aolink.jobs.tables import COLUMNS
+from aolink.jobs.unit import Model, Settings, estimated
 from aolink.numerics.workers import processes
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures, fill_reestimated
-from aolink.rig import parse_rig
-from aolink.rig.edit import with_value
+from aolink.recording.remote import Url, location
 
-COLUMNS = (
-    "recording", "model", "estimator", "exposures", "path_rmse", "start_rmse", "end_rmse",
-    "nis", "nis_low", "nis_high", "start_nees", "end_nees", "nees_low", "nees_high", "not_ok", "nothing_measured",
-    "seconds", "output", "damage", "error",
-)  # fmt: skip
-"""Of the table: one row for each recording, model and estimator; what is not known is empty."""
 _IN_EVERY_ROW = {"recording", "model", "estimator", "exposures", "output"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Model:
-    """The rig that recordings are estimated with: their own, or another, with some values changed."""
-
-    name: str = ""
-    """The other rig's name and what was changed; empty for the recording's own."""
-    rig_text: str | None = None
-    """Instead of the rig file in the recording."""
-    changes: tuple[tuple[str, Any], ...] = ()
-    """Dotted keys of the rig file, with their new values."""
-
-    def text_for(self, recorded: str) -> str:
-        """The rig file to use for a recording that was made with ``recorded``. Raises RigError for a key it lacks."""
-        text = recorded if self.rig_text is None else self.rig_text
-        for key, value in self.changes:
-            try:
-                text = with_value(text, key, value)
-            except RigError as error:
-                raise RigError(f"--set {error}") from None
-        return text
-
-    def applied_to(self, recording: Recording) -> Recording:
-        """The same recording to be estimated with this model. Raises RigError where that cannot be."""
-        text = self.text_for(recording.rig.toml)
-        return recording if text == recording.rig.toml else Recording(recording.path, rig=parse_rig(text))
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +67,56 @@ class Job:
         ]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
+    def done_before(self) -> Done | None:
+        """What came of it if it was done before, and nothing has changed since."""
+        record = None if self.overwrite else _record(self.record)
+        try:
+            if record and record["digest"] == self.digest() and self.output.exists():
+                return Done(self, record["rows"], skipped=True)
+        except OSError:  # there is no such recording: the job will say so
+            pass
+        return None
+
+    def rows(self) -> tuple[list[dict[str, Any]], bool]:
+        """Do it; gives the rows, and whether it had been done before."""
+        with writing(self.output, overwrite=True, sources=[self.source], error=RecordingError) as partial:
+            rows = _estimated(self, partial)
+            # A result is never there without the record that says whose it is and what it depends on.
+            self.output.unlink(missing_ok=True)
+            with writing(self.record, overwrite=True) as record:
+                record.write_text(json.dumps({"digest": self.digest(), "rows": rows}))
+        return rows, False
+
+
+@dataclass(frozen=True, slots=True)
+class SideJob:
+    """One recording with one model and one estimator, to be a side file."""
+
+    source: str
+    """A file or a URL."""
+    output: Path
+    settings: Settings
+
+    @property
+    def model(self) -> Model:
+        """What the recording is estimated with."""
+        return self.settings.model
+
+    def done_before(self) -> Done | None:
+        """Nothing: whether it was done is found out where it would be done, with the recording at hand."""
+        return None
+
+    def rows(self) -> tuple[list[dict[str, Any]], bool]:
+        """Do it; gives the row, and whether it had been done before."""
+        row, before = estimated(self.source, self.output, self.settings)
+        return [row], before
+
 
 @dataclass(frozen=True, slots=True)
 class Done:
     """The result of a job."""
 
-    job: Job
+    job: Job | SideJob
     rows: list[dict[str, Any]]
     """By `COLUMNS`."""
     error: str = ""
@@ -174,17 +185,14 @@ def jobs(
     """
     made = []
     for source, model in itertools.product(sources, each):
-        suffix = "".join(c if c.isalnum() or c in "=.-_" else "-" for c in model.name.replace("plant.", ""))
-        name = f"{source.stem}-{suffix}" if suffix else source.stem
-        output = folder / f"{name}.mcap"
+        output = folder / f"{_name(source.stem, model)}.mcap"
         made.append(Job(source, model, tuple(dict.fromkeys(estimators)), output, engine, overwrite, only))
-    names = [job.output for job in made]
-    if doubled := {name for name in names if names.count(name) > 1}:
-        raise RigError(f"two recordings would be written as {doubled.pop().name}: give them different names")
+    _check_all_differ(job.output for job in made)
+    there = {(status.st_dev, status.st_ino) for source in sources if source.exists() for status in [source.stat()]}
     for job in made:
         if not job.output.exists():
             continue
-        if any(source.exists() and job.output.samefile(source) for source in sources):
+        if ((status := job.output.stat()).st_dev, status.st_ino) in there:
             raise RecordingError(f"{job.output} is one of the recordings: give another folder for the results")
         if not overwrite and _record(job.record) is None:
             raise RecordingError(
@@ -193,8 +201,66 @@ def jobs(
     return made
 
 
+def side_jobs(
+    sources: Sequence[str],
+    each: Sequence[Model],
+    estimators: Sequence[str],
+    folder: Path,
+    engine: Engine = "aolink",
+    *,
+    table: bool = False,
+    overwrite: bool = False,
+) -> list[SideJob]:
+    """Every recording with every model and every estimator; parameters as for `jobs` and `Settings`.
+
+    Raises
+    ------
+    RigError
+        Two would write the same file.
+    """
+    made = []
+    for source, model, name in itertools.product(dict.fromkeys(sources), each, dict.fromkeys(estimators)):
+        settings = Settings(estimator=name, model=model, engine=engine, table=table, overwrite=overwrite)
+        made.append(SideJob(source, folder / f"{_name(location(source).stem, model)}.{name}.mcap", settings))
+    _check_all_differ(job.output for job in made)
+    return made
+
+
+def _name(stem: str, model: Model) -> str:
+    suffix = "".join(c if c.isalnum() or c in "=.-_" else "-" for c in model.name.replace("plant.", ""))
+    return f"{stem}-{suffix}" if suffix else stem
+
+
+def _check_all_differ(outputs: Iterable[Path]) -> None:
+    for output, count in Counter(outputs).items():
+        if count > 1:
+            raise RigError(f"two recordings would be written as {output.name}: give them different names")
+
+
+def shard(sources: Sequence[str], part: str) -> list[str]:
+    """The recordings of one part of several, ``i/n`` with i from 1 to n: the same whatever their order.
+
+    The parts differ by one recording at most in size, have none in common, and all of them together are all.
+
+    Raises
+    ------
+    AolinkError
+        ``part`` is not of that form.
+    """
+    found = re.fullmatch(r"([0-9]{1,9})/([0-9]{1,9})", part)
+    number, count = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not 1 <= number <= count:
+        raise AolinkError(f"--shard {part}: I/N is needed, with I from 1 to N, as 1/100 to 100/100")
+    return sorted(set(sources))[number - 1 :: count]
+
+
+def absolute(source: str) -> str:
+    """A path as a process in another folder needs it; a URL as it is."""
+    return source if isinstance(location(source), Url) else str(Path(source).absolute())
+
+
 def run(
-    todo: Sequence[Job],
+    todo: Sequence[Job | SideJob],
     workers: int,
     *,
     stop: Callable[[], bool] = lambda: False,
@@ -204,33 +270,33 @@ def run(
 
     When ``stop()`` says so no other job is begun, and those that are on the way are ended in good order.
     """
-    fresh: list[Job] = []
+    fresh: list[Job | SideJob] = []
     for job in todo:
-        before = None if job.overwrite else _done_before(job)
+        before = job.done_before()
         if before is None:
             fresh.append(job)
         else:
             yield before
     count = len(todo) - len(fresh)
     progress(count)
-    each = map(_do, itertools.takewhile(lambda job: not stop(), fresh))
+    each = map(do, itertools.takewhile(lambda job: not stop(), fresh))
     for done in each if workers == 1 or len(fresh) < 2 else _in_parallel(fresh, workers, stop):
         yield done
         progress(count := count + 1)
 
 
-def _in_parallel(todo: Sequence[Job], workers: int, stop: Callable[[], bool]) -> Iterator[Done]:
+def _in_parallel(todo: Sequence[Job | SideJob], workers: int, stop: Callable[[], bool]) -> Iterator[Done]:
     queue = deque(todo)
     while queue and not stop():  # again, if a process was lost and its pool with it
-        running: dict[Future[Done], Job] = {}
-        lost, broken = False, list[Job]()
+        running: dict[Future[Done], Job | SideJob] = {}
+        lost, broken = False, list[Job | SideJob]()
         try:
             with processes(workers) as pool:
                 while running or (queue and not lost and not stop()):
                     # No more than can run: what waits in a pool cannot be taken back.
                     while queue and not lost and len(running) < workers and not stop():
                         try:
-                            running[pool.submit(_do, queue[0])] = queue[0]
+                            running[pool.submit(do, queue[0])] = queue[0]
                         except BrokenProcessPool:
                             lost = True
                         else:
@@ -250,30 +316,7 @@ def _in_parallel(todo: Sequence[Job], workers: int, stop: Callable[[], bool]) ->
                 remove_unfinished(job.output)
 
 
-def write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of `COLUMNS` as CSV, or as Parquet if the name ends with .parquet.
-
-    Raises
-    ------
-    AolinkError
-        It cannot be written, or pyarrow is missing for Parquet.
-    """
-    with writing(path, overwrite=True) as partial:
-        if path.suffix == ".parquet":
-            try:
-                import pyarrow as pa
-                import pyarrow.parquet as pq
-            except ImportError:
-                raise AolinkError("Parquet needs pyarrow: pip install 'aolink[parquet]', or write .csv") from None
-            pq.write_table(pa.Table.from_pylist([dict(row) for row in rows]), partial)
-        else:
-            with partial.open("w", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                writer.writeheader()
-                writer.writerows(rows)
-
-
-def table_rows(done: Sequence[Done], folder: Path) -> list[dict[str, Any]]:
+def table_rows(done: Sequence[Done], folder: Path | None = None) -> list[dict[str, Any]]:
     """Rows by `COLUMNS` of these jobs, and of those whose results are in the folder from before, sorted.
 
     A failed job has one row, with its error.
@@ -282,8 +325,8 @@ def table_rows(done: Sequence[Done], folder: Path) -> list[dict[str, Any]]:
     for each in done:
         failed = {"recording": str(each.job.source), "model": each.job.model.name, "error": each.error}
         rows += [dict.fromkeys(COLUMNS) | row for row in (each.rows or [failed])]
-    known = {each.job.record.resolve() for each in done}
-    for path in folder.glob("*.json"):
+    known = {each.job.record.resolve() for each in done if isinstance(each.job, Job)}
+    for path in folder.glob("*.json") if folder else ():
         if path.resolve() not in known and path.with_suffix(".mcap").exists() and (record := _record(path)):
             rows += [dict.fromkeys(COLUMNS) | row for row in record["rows"]]
     return sorted(rows, key=lambda row: (_numerically(row["recording"]), _numerically(row["model"])))
@@ -311,20 +354,15 @@ def _record(path: Path) -> dict[str, Any] | None:
     return None
 
 
-def _do(job: Job) -> Done:
-    """Estimate a recording again; whatever goes wrong is the result."""
+def do(job: Job | SideJob) -> Done:
+    """Do a job; whatever goes wrong is the result."""
     try:
-        with writing(job.output, overwrite=True, sources=[job.source], error=RecordingError) as partial:
-            rows = _estimated(job, partial)
-            # A result is never there without the record that says whose it is and what it depends on.
-            job.output.unlink(missing_ok=True)
-            with writing(job.record, overwrite=True) as record:
-                record.write_text(json.dumps({"digest": job.digest(), "rows": rows}))
+        rows, before = job.rows()
     except (AolinkError, OSError) as error:
         return Done(job, [], f"{error}")
     except Exception as error:  # a value that nobody thought of stops no other job
         return Done(job, [], f"it cannot be estimated with this model: {error!r}")
-    return Done(job, rows)
+    return Done(job, rows, skipped=before)
 
 
 def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
@@ -361,16 +399,6 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
             }
         )  # fmt: skip
     return rows
-
-
-def _done_before(job: Job) -> Done | None:
-    record = _record(job.record)
-    try:
-        if record and record["digest"] == job.digest() and job.output.exists():
-            return Done(job, record["rows"], skipped=True)
-    except OSError:  # there is no such recording: the job will say so
-        pass
-    return None
 
 
 def _values(text: str, setting: str) -> list[Any]:

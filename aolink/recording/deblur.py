@@ -68,7 +68,7 @@ def write_deblurred(
     """
     check_has_exposures(recording)
     find_method(method)
-    check_target(path, overwrite=overwrite, sources=[recording.path], error=RecordingError)
+    check_target(path, overwrite=overwrite, sources=recording.files, error=RecordingError)
     made = _deblurred(recording.rig, _estimated(recording, estimator), method, workers)
     held = next(made, None)  # whether the estimator can work shows before the file is made
     notes = {
@@ -77,7 +77,7 @@ def write_deblurred(
         "deblurred_with": f"{estimator} {method}",
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
-    with writing(path, overwrite=overwrite, sources=[recording.path], error=RecordingError) as partial:
+    with writing(path, overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
         return _written(recording, partial, made, held, estimator, notes, progress)
 
 

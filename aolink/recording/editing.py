@@ -17,7 +17,7 @@ from aolink.files import open_unfinished, writing
 from aolink.recording import topics
 from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
-from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.reader import RawMessage, Recording, in_time
 from aolink.recording.scan import Loss
 from aolink.recording.writer import begin_recording
 from aolink.wire import messages_pb2 as wire
@@ -252,7 +252,7 @@ def _raw(lead: Lead) -> Iterator[RawMessage]:
 def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:
     recent: dict[tuple[str, int, bytes], int] = {}
     frames: dict[int, int] = {}
-    for key, raw in heapq.merge(*map(_timed, recordings), key=lambda each: each[0]):
+    for key, raw in heapq.merge(*(in_time(each.raw_messages()) for each in recordings), key=lambda each: each[0]):
         name = (raw.topic, raw.log_time_ns, raw.data)
         if name in recent:
             continue
@@ -267,11 +267,3 @@ def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:
                 )
             frames[frame_id] = key
         yield raw
-
-
-def _timed(recording: Recording) -> Iterator[tuple[int, RawMessage]]:
-    """Messages with a time that never goes back, so that their order stays."""
-    latest = 0
-    for raw in recording.raw_messages():
-        latest = max(latest, raw.log_time_ns)
-        yield latest, raw

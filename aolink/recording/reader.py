@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import heapq
 import io
+import json
 from collections import deque
-from collections.abc import Container, Iterator
+from collections.abc import Collection, Container, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import count, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, overload
 
 import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -19,16 +23,23 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel, exposure_model
+from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
+from aolink.recording.frame_index import FrameIndex, StepRun
+from aolink.recording.remote import Url, location, only_paths
 from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
+from aolink.recording.slices import RecordingSlice
 from aolink.rig import Rig, parse_rig
-from aolink.wire.messages_pb2 import Applied
+from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
 
 if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
+
+_END_OF_TIME = 1 << 64
+"""After every log time, ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +65,11 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class Recording:
+class Recording(Series):
     """A recording on disk, read piece by piece, so files may be larger than the memory.
+
+    It is a series of exposures: a loop over it gives them, and so do its length, numbers and slices. The numbers are
+    those of the frames in the file's index.
 
     A complete file is read by its index. One that was cut off or damaged is scanned for its undamaged parts; `losses`
     lists the others.
@@ -63,22 +77,33 @@ class Recording:
     Parameters
     ----------
     path:
-        The file.
+        The file, or a URL that fsspec knows: of that only the ranges are read that are needed.
     rig:
         Used instead of the rig that is in the file, so new estimates are made with another model. Estimates that are in
         the file cannot be read with it.
     check:
         Read every byte at once, so that `losses` is known from the start. Without it, damage in the
         middle of a file that has its index is noticed when it is read.
+    side:
+        Side files of the recording, which hold estimates of it alone: their estimates stand in the place of those of
+        the same estimators in the file, as in a copy with new estimates, and their rig in the place of the file's.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or is not a recording of aolink.
+        The file cannot be read, or is not a recording of aolink; a side file is not of this recording, or two of them
+        were made with different rigs.
     """
 
-    def __init__(self, path: str | Path, *, rig: Rig | None = None, check: bool = False) -> None:
-        self.path = Path(path)
+    def __init__(
+        self,
+        path: str | Path | Url,
+        *,
+        rig: Rig | None = None,
+        check: bool = False,
+        side: Sequence[str | Path | Url] = (),
+    ) -> None:
+        self.path = location(path)
         self.metadata: dict[str, str] = {}
         """Facts about the session, from its start and its end."""
         self.end_metadata: dict[str, str] = {}
@@ -99,11 +124,14 @@ class Recording:
         self.encodings: dict[str, str] = {}
         """Encoding of the messages by topic, where the file states it."""
         self._index: list[ChunkIndex] | None = None
+        self._left_out: frozenset[str] = frozenset()
+        """Topics that side files have instead."""
         rig_text = self._survey(check=check)
         if rig_text is None:
             raise RecordingError(f"{self.path} is an MCAP file but not a recording of aolink: it holds no rig file")
+        self._rig_text = rig_text
         try:
-            recorded_rig = parse_rig(rig_text)
+            recorded_rig = _parsed_rig(rig_text)
         except RigError as error:
             if rig is None:
                 raise RecordingError(f"{self.path} holds a rig file that this aolink does not take: {error}") from None
@@ -112,6 +140,9 @@ class Recording:
         self.rig: Rig = rig or recorded_rig
         self.rig_is_recorded = self.rig.toml == rig_text
         """Whether ``rig`` is the one in the file, so that the estimates in the file can be read with it."""
+        self._side = [Recording(each, check=check) for each in side]
+        if self._side:
+            self._take_side(rig)
 
     @property
     def losses(self) -> list[Loss]:
@@ -121,7 +152,7 @@ class Recording:
             times = [time_ns for _, time_ns in messages]
             what = f"{len(messages)} message(s) on {topic} cannot be decoded"
             found.append(Loss(0, sum(messages.values()), what, min(times), max(times)))
-        return found
+        return found + [loss for each in self._side for loss in each.losses]
 
     @property
     def damage(self) -> str:
@@ -136,9 +167,40 @@ class Recording:
         return not self.damage
 
     @property
+    def files(self) -> list[Path]:
+        """The files of this machine that it is read from: nothing that is made of it may take their place."""
+        return only_paths([self.path, *(side.path for side in self._side)])
+
+    @cached_property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return self.path.size if isinstance(self.path, Url) else self.path.stat().st_size
+
+    @cached_property
+    def digest(self) -> str:
+        """What side files know the recording by: SHA-256 of its index, which has the place and the length of all that
+        is in it. Where there is no index, of what a scan found: rig, session, times and counts."""
+        with open_recording(self.path) as file:
+            summary = read_summary(file)
+        if summary is not None and summary.is_index:
+            return summary.digest
+        facts = [self._rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
+        return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+    @property
+    def side_of(self) -> str:
+        """The `digest` of the recording that this is a side file of; empty where it is a recording of its own."""
+        return self.metadata.get(topics.SIDE_OF, "")
+
+    @property
     def estimators(self) -> list[str]:
         """Names of the estimators whose results are in the file."""
         return [name.removeprefix(topics.ESTIMATE) for name in self.counts if name.startswith(topics.ESTIMATE)]
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether what really happened is in the file."""
+        return topics.TRUTH in self.counts
 
     @property
     def n_frames(self) -> int:
@@ -200,9 +262,32 @@ class Recording:
     ) -> Iterator[RawMessage]:
         """As `messages`, as bytes, and those of other software too."""
         low = start_ns if start_ns is not None else 0
-        high = end_ns if end_ns is not None else 1 << 64
-        channels = {k: names for k, names in self._channels.items() if not wanted or names[0] in wanted}
-        for record in self._records(channels, low, high):
+        return self._raw(wanted, low, end_ns if end_ns is not None else _END_OF_TIME)
+
+    def _raw(
+        self, wanted: Collection[str], low: int = 0, high: int = _END_OF_TIME, chunks: slice = slice(None)
+    ) -> Iterator[RawMessage]:
+        """The messages in some chunks of the index, if there is one, with those of side files.
+
+        They are of all topics if none is ``wanted``.
+        """
+        own = self._own_messages(wanted, low, high, chunks)
+        if not self._side:
+            return own
+        others = (each.raw_messages(*wanted, start_ns=low, end_ns=high) for each in self._side)
+        timed = heapq.merge(*map(in_time, (own, *others)), key=lambda each: each[0])
+        return (raw for _, raw in timed)
+
+    def _own_messages(
+        self, wanted: Collection[str], low: int = 0, high: int = _END_OF_TIME, chunks: slice = slice(None)
+    ) -> Iterator[RawMessage]:
+        """The messages of the file itself."""
+        channels = {
+            k: names
+            for k, names in self._channels.items()
+            if (not wanted or names[0] in wanted) and names[0] not in self._left_out
+        }
+        for record in self._records(channels, low, high, chunks):
             if isinstance(record, McapMessage) and record.channel_id in channels and low <= record.log_time < high:
                 topic, schema = channels[record.channel_id]
                 yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
@@ -213,27 +298,117 @@ class Recording:
         The messages are those of the topics ``others`` (of all, if none is named), besides those that make exposures.
         Exposures that were still incomplete when the recording ended come last, with None.
         """
+        return self._assembled(others)
+
+    def _assembled(
+        self, others: tuple[str, ...], chunks: slice = slice(None)
+    ) -> Iterator[tuple[RecordedMessage | None, list[Exposure]]]:
         assembly = ExposureAssembly(self.rig)
-        for recorded in self.messages(*({*others, *_ASSEMBLED} if others else ())):
-            yield recorded, assembly.take(recorded.topic, recorded.message)
+        for raw in self._raw((*others, *_ASSEMBLED) if others else (), chunks=chunks):
+            if (message := self.decoded(raw)) is not None:
+                recorded = RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
+                yield recorded, assembly.take(recorded.topic, message)
         yield None, assembly.flush()
 
-    def __iter__(self) -> Iterator[Exposure]:
-        """Its exposures, from the first one on, as for the `Exposures` of `aolink.simulate`."""
-        return self.exposures()
+    def __len__(self) -> int:
+        return self.n_frames
 
-    def exposures(self) -> Iterator[Exposure]:
-        """The exposures in order, with their truth and their scene where the file has them."""
+    @overload
+    def __getitem__(self, index: int) -> Exposure: ...
+    @overload
+    def __getitem__(self, index: slice) -> RecordingSlice: ...
+    def __getitem__(self, index: int | slice) -> Exposure | RecordingSlice:
+        """An exposure by its number, or a slice, of which nothing is read before it is used.
+
+        Raises RecordingError for an exposure that is damaged.
+        """
+        if isinstance(index, slice):
+            return RecordingSlice(self, range(len(self))[index])
+        number = range(len(self))[index]
+        if (exposure := next(self.exposures(number, number + 1), None)) is None:
+            raise RecordingError(f"exposure {number} of {self.path} cannot be read: {self.damage or 'it is not whole'}")
+        return exposure
+
+    def facts(self) -> dict[str, str]:
+        """What the recording holds, in words."""
+        return super().facts() | ({"damage": self.damage} if self.damage else {})
+
+    def exposures(self, start: int = 0, stop: int | None = None) -> Iterator[Exposure]:
+        """The exposures in order, with their truth and their scene where the file has them.
+
+        With ``start`` and ``stop`` those with the numbers from the one to below the other, counted from 0 on.
+        """
+        if stop is not None and stop <= start:
+            return iter(())
+        chunk, before = self._beginning(start)
+        exposures = (exposure for _, exposure in self._timed(chunk))
+        return islice(exposures, start - before, None if stop is None else stop - before)
+
+    def timed_exposures(self) -> Iterator[tuple[int, Exposure]]:
+        """As `exposures`, each after the log time of the message that it was whole with, ns."""
+        return self._timed(0)
+
+    def _timed(self, chunk: int) -> Iterator[tuple[int, Exposure]]:
+        for now, exposures in self._whole_exposures(chunk):
+            for exposure in exposures:
+                yield now, exposure
+
+    def _whole_exposures(self, chunk: int) -> Iterator[tuple[int, list[Exposure]]]:
+        now = 0
         assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
-        for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE):
+        for raw in self._raw((*_ASSEMBLED, *_BESIDE), chunks=slice(chunk, None)):
             if (message := self.decoded_run(raw) or self.decoded(raw)) is None:
                 continue
+            now = raw.log_time_ns
             if raw.topic in _BESIDE:
-                yield from beside.take(raw.topic, message)
+                yield now, beside.take(raw.topic, message)
             elif completed := assembly.take(raw.topic, message):
-                yield from beside.add(completed)
-        yield from beside.add(assembly.flush())
-        yield from beside.flush()
+                yield now, beside.add(completed)
+        yield now, beside.add(assembly.flush())
+        yield now, beside.flush()
+
+    def _beginning(self, number: int) -> tuple[int, int]:
+        """Where to read from so that an exposure is made as from the file's start: a chunk, and the frames before it.
+
+        An exposure's inputs go on where those of the one before it ended. That one is known for certain if the mirror
+        reported all of it; else its inputs may go on from what was before, and so on.
+        """
+        index, back = self._frame_index if number else None, 1
+        while index is not None and number - back > 0:
+            first = number - back
+            chunk = index.chunk_of(first)
+            infos = self._own_messages((topics.EXPOSURE,), chunks=slice(chunk, chunk + 1))
+            info = next(islice(map(self.decoded, infos), first - index.before[chunk], None), None)
+            if not isinstance(info, schemas_pb2.ExposureInfo):
+                break
+            # Reports come in the order of their steps. Commands may be replaced by others of the same steps, but none
+            # is of a step that the mirror's queue did not reach yet.
+            reach = {topics.APPLIED: info.first_step, topics.COMMAND: info.first_step - self.rig.mirror.queue_steps}
+            reach = {topic: step for topic, step in reach.items() if self.counts.get(topic)}
+            chunk = index.first_chunk(first, reach, self._runs_in)
+            known = next(islice(self._timed(chunk), first - index.before[chunk], None), None)
+            if known is None:
+                break
+            if not known[1].inputs_assumed:
+                return chunk, index.before[chunk]
+            back *= 2
+        return 0, 0
+
+    @cached_property
+    def _frame_index(self) -> FrameIndex | None:
+        """None where the file has no index, or one that cannot say which exposures there are."""
+        if self._index is None or self._losses or self.counts.get(topics.EXPOSURE) != self.n_frames:
+            return None
+        frames = {channel for channel, (topic, _) in self._channels.items() if topic == topics.EXPOSURE}
+        index = FrameIndex.of(self.path, self._index, frames)
+        return index if index is not None and index.before[-1] == self.n_frames else None
+
+    def _runs_in(self, chunk: int) -> Iterator[StepRun]:
+        """The commands and reports in a chunk."""
+        for raw in self._own_messages(tuple(_RUNS), chunks=slice(chunk, chunk + 1)):
+            message = self.decoded_run(raw) or self.decoded(raw)
+            if isinstance(message, Run | Applied | CommandBlock):
+                yield raw.topic, message.first_step + message.n_steps
 
     @property
     def true_scene(self) -> NDArray[np.uint16] | None:
@@ -266,27 +441,30 @@ class Recording:
         if info is not None:
             yield _restored(info, pictures)
 
-    def estimates(self, name: str) -> list[Estimate]:
-        """The estimates that are in the file under a name, in order. Raises RecordingError if there are none."""
-        topic = topics.estimate_topic(name)
-        if topic not in self.counts:
-            known = ", ".join(self.estimators) or "none"
-            raise RecordingError(
-                f"{self.path} holds no estimates of {name} (it has: {known}): `aolink estimate` makes them"
-            )
-        return list(self.iter_estimates(name))
+    def iter_estimates(self, name: str, start: int = 0, stop: int | None = None) -> Iterator[Estimate]:
+        """As `estimates`, one by one: the file is read only as far as they are asked for. None is no error here.
 
-    def iter_estimates(self, name: str) -> Iterator[Estimate]:
-        """As `estimates`, one by one: the file is read only as far as they are asked for. None is no error here."""
+        With ``start`` and ``stop`` those of the exposures that `exposures` gives for them.
+        """
+        if stop is not None and stop <= start:
+            return
+        chunk, before = self._beginning(start)
+        numbers = count(before)
         exposures: dict[int, Exposure] = {}
         waiting: deque[schemas_pb2.Estimate] = deque()
-        for recorded, completed in self.assembled(topics.estimate_topic(name), topics.estimation_topic(name)):
+        ended, done = False, -1
+        """Whether all of the exposures have come, and the last of them that has had its estimate."""
+        wanted = (topics.estimate_topic(name), topics.estimation_topic(name))
+        for recorded, completed in self._assembled(wanted, slice(chunk, None)):
             received = None if recorded is None else recorded.message
             if isinstance(received, schemas_pb2.Estimate):
                 waiting.append(received)
             elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
                 exposures.pop(received.frame_id, None)
-            exposures.update((exposure.frame_id, exposure) for exposure in completed)
+            for exposure, number in zip(completed, numbers, strict=False):
+                ended = stop is not None and number >= stop - 1
+                if start <= number and (stop is None or number < stop):
+                    exposures[exposure.frame_id] = exposure
             # At the end of the recording, an exposure that has not come will not; nor will one of the part before this.
             first = next(iter(exposures), 0)
             while waiting and (recorded is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
@@ -297,6 +475,36 @@ class Recording:
                 # Estimates come in the order of their exposures: what is before this one has had its own.
                 for frame_id in list(exposures)[: list(exposures).index(message.frame_id)]:
                     del exposures[frame_id]
+                done = message.frame_id
+            last = next(reversed(exposures), done)
+            if ended and (last == done or (waiting and waiting[0].frame_id > last)):
+                return
+
+    def _take_side(self, rig: Rig | None) -> None:
+        """Put the estimates of side files in the place of the file's own."""
+        for each in self._side:
+            check_is_side_of(each, self)
+        texts = {each.rig.toml for each in self._side} | ({rig.toml} if rig else set())
+        if len(texts) > 1:
+            raise RecordingError(
+                f"the side files of {self.path} were made with different rig files, or with another than is asked for:"
+                " give those of one"
+            )
+        replaced = {topics.estimate_topic(name) for each in self._side for name in each.estimators}
+        other_rig = self._side[0].rig.toml != self._rig_text
+        own = {topic for topic in self.counts if topic.startswith(topics.ESTIMATE)}
+        gone = own if other_rig else own & replaced
+        # Pictures were restored with some of these estimates; which, only reading all of them would say.
+        self._left_out = frozenset(
+            {*gone, *(topics.estimation_topic(topic.removeprefix(topics.ESTIMATE)) for topic in gone)}
+            | {topic for topic in self.counts if gone and topic.startswith(topics.RESTORED)}
+        )
+        self.counts = {topic: count for topic, count in self.counts.items() if topic not in self._left_out}
+        for each in self._side:
+            self.counts |= each.counts
+            self.schemas = each.schemas | self.schemas
+            self.encodings |= each.encodings
+        self.rig, self.rig_is_recorded = self._side[0].rig, True
 
     def _survey(self, *, check: bool) -> str | None:
         """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
@@ -316,8 +524,10 @@ class Recording:
                     if channel_id in self._channels:
                         self.counts[self._channels[channel_id][0]] = count
                 self.start_ns, self.end_ns = statistics.message_start_time, statistics.message_end_time
-                for each in summary.others:
-                    self._note(record_at(file, each.offset), rig_texts)
+                others = sorted(summary.others, key=lambda each: each.offset)
+                with open_recording(self.path, [(each.offset, each.length) for each in others]) as again:
+                    for each in others:
+                        self._note(record_at(again, each.offset), rig_texts)
                 return rig_texts.get(topics.RIG_ATTACHMENT, rig_texts.get(topics.RIG_METADATA))
         ids: dict[int, str] = {}
         names: dict[int, int] = {}
@@ -362,19 +572,20 @@ class Recording:
             elif record.name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
                 self._channels.setdefault(int(values["id"]), (values.get("topic", ""), values.get("schema", "")))
 
-    def _records(self, channels: Container[int], low: int, high: int) -> Iterator[McapRecord]:
+    def _records(self, channels: Container[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""
         if self._index is None:
             for record, _ in self._scanned():
                 yield record
             return
-        with open_recording(self.path) as file:
-            for index in self._index:
-                held = index.message_index_offsets
-                if index.message_end_time < low or index.message_start_time >= high:
-                    continue
-                if held and not any(channel in channels for channel in held):
-                    continue
+        wanted = [
+            index
+            for index in self._index[chunks]
+            if not (index.message_end_time < low or index.message_start_time >= high)
+            and (not (held := index.message_index_offsets) or any(channel in channels for channel in held))
+        ]
+        with open_recording(self.path, [(each.chunk_start_offset, each.chunk_length) for each in wanted]) as file:
+            for index in wanted:
                 yield from chunk_at(file, index, self._lose)
 
     def _scanned(self) -> Iterator[tuple[McapRecord, bool]]:
@@ -385,13 +596,52 @@ class Recording:
         self._losses.setdefault(loss.offset, loss)
 
 
+@lru_cache(maxsize=8)
+def _parsed_rig(text: str) -> Rig:
+    """The rig of a file; thousands of recordings have the same, and the exposure model is made once for each."""
+    return parse_rig(text)
+
+
+def check_is_side_of(side: Recording, recording: Recording) -> None:
+    """Raise RecordingError where a file does not hold estimates of a recording and nothing else."""
+    if not side.side_of:
+        raise RecordingError(
+            f"{side.path} is a recording of its own and no side file of {recording.path}: `aolink estimate --side`"
+            " writes those"
+        )
+    if side.side_of != recording.digest:
+        name = side.metadata.get("estimated_from", "another recording")
+        raise RecordingError(
+            f"{side.path} does not belong to {recording.path}: its estimates are of another file, which was called"
+            f" {name}; give that one, or estimate again"
+        )
+
+
+def check_stands_alone(recording: Recording) -> None:
+    """Raise RecordingError for a side file, which shows nothing without its recording."""
+    if recording.side_of:
+        name = recording.metadata.get("estimated_from", "a recording")
+        raise RecordingError(
+            f"{recording.path} is a side file with the estimates of {name} alone: give {name}, and after it this file"
+            " where the command takes side files"
+        )
+
+
+def in_time(messages: Iterator[RawMessage]) -> Iterator[tuple[int, RawMessage]]:
+    """Messages with a time that never goes back, so that their order stays."""
+    latest = 0
+    for raw in messages:
+        latest = max(latest, raw.log_time_ns)
+        yield latest, raw
+
+
 def _restored(info: schemas_pb2.Restoration, pictures: dict[str, RawImage]) -> RestoredPictures:
     return convert.restored_from_messages(
         info, pictures.get(topics.RESTORED_SCENE), pictures.get(topics.RESTORED_SPOTS)
     )
 
 
-def _check_replaces(rig: Rig | None, recorded: Rig, path: Path) -> None:
+def _check_replaces(rig: Rig | None, recorded: Rig, path: Path | Url) -> None:
     """Raise RigError where another rig cannot stand in for the one that a recording was made with."""
     if rig is None:
         return

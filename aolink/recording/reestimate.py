@@ -16,7 +16,7 @@ from aolink.files import writing
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.exposures import ExposureAssembly
-from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.reader import RawMessage, Recording, check_stands_alone
 
 _AT_ONCE = 512
 """Exposures that are estimated together, ..."""
@@ -103,6 +103,7 @@ def scored_and_compared(
 
 def check_has_exposures(recording: Recording) -> None:
     """Raise RecordingError if there is nothing to estimate."""
+    check_stands_alone(recording)
     if not (recording.counts.get(topics.EXPOSURE) and recording.counts.get(topics.IMAGE)):
         raise RecordingError(
             f"{recording.path} holds no exposure, which is a message on {topics.EXPOSURE} and one on {topics.IMAGE}:"
@@ -134,7 +135,7 @@ def write_reestimated(
         ``path`` exists and not ``overwrite``, or cannot be written.
     """
     path = Path(path)
-    with writing(path, overwrite=overwrite, sources=[recording.path], error=RecordingError) as partial:
+    with writing(path, overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
         fill_reestimated(
             recording, names, partial, only=only, progress=progress, engine=engine, as_recorded=as_recorded
         )  # fmt: skip

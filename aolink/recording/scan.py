@@ -8,11 +8,12 @@ costs no memory, and no more time than a few readings of it.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -40,6 +41,7 @@ from mcap.records import (
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
+from aolink.recording.remote import Url
 from aolink.recording.search import HEAD, MAX_RECORD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
 
 MAX_CHUNK = 128 << 20
@@ -97,6 +99,8 @@ class Summary:
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     others: list[AttachmentIndex | MetadataIndex] = field(default_factory=list)
+    digest: str = ""
+    """SHA-256 of its bytes."""
 
     @property
     def is_index(self) -> bool:
@@ -115,8 +119,13 @@ class Summary:
         )
 
 
-def open_recording(path: Path) -> IO[bytes]:
+def open_recording(path: Path | Url, expected: Sequence[tuple[int, int]] = ()) -> IO[bytes]:
     """Open a file that should be a recording.
+
+    Parameters
+    ----------
+    expected:
+        First byte and length of the ranges that will be read, in ascending order, for a file behind a URL.
 
     Raises
     ------
@@ -124,9 +133,12 @@ def open_recording(path: Path) -> IO[bytes]:
         The file cannot be read, or is neither an MCAP file nor a part of one.
     """
     try:
-        if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
-            raise RecordingError(f"{path} is a pipe or a device: a recording must be a file, copy it into one")
-        file = path.open("rb")
+        if isinstance(path, Url):
+            file: IO[bytes] = path.open(expected)  # type: ignore[assignment] # a RawIOBase is one in all but name
+        else:
+            if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+                raise RecordingError(f"{path} is a pipe or a device: a recording must be a file, copy it into one")
+            file = path.open("rb")
         head = file.read(len(_MAGIC) + HEAD.size)
     except OSError as error:
         raise RecordingError(f"cannot read {path}: {os.strerror(error.errno or 0).lower()}") from None
@@ -166,7 +178,7 @@ def read_summary(file: IO[bytes]) -> Summary | None:
 
 
 def _parse_summary(data: bytes) -> Summary | None:
-    summary = Summary()
+    summary = Summary(digest=hashlib.sha256(data).hexdigest())
     records: list[McapRecord] = []
     position = 0
     try:

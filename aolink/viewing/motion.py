@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.estimate import Estimate
+from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure, Truth
 from aolink.viewing.palette import TRUTH, estimator_colour
 from aolink.viewing.series import Style, send_axes, send_line, send_states
@@ -49,7 +50,8 @@ def log_estimates(stream: rr.RecordingStream, timebase: Timebase, estimates: Seq
     """One estimator's path with its band, states with theirs, NIS with its bounds, and status.
 
     ``/path/NAME/mean`` and ``/band`` (two lines, `BAND` standard deviations up and down, of the first output),
-    ``/state/start/xI/NAME/mean`` and ``/band``, ``/state/end/...`` alike, ``/nis/NAME``, ``/status/NAME``.
+    ``/state/start/xI/NAME/mean`` and ``/band``, ``/state/end/...`` alike, ``/nis/NAME``, ``/status/NAME``; and
+    ``/estimate/NAME``, which is not drawn: columns for whoever reads the file as a table.
     """
     if not estimates:
         return
@@ -75,7 +77,9 @@ def log_estimates(stream: rr.RecordingStream, timebase: Timebase, estimates: Seq
             limits = column[:, :1] + BAND * deviation[:, i : i + 1] * [1.0, -1.0]
             send_line(stream, f"state/{where}/x{i + 1}/{name}/band", times, limits, band)
     _log_nis(stream, timebase, estimates)
-    send_states(stream, f"status/{name}", timebase.at_steps(starts, frames), [e.status.name for e in estimates])
+    times = timebase.at_steps(starts, frames)
+    send_states(stream, f"status/{name}", times, [e.status.name for e in estimates])
+    _send_table(stream, f"estimate/{name}", times, estimates)
 
 
 def log_errors(
@@ -100,6 +104,18 @@ def log_errors(
     ends = timebase.at_steps(starts + [e.n_steps for e, _ in known], frames)
     for i, column in enumerate(np.moveaxis(np.array([e.end_state - truth.end_state for e, truth in known]), 2, 0)):
         send_axes(stream, f"error/end/x{i + 1}/{name}", ends, column, style)
+
+
+def _send_table(
+    stream: rr.RecordingStream, path: str, times: Sequence[rr.TimeColumn], estimates: Sequence[Estimate]
+) -> None:
+    """Columns ``status`` and ``reason``, and those of `estimate_scalars` with a number for each axis."""
+    words = rr.AnyValues.columns(status=[e.status.name for e in estimates], reason=[e.reason for e in estimates])
+    scalars = [estimate_scalars(e) for e in estimates]
+    numbers = rr.AnyValues.columns(
+        True, **{name: np.concatenate([each[name] for each in scalars]) for name in scalars[0]}
+    )
+    stream.send_columns(path, times, [*words, *numbers.partition([len(e.start_state) for e in estimates])])
 
 
 @lru_cache(maxsize=64)

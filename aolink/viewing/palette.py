@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-import zlib
 
+from aolink.colours import Colour, estimator_colour
 from aolink.errors import EstimatorError
 from aolink.estimation import estimator_row
 
-Colour = tuple[int, int, int]
+__all__ = [
+    "APPLIED", "COMMANDED", "MEASURED", "MISSING", "NOTHING", "STATUS_COLOURS", "TRUTH",
+    "Colour", "by_rank", "estimator_colour", "series_colour",
+]  # fmt: skip
 
 TRUTH: Colour = (245, 200, 40)
 MEASURED: Colour = (165, 165, 165)
@@ -19,7 +22,6 @@ MISSING: Colour = (90, 20, 40)
 NOTHING: Colour = (13, 13, 13)
 """Where there was no exposure yet: the viewer's own background."""
 
-_OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120), (255, 160, 160), (140, 180, 255))
 _SERIES: tuple[Colour, ...] = (
     (86, 180, 233),
     (240, 110, 50),
@@ -42,14 +44,6 @@ STATUS_COLOURS: dict[str, Colour] = {
     "CLIPPED": (190, 50, 50),
 }
 """Colours of an estimate's status and of what drove the mirror."""
-
-
-def estimator_colour(name: str) -> Colour:
-    """Colour of an estimator; one that is not installed here gets one by its name, the same each time."""
-    try:
-        return estimator_row(name).colour
-    except EstimatorError:
-        return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
 
 
 def series_colour(index: int) -> Colour:

@@ -17,16 +17,18 @@ from aolink.files import writing
 
 @contextmanager
 def new_rrd(
-    application: str, path: Path, *, overwrite: bool = False, sources: Iterable[Path] = ()
+    application: str, path: Path, *, overwrite: bool = False, sources: Iterable[Path] = (), identity: str | None = None
 ) -> Iterator[rr.RecordingStream]:
     """A stream into a new .rrd file, which is there when the block has ended well; it has to send a layout.
+
+    Files of one ``application`` with the same ``identity`` are one recording to Rerun; None: each is one of its own.
 
     Raises
     ------
     ViewerError
         The file exists and not ``overwrite``, is one of the ``sources``, or cannot be written.
     """
-    stream = rr.RecordingStream(application)
+    stream = rr.RecordingStream(application, recording_id=identity)
     with writing(path, overwrite=overwrite, sources=sources, suffix=".rrd", error=ViewerError) as partial:
         try:
             stream.save(partial)

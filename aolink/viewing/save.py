@@ -15,6 +15,7 @@ from aolink.estimation.score import score
 from aolink.exposure import Exposure
 from aolink.optics.sensor import SpotSensor
 from aolink.recording import topics
+from aolink.recording.reader import check_stands_alone
 from aolink.rig import Rig
 from aolink.viewing import camera, devices, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
@@ -32,6 +33,8 @@ APPLICATION = "aolink"
 def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False) -> Path:
     """Write a recording as an .rrd file that any Rerun viewer opens with aolink's layout.
 
+    Its recording id in Rerun is the digest of the recording's bytes: the same recording opened twice is one there.
+
     Parameters
     ----------
     recording:
@@ -47,7 +50,7 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
         The file exists already or cannot be written, or the recording has nothing to show.
     """
     path = Path(path)
-    with new_rrd(APPLICATION, path, overwrite=overwrite, sources=[recording.path]) as stream:
+    with new_rrd(APPLICATION, path, overwrite=overwrite, sources=recording.files, identity=recording.digest) as stream:
         contents = send_recording(stream, recording)
         # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
         stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
@@ -57,6 +60,7 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
 
 def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents:
     """Send everything in a recording to a stream; tells what there was, for the layout."""
+    check_stands_alone(recording)
     rig = recording.rig
     exposures = list(recording.exposures())
     if strange := [e for e in exposures if e.pixels.shape != rig.sensor.shape]:

@@ -70,7 +70,7 @@ def test_a_session_with_devices_of_another_package(aolink: Run, installed: dict[
     assert steps == list(range(steps[0], steps[0] + len(steps)))  # each once, in order
     exposures = list(recording.exposures())
     assert all(exposure.inputs_assumed == 0 for exposure in exposures)
-    assert np.abs(exposures[-1].inputs).max() > 0.001
+    assert max(np.abs(each.inputs).max() for each in exposures) > 0.001
     for exposure, estimate in zip(exposures, estimate_exposures(tmp_path / "a.mcap", "o1"), strict=True):
         assert exposure.truth is not None
         assert np.abs(estimate.path - exposure.truth.path).max() < 0.02  # its frames have no noise

@@ -21,6 +21,7 @@ from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
 from aolink.rig import load_rig
 from tests.conftest import EXPOSURES, Session
+from tests.kinds import must_be
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -162,7 +163,9 @@ def test_stopped_no_job_is_begun_and_those_on_the_way_count(recorded: Session, t
     assert 1 <= len(done) <= workers + 1
     assert not any(each.error for each in done)
     assert {each.job.output for each in done} == {*tmp_path.glob("*.mcap")}
-    assert {*tmp_path.iterdir()} == {path for each in done for path in (each.job.output, each.job.record)}
+    assert {*tmp_path.iterdir()} == {
+        path for each in done for path in (each.job.output, must_be(batch.Job, each.job).record)
+    }
 
 
 def runs(pid: int) -> bool:

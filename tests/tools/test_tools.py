@@ -98,7 +98,9 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
     assert "no figure has 'turbulense' in its name" in done.stderr
 
 
-@pytest.mark.parametrize("room", ["estimation", "optics", "wire", "recording", "restoration", "moving_scene"])
+@pytest.mark.parametrize(
+    "room", ["estimation", "optics", "wire", "recording", "batches", "restoration", "moving_scene"]
+)
 def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
     if room == "restoration":

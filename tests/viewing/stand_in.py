@@ -64,6 +64,7 @@ class StandIn:
     rig: Rig = field(default_factory=lambda: load_rig("section-vi-lively"))
     path: Path = Path("session.mcap")
     metadata: dict[str, str] = field(default_factory=dict)
+    digest: str = "0" * 64
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(7)

@@ -32,6 +32,7 @@ class Simulated:
     estimators: list[str] = field(default_factory=lambda: NAMES)
     path: Path = Path("session.mcap")
     metadata: dict[str, str] = field(default_factory=dict)
+    digest: str = "1" * 64
 
     def __post_init__(self) -> None:
         self._exposures = simulate(self.rig, N)

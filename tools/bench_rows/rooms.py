@@ -14,6 +14,7 @@ ROWS = {
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes",
     ),
+    "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "moving_scene": ("moving_scene",),
 }  # fmt: skip

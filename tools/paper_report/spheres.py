@@ -1,152 +1,171 @@
-"""Real motion blur: spheres that diffuse in water, six spots of two directions each, as a rig and its exposures.
+"""Real motion blur: a film of spheres that diffuse in water, through the door that `aolink import` is.
 
-The mean of K frames is an exposure of K fast steps whose path the single frames tell. Each direction is a line of
-pixels: the window's darkness summed across. Kernel and noise are those of single frames; the plant is a random walk.
+The mean of K frames is an exposure of K fast steps whose path the single frames tell. The rig file is the one that
+`aolink rig --from` writes: kernel, noise and random walk of the single frames. Beside the estimators stands what a user
+would do instead: the centroid of each blurred picture, held for the exposure, or interpolated from one to the next.
 """
 
-import dataclasses
+import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
-from aolink.estimation import ESTIMATOR_NAMES, make_estimator
+from aolink.estimation import ESTIMATOR_NAMES, make_estimator, smooth
 from aolink.exposure import Exposure
-from aolink.optics.camera import to_counts
-from aolink.optics.kernel import pixel_mass
-from aolink.optics.sensor import Kernel, Sensor
-from aolink.rig import Rig, load_rig
+from aolink.importing.exposures import Settings
+from aolink.importing.first_rig import first_rig
+from aolink.importing.readers import open_film
+from aolink.importing.recording import import_film
+from aolink.optics.camera import to_density
+from aolink.optics.centroid import weighted_centroid
+from aolink.optics.frame import spot_windows
+from aolink.optics.sensor import SpotSensor
+from aolink.recording.reader import Recording
+from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
-from paper_report.ensemble import Measured, SensorRows, ratio, rms
+from paper_report.ensemble import Measured, ratio, rms
 from paper_report.numbers import Effort
 
 FloatArray = NDArray[np.float64]
 
 FILE = Path(__file__).parents[2] / "tests" / "data" / "diffusing_spheres.npz"
-HALF = 24  # pixels; the field is one slope unit on each side
-COUNTS = 2000.0
+_RATE_HZ = 24.0
+_SKIP = 1
+"""Exposures that are not scored: nothing is known of the spheres before."""
 
 
-REACH = 9  # pixels about where the sphere was last: beyond them are other spheres
-NEAR = 6  # the same across, where it is summed
-
-
-def load() -> tuple[FloatArray, FloatArray]:
-    """Darkness of all frames (6, frames, 48, 48) and tracked positions, pixels, (6, frames, 2)."""
+def places() -> tuple[tuple[float, float], ...]:
+    """Where the six spheres are in the first frame, their films side by side, pixels."""
     data = np.load(FILE)
-    frames, xy = data["frames"].astype(float), data["tracked_xy"].astype(float)
-    return np.median(frames, axis=(2, 3), keepdims=True) - frames, xy
+    width = data["frames"].shape[3]
+    return tuple((float(x) + k * width, float(y)) for k, (x, y) in enumerate(data["tracked_xy"][:, 0]))
 
 
-def profile(dark: FloatArray, centre: FloatArray) -> FloatArray:
-    """Darkness about a pixel summed across, along x and along y, (2, 48); what is beyond is no light."""
-    away = np.abs(np.arange(48) - np.rint(centre)[:, None])
-    (x, y), (near_x, near_y) = away <= REACH, away <= NEAR
-    return np.stack([(dark * near_y[:, None] * x).sum(axis=0), (dark * near_x * y[:, None]).sum(axis=1)])
+def spheres(K: int) -> tuple[Rig, list[Exposure]]:
+    """A rig of 12 axes and its exposures of K frames, read back from a recording."""
+    settings = Settings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
+    film = open_film(FILE)
+    rig = parse_rig(first_rig(film, settings, "spheres"))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "spheres.mcap"
+        import_film(film, rig, settings, path)
+        return rig, list(Recording(path).exposures())
 
 
-def kernel_and_noise(dark: FloatArray, xy: FloatArray) -> tuple[FloatArray, float, float]:
-    """Light of each axis, width of the Gaussian that fits single frames best, and V: what it leaves, times a pixel."""
-    edges = np.linspace(-1, 1, 49)
-    singles = np.array([[profile(dark[s, k], xy[s, k]) for k in range(0, 300, 6)] for s in range(6)])  # (6, k, 2, 48)
-    light = singles.sum(axis=3).mean(axis=1) / HALF
-    density = singles / light[:, None, :, None]
-    track = (xy[:, ::6] + 0.5 - HALF) / HALF
+def centroids(rig: Rig, exposures: Sequence[Exposure]) -> tuple[FloatArray, FloatArray]:
+    """Paths by the centroid of each picture, held and interpolated in time, each (exposures, outputs, K).
 
-    def left(sigma: float) -> FloatArray:
-        return np.asarray(density - pixel_mass(Kernel(shape="gaussian", sigma=float(sigma)), edges, track) * HALF)
-
-    sigma = float(optimize.minimize_scalar(lambda s: (left(s) ** 2).mean(), bounds=(0.02, 0.5), method="bounded").x)
-    seen = np.abs(density) > 0
-    return light, sigma, float((left(sigma)[seen] ** 2).mean() / HALF)
-
-
-def spheres(K: int) -> tuple[Rig, list[Exposure], FloatArray]:
-    """A rig of 12 axes, its exposures of K frames, and the paths, (exposures, 12, K)."""
-    dark, xy = load()
-    light, sigma, V = kernel_and_noise(dark, xy)
-    track = ((xy + 0.5 - HALF) / HALF).transpose(0, 2, 1).reshape(12, -1)
-    rig = load_rig("section-vi-lively")
-    axes, frames = track.shape
-    walk = float(np.diff(track, axis=1).var())
-    plant = dataclasses.replace(
-        rig.plant, A=np.eye(1), B=np.eye(1), B_w=np.eye(1), C=np.eye(1), process_noise=np.eye(1) * walk,
-        initial_mean=np.zeros(1), initial_covariance=np.eye(1) * 0.1, axes=axes,
-    )  # fmt: skip
-    line = dataclasses.replace(
-        rig.sensor.profile,
-        pixels=48,
-        noise_density=V,
-        counts_per_density=COUNTS,
-        kernel=Kernel(shape="gaussian", sigma=sigma),
+    The centroid has a Gaussian weight as wide as the spot; that came nearer than wider ones and than none.
+    """
+    sensor = rig.sensor
+    assert isinstance(sensor, SpotSensor)
+    K, width = rig.timing.exposure_steps, sensor.pixel_width
+    weight_sd = float(np.sqrt(sensor.kernel.variance)) / width
+    found = np.array(
+        [
+            (weighted_centroid(spot_windows(sensor, to_density(sensor, each.pixels)), weight_sd).ravel() + 0.5) * width
+            + sensor.field[0]
+            for each in exposures
+        ]
     )
-    sensor = SensorRows(**{f.name: getattr(line, f.name) for f in dataclasses.fields(Sensor)}, rows=axes)
-    timing = dataclasses.replace(rig.timing, exposure_steps=K, frame_period_steps=K)
-    rig = dataclasses.replace(rig, plant=plant, sensor=sensor, timing=timing)
-    exposures, paths = [], []
-    for j in range(frames // K):
-        steps = slice(j * K, j * K + K)
-        last = xy[:, max(0, j * K - 1)]
-        blurred = np.stack([profile(dark[s, steps].mean(axis=0), last[s]) for s in range(6)])
-        density = (blurred / light[..., None]).reshape(12, 48)
-        exposures.append(
-            Exposure(
-                frame_id=j + 1,
-                first_step=j * K,
-                n_steps=K,
-                pixels=to_counts(sensor, density),
-                mask=np.ones(sensor.shape, bool),
-                inputs=np.zeros((K, axes)),
-                lead_inputs=np.zeros((0, axes)),
-            )
-        )
-        paths.append(track[:, steps])
-    return rig, exposures, np.array(paths)
+    # Windows move from exposure to exposure; between pictures the path is a line where they do not.
+    moved = np.cumsum([each.inputs.sum(axis=0) for each in exposures], axis=0)
+    moved = np.vstack([np.zeros(moved.shape[1]), moved[:-1]])
+    middles = np.arange(len(exposures)) * K + (K - 1) / 2
+    steps = np.arange(len(exposures) * K)
+    still = np.array([np.interp(steps, middles, one) for one in (found - moved).T])
+    interpolated = still.reshape(len(still), -1, K).swapaxes(0, 1) + moved[:, :, None]
+    return np.repeat(found[:, :, None], K, axis=2), interpolated
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Film:
-    """What came of exposures of so many frames of the film."""
+    """Results for exposures of this many frames of the film."""
 
     frames: int
     path: dict[str, Measured]
     """RMSE of the path, pixels, over the twelve axes."""
-    over_o1: dict[str, Measured]
+    over_held: dict[str, Measured]
+    """The same over that of the centroid, held."""
+    smoothed: dict[str, Measured]
+    over_interpolated: dict[str, Measured]
+    """RMSE of the smoothed path over that of the interpolated centroid, which uses the future as well."""
+    coverage: dict[str, float]
+    """Share of the path inside the estimate's 95 % intervals, with the error of the truth in the account."""
 
 
 def film(effort: Effort) -> list[Film]:
     """The estimators on the film, in exposures of each length."""
     found = []
     for frames in effort.film_frames:
-        rig, exposures, paths = spheres(frames)
-        squares = {}
+        rig, exposures = spheres(frames)
+        exposures = exposures[: effort.film_exposures]
+        scored = [k for k, each in enumerate(exposures) if k >= _SKIP and each.truth is not None]
+        true = np.array([each.truth.path for each in exposures if each.truth is not None and each is not exposures[0]])
+        unit = 1 / rig.sensor.pixel_width
+
+        def squares(paths: FloatArray, true: FloatArray = true, unit: float = unit) -> FloatArray:
+            """Mean squared errors, pixels squared, (axes, exposures)."""
+            return np.asarray(((paths - true) ** 2).mean(axis=2).T * unit**2)
+
+        held, interpolated = (squares(each[scored]) for each in centroids(rig, exposures))
+        path, smoothed, coverage = {"centroid, held": held}, {"centroid, interpolated": interpolated}, {}
         for name in ESTIMATOR_NAMES:
             options = {"particles": effort.particles} if name == "sampled" else {}
             estimator = make_estimator(rig, name, **options)
-            estimates = [estimator.step(exposure) for exposure in exposures[: effort.film_exposures]]
-            error = np.array([e.path - path for e, path in zip(estimates, paths, strict=False)])[1:]
-            squares[name] = HALF**2 * (error**2).mean(axis=2).T  # (axes, exposures)
-        over = {name: ratio(each, squares["o1"]) for name, each in squares.items()}
-        found.append(Film(frames, {name: rms(each) for name, each in squares.items()}, over))
+            estimates = [estimator.step(exposure) for exposure in exposures]
+            some = [estimates[k] for k in scored]
+            after = smooth(rig.plant, exposures, estimates)
+            path[name] = squares(np.array([each.path for each in some]))
+            smoothed[name] = squares(np.array([after[k].path for k in scored]))
+            truth_sd = max(each.truth.path_sd for each in exposures if each.truth is not None)
+            error = np.abs(np.array([each.path for each in some]) - true)
+            spread = np.hypot(np.array([each.path_sd for each in some]), truth_sd)
+            coverage[name] = float((error <= 1.96 * spread).mean())
+        found.append(
+            Film(
+                frames,
+                {name: rms(each) for name, each in path.items()},
+                {name: ratio(each, held) for name, each in path.items()},
+                {name: rms(each) for name, each in smoothed.items()},
+                {name: ratio(each, interpolated) for name, each in smoothed.items()},
+                coverage,
+            )
+        )
     return found
 
 
 def film_section(found: Sequence[Film]) -> list[Block]:
     """A row for each estimator, exposures of more and more frames across."""
-    names = list(found[0].path)
+    filtered, smoothed = list(found[0].path), list(found[0].smoothed)
     across = [f"{each.frames} frames" for each in found]
     return [
         Heading("Blur that nobody here made"),
         Text(
             "Not the paper's: a film of six spheres that diffuse in water, along x and y"
-            " (tests/data/diffusing_spheres.md). The mean of some frames is an exposure, what a tracker saw in the"
-            " single frames its path; kernel and noise are those of single frames, the plant is a random walk. The"
-            " model is not known to be right: what counts is the ratio to o1. RMSE of the path, pixels, with the"
-            " standard error over the twelve axes:"
+            " (tests/data/diffusing_spheres.md), imported as `aolink rig --from` and `aolink import --track 6 --sum K`"
+            " do it. The mean of K frames is an exposure, the places in the single frames its path; kernel, noise and"
+            " random walk are those of single frames. RMSE of the path, pixels, with the standard error over the twelve"
+            " axes:"
         ),
-        Table(["estimator", *across], [[name, *(str(each.path[name]) for each in found)] for name in names]),
-        Text("Over o1's, with the 95 % interval of a bootstrap over the axes:"),
-        Table(["estimator", *across], [[name, *(each.over_o1[name].interval for each in found)] for name in names]),
+        Table(["estimator", *across], [[name, *(str(each.path[name]) for each in found)] for name in filtered]),
+        Text("Over that of the held centroid, with the 95 % interval of a bootstrap over the axes:"),
+        Table(
+            ["estimator", *across], [[name, *(each.over_held[name].interval for each in found)] for name in filtered]
+        ),
+        Text("Smoothed, beside the centroid interpolated to the next picture; both use the future:"),
+        Table(["smoother", *across], [[name, *(str(each.smoothed[name]) for each in found)] for name in smoothed]),
+        Text("Over that of the interpolated centroid:"),
+        Table(
+            ["smoother", *across],
+            [[name, *(each.over_interpolated[name].interval for each in found)] for name in smoothed],
+        ),
+        Text("Share of the path inside the estimate's 95 % intervals, with the tracker's own error added:"),
+        Table(
+            ["estimator", *across],
+            [[name, *(f"{each.coverage[name]:.3f}" for each in found)] for name in ESTIMATOR_NAMES],
+        ),
     ]

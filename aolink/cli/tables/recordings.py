@@ -41,7 +41,7 @@ def recording_facts(recording: Recording) -> dict[str, Any]:
     gaps, estimates = _gaps_and_estimates(recording)
     return {
         "file": str(recording.path),
-        "bytes": recording.path.stat().st_size,
+        "bytes": recording.size,
         "complete": recording.complete,
         "damage": recording.damage,
         "start_ns": recording.start_ns,

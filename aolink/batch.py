@@ -1,0 +1,11 @@
+"""One recording estimated by one call, for batches on whatever engine: see `aolink/jobs/README.md`.
+
+>>> from aolink.batch import Settings
+>>> Settings(estimator="moments").estimator
+'moments'
+"""
+
+from aolink.jobs.tables import COLUMNS, EXPOSURE_COLUMNS
+from aolink.jobs.unit import Model, Settings, estimate_file
+
+__all__ = ["COLUMNS", "EXPOSURE_COLUMNS", "Model", "Settings", "estimate_file"]

@@ -1,0 +1,41 @@
+"""Commands that exchange recordings with other programs: export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aolink.cli.common import FileArgument, OverwriteOption, app, open_recording, stderr, stdout
+from aolink.cli.terminal import progress_bar
+
+
+@app.command(epilog="Example: aolink export session.mcap -o session.parquet -e o3")
+def export(
+    file: FileArgument,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="What to write: .npz, .csv, .parquet, .nc (NetCDF) or .fits (AOT)."
+        ),
+    ],
+    estimator: Annotated[
+        list[str] | None,
+        typer.Option("--estimator", "-e", help="Whose estimates; may be given several times. All by default."),
+    ] = None,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Write exposures, inputs, estimates and truth of a recording as other programs read them.
+
+    NumPy, NetCDF and AOT telemetry hold the frames and the paths; a table has a row for each exposure and axis.
+    """
+    from aolink.exporting.files import export as export_series
+
+    recording = open_recording(file)
+    known = recording.damage
+    with progress_bar(stderr, recording.n_frames) as tell:
+        export_series(recording, output, estimator, overwrite=overwrite, progress=lambda n: tell("export", n))
+    if recording.damage != known:
+        stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
+    stdout.print(f"written: {output}", markup=False)

@@ -1,0 +1,20 @@
+"""One colour for each estimator, in the viewer and in every plot."""
+
+from __future__ import annotations
+
+import zlib
+
+from aolink.errors import EstimatorError
+from aolink.estimation import estimator_row
+
+Colour = tuple[int, int, int]
+
+_OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120), (255, 160, 160), (140, 180, 255))
+
+
+def estimator_colour(name: str) -> Colour:
+    """Colour of an estimator; one that is not installed here gets one by its name, the same each time."""
+    try:
+        return estimator_row(name).colour
+    except EstimatorError:
+        return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]

@@ -1,0 +1,238 @@
+"""Exposures and estimates as arrays along time, each with its dimensions, its unit and its meaning."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import ExportError
+from aolink.exporting.common import Progress, clock_of, no_progress, time_ns, together
+from aolink.exporting.series import Series
+from aolink.exporting.summary import estimate_scalars
+from aolink.exposure import Exposure
+
+_MOST_BYTES = 8 << 30
+"""More is not put into memory at once."""
+_SLOPE = "slope unit"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Variable:
+    """One array of an export."""
+
+    dims: tuple[str, ...]
+    """Names of its dimensions."""
+    values: NDArray[Any]
+    text: str
+    """What it is."""
+    unit: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    """How one variable is got."""
+
+    dims: tuple[str, ...]
+    """Besides time, and estimator."""
+    get: Callable[[Any], Any]
+    text: str
+    unit: str = ""
+    in_words: bool = False
+
+
+EXPOSURE = {
+    "frame_id": _Row(dims=(), get=lambda e: e.frame_id, text="the camera's own count of its frames"),
+    "first_step": _Row(dims=(), get=lambda e: e.first_step, text="fast step at which the exposure starts"),
+    "n_steps": _Row(dims=(), get=lambda e: e.n_steps, text="fast steps in the exposure"),
+    "start_offset": _Row(
+        dims=(), get=lambda e: e.start_offset, text="how far into its first fast step the exposure starts", unit="step"
+    ),
+    "device_start_ns": _Row(dims=(), get=lambda e: e.device_start_ns, text="start, camera's clock", unit="ns"),
+    "device_end_ns": _Row(dims=(), get=lambda e: e.device_end_ns, text="end, camera's clock", unit="ns"),
+    "host_start_ns": _Row(dims=(), get=lambda e: e.host_start_ns, text="start, host's clock; 0: not known", unit="ns"),
+    "host_receive_ns": _Row(
+        dims=(), get=lambda e: e.host_receive_ns, text="when the host had the frame, host's clock", unit="ns"
+    ),
+    "clock_sigma_ns": _Row(
+        dims=(), get=lambda e: e.clock_sigma_ns, text="standard deviation of host_start_ns", unit="ns"
+    ),
+    "chunks_lost": _Row(dims=(), get=lambda e: e.chunks_lost, text="chunks of the frame that never arrived"),
+    "inputs_assumed": _Row(
+        dims=(), get=lambda e: e.inputs_assumed, text="steps of inputs and lead inputs without the mirror's report"
+    ),
+    "lead_steps": _Row(
+        dims=(), get=lambda e: len(e.lead_inputs), text="fast steps between the exposure before and this one"
+    ),
+    "pixels": _Row(dims=("row", "column"), get=lambda e: e.pixels, text="the frame", unit="count"),
+    "mask": _Row(dims=("row", "column"), get=lambda e: e.mask, text="whether the pixel arrived"),
+    "inputs": _Row(
+        dims=("step", "input"), get=lambda e: e.inputs, text="what the mirror held in each fast step", unit="input unit"
+    ),
+}
+TRUTH = {
+    "truth_start_state": _Row(
+        dims=("axis", "state"), get=lambda t: t.start_state, text="true state at the start", unit="plant's unit"
+    ),
+    "truth_end_state": _Row(
+        dims=("axis", "state"), get=lambda t: t.end_state, text="true state a step after the end", unit="plant's unit"
+    ),
+    "truth_path": _Row(dims=("output", "step"), get=lambda t: t.path, text="true path", unit=_SLOPE),
+}
+ESTIMATE = {
+    "status": _Row(
+        dims=(), get=lambda e: e.status.name, text="what became of the measurement; empty: no estimate", in_words=True
+    ),
+    "reason": _Row(dims=(), get=lambda e: e.reason, text="why the status is not OK", in_words=True),
+    "start_state": _Row(
+        dims=("axis", "state"), get=lambda e: e.start_state, text="state at the start", unit="plant's unit"
+    ),
+    "start_state_sd": _Row(
+        dims=("axis", "state"), get=lambda e: _sd(e.start_covariance), text="its standard deviation",
+        unit="plant's unit",
+    ),
+    "end_state": _Row(
+        dims=("axis", "state"), get=lambda e: e.end_state, text="state one fast step after the end", unit="plant's unit"
+    ),
+    "end_state_sd": _Row(
+        dims=("axis", "state"), get=lambda e: _sd(e.end_covariance), text="its standard deviation", unit="plant's unit"
+    ),
+    "path": _Row(dims=("output", "step"), get=lambda e: e.path, text="output at each fast step", unit=_SLOPE),
+    "path_sd": _Row(dims=("output", "step"), get=lambda e: e.path_sd, text="its standard deviation", unit=_SLOPE),
+    "path_rms": _Row(
+        dims=("axis",), get=lambda e: estimate_scalars(e)["path_rms"], text="RMS of the path about its mean",
+        unit=_SLOPE,
+    ),
+    "nis": _Row(
+        dims=("axis",), get=lambda e: estimate_scalars(e)["nis"],
+        text="normalised innovation squared; NaN: no measurement",
+    ),
+}  # fmt: skip
+
+
+def arrays(
+    series: Series, estimators: Sequence[str] | None = None, progress: Progress = no_progress
+) -> dict[str, Variable]:
+    """Everything about exposures and their estimates, by name, in memory.
+
+    Dimensions: ``time``, an exposure each; ``row`` and ``column`` of a frame; ``step``, a fast step of an exposure;
+    ``input``; ``axis``, ``state`` and ``output`` of the plant; ``estimator``. ``lead_inputs`` are those of the steps
+    between exposures, end to end along ``lead_step``: ``lead_steps`` says how many belong to each exposure, before it.
+    Frames of a picture sensor are ``scene``. Variables of a truth, or of estimates, are there if these are; where one
+    exposure has none, numbers are NaN and texts empty.
+
+    Parameters
+    ----------
+    estimators:
+        Whose estimates; all of them by default.
+
+    Raises
+    ------
+    RecordingError
+        There are no estimates of such a name.
+    ExportError
+        There is no exposure, the exposures have different sizes, or all of it would be too large for the memory.
+    """
+    names = series.named(estimators)
+    _check_size(series, len(names))
+    columns: dict[str, list[Any]] = {name: [] for name in (*EXPOSURE, *TRUTH)}
+    by_estimator: dict[str, list[list[Any]]] = {name: [[] for _ in names] for name in ESTIMATE}
+    times: list[int] = []
+    leads, scenes = [], []
+    first: Exposure | None = None
+    clock = ""
+    for exposure, estimates in together(series, names, progress):
+        if first is None:
+            first, clock = exposure, clock_of(exposure)
+        _check_alike(series, first, exposure)
+        times.append(time_ns(series, exposure, clock))
+        leads.append(exposure.lead_inputs)
+        scenes.append(exposure.scene)
+        for name, row in EXPOSURE.items():
+            columns[name].append(row.get(exposure))
+        for name, row in TRUTH.items():
+            columns[name].append(None if exposure.truth is None else row.get(exposure.truth))
+        for name, row in ESTIMATE.items():
+            for column, estimate in zip(by_estimator[name], estimates, strict=True):
+                column.append(None if estimate is None else row.get(estimate))
+    found = {
+        "time": Variable(
+            dims=("time",), values=np.array(times).astype("datetime64[ns]"),
+            text=f"start of the exposure, by {clock or 'its fast step'}; UTC where that is the host's clock",
+        )
+    }  # fmt: skip
+    for name, row in EXPOSURE.items():
+        found[name] = _variable(row, np.array(columns[name]))
+    found["lead_inputs"] = Variable(
+        dims=("lead_step", "input"), values=np.concatenate(leads), text="what the mirror held between the exposures",
+        unit="input unit",
+    )  # fmt: skip
+    found |= _scenes(scenes)
+    sizes = {
+        "axis": series.rig.plant.axes, "state": series.rig.plant.n_states, "output": series.rig.n_outputs,
+        "step": found["inputs"].values.shape[1],
+    }  # fmt: skip
+    if any(each is not None for each in columns["truth_path"]):
+        found |= {name: _variable(row, _filled(row, columns[name], sizes)) for name, row in TRUTH.items()}
+    if names:
+        found["estimator"] = Variable(dims=("estimator",), values=np.array(names), text="name of the estimator")
+        for name, row in ESTIMATE.items():
+            whole = _filled(row, [each for column in by_estimator[name] for each in column], sizes)
+            found[name] = _variable(row, whole.reshape(len(names), len(times), *whole.shape[1:]), "estimator")
+    return found
+
+
+def _variable(row: _Row, values: NDArray[Any], *before: str) -> Variable:
+    return Variable(dims=(*before, "time", *row.dims), values=values, text=row.text, unit=row.unit)
+
+
+def _filled(row: _Row, values: Sequence[Any], sizes: Mapping[str, int]) -> NDArray[Any]:
+    """The values as an array, with NaN or an empty text for None."""
+    missing = "" if row.in_words else np.full([sizes[dim] for dim in row.dims], np.nan)
+    return np.array([missing if each is None else each for each in values])
+
+
+def _sd(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)))
+
+
+def _scenes(scenes: Sequence[Any]) -> Mapping[str, Variable]:
+    """Frames of the picture sensor; one that never came is zero, with nothing of it in the mask."""
+    known = next((each for each in scenes if each is not None), None)
+    if known is None:
+        return {}
+    dims = ("time", "scene_row", "scene_column")
+    dark, lost = np.zeros_like(known.pixels), np.zeros_like(known.mask)
+    pixels = np.array([dark if each is None else each.pixels for each in scenes])
+    mask = np.array([lost if each is None else each.mask for each in scenes])
+    return {
+        "scene": Variable(dims=dims, values=pixels, text="the picture sensor's frame", unit="count"),
+        "scene_mask": Variable(dims=dims, values=mask, text="whether the pixel arrived"),
+    }
+
+
+def _check_alike(series: Series, first: Exposure, other: Exposure) -> None:
+    ours = (first.n_steps, *first.pixels.shape)
+    theirs = (other.n_steps, *other.pixels.shape)
+    if ours != theirs:
+        raise ExportError(
+            f"frame {other.frame_id} of {series.path} has {theirs} fast steps, rows and columns, frame {first.frame_id}"
+            f" has {ours}: they make no array; a table (.csv, .parquet) takes both"
+        )
+
+
+def _check_size(series: Series, n_estimators: int) -> None:
+    """Refuse what would fill the memory."""
+    rig, steps = series.rig, series.rig.timing.exposure_steps
+    numbers = (1 + 2 * n_estimators) * rig.n_outputs * steps + rig.n_inputs * steps
+    numbers += 4 * n_estimators * rig.plant.axes * rig.plant.n_states
+    pixels = int(np.prod(rig.sensor.shape)) + (int(np.prod(rig.scene.shape)) if rig.scene else 0)
+    size = len(series) * (8 * numbers + 3 * pixels)
+    if size > _MOST_BYTES:
+        raise ExportError(
+            f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {_MOST_BYTES >> 30} are allowed:"
+            " take fewer estimators or a part of it (`aolink cut`), or a table (.csv, .parquet), written row by row"
+        )

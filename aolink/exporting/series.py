@@ -1,0 +1,171 @@
+"""`Series`: exposures of one rig and their estimates, with what a notebook expects of them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any, overload
+
+from aolink.errors import RecordingError
+from aolink.estimation.estimate import Estimate
+from aolink.exposure import Exposure
+from aolink.rig import Rig
+from aolink.units import duration
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+
+class Series(ABC):
+    """Exposures in order, with the estimates that were made of them; nothing is read before it is asked for.
+
+    ``len(series)``, ``series[7]``, ``series[-10:]`` and a loop over it give exposures. A slice is a series too.
+    """
+
+    rig: Rig
+    path: Any
+    """The file that they are in: a path, or the location of one behind a URL."""
+    metadata: dict[str, str]
+    """Facts about the session."""
+
+    @property
+    @abstractmethod
+    def estimators(self) -> list[str]:
+        """Names of the estimators whose results are there."""
+
+    @property
+    @abstractmethod
+    def has_truth(self) -> bool:
+        """Whether it is known what really happened, for some exposures at least."""
+
+    @abstractmethod
+    def exposures(self) -> Iterator[Exposure]:
+        """The exposures, one after the other."""
+
+    @abstractmethod
+    def iter_estimates(self, name: str) -> Iterator[Estimate]:
+        """An estimator's estimates of these exposures in their order; an exposure may have none."""
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @overload
+    def __getitem__(self, index: int) -> Exposure: ...
+    @overload
+    def __getitem__(self, index: slice) -> Series: ...
+    @abstractmethod
+    def __getitem__(self, index: int | slice) -> Exposure | Series: ...
+
+    def __bool__(self) -> bool:
+        return True  # an empty recording is a recording
+
+    def __iter__(self) -> Iterator[Exposure]:
+        return self.exposures()
+
+    def estimates(self, name: str) -> list[Estimate]:
+        """The estimates by an estimator's name, in order. Raises RecordingError if there are none of that name."""
+        self.named([name])
+        return list(self.iter_estimates(name))
+
+    def named(self, estimators: Sequence[str] | None) -> list[str]:
+        """The names themselves, or those of all estimators for None. Raises RecordingError for one that is not here."""
+        for name in estimators or ():
+            if name not in self.estimators:
+                known = ", ".join(self.estimators) or "none"
+                raise RecordingError(
+                    f"{self.path} holds no estimates of {name} (it has: {known}): `aolink estimate` makes them"
+                )
+        return self.estimators if estimators is None else list(dict.fromkeys(estimators))
+
+    def to_pandas(self, estimators: Sequence[str] | None = None) -> pd.DataFrame:
+        """A table with a row for each exposure and axis, indexed by time (UTC).
+
+        The columns are those of `aolink.exporting.table`; estimators are all, or those that are named.
+
+        Raises
+        ------
+        RecordingError
+            There are no estimates of such a name.
+        ExportError
+            There is no exposure, or pandas is missing.
+        """
+        from aolink.exporting.table import to_pandas
+
+        return to_pandas(self, estimators)
+
+    def to_xarray(self, estimators: Sequence[str] | None = None) -> xr.Dataset:
+        """All of it as one dataset along ``time`` (UTC): frames, inputs, truth, and estimates along ``estimator``.
+
+        The variables are those of `aolink.exporting.arrays`, all in memory: take a slice of what is long.
+
+        Raises
+        ------
+        RecordingError
+            There are no estimates of such a name.
+        ExportError
+            There is no exposure, the exposures have different sizes, it would be too large, or xarray is missing.
+        """
+        from aolink.exporting.dataset import to_xarray
+
+        return to_xarray(self, estimators)
+
+    def plot(
+        self,
+        estimators: Sequence[str] | None = None,
+        *,
+        output: int = 0,
+        axes: tuple[Axes, Axes] | None = None,
+    ) -> tuple[Axes, Axes]:
+        """Draw with matplotlib what the camera saw of one output with the paths over it, and the NIS of the estimates.
+
+        Parameters
+        ----------
+        estimators:
+            Whose paths and NIS; all by default.
+        output:
+            Number of the output (a row of a path).
+        axes:
+            Where to draw the two; by default on a new figure.
+
+        Returns
+        -------
+        The axes with the paths, and those with the NIS.
+
+        Raises
+        ------
+        RecordingError
+            There are no estimates of such a name.
+        ExportError
+            There is no exposure or no such output, or matplotlib is missing.
+        """
+        from aolink.exporting.plot import plot
+
+        return plot(self, estimators, output, axes)
+
+    def facts(self) -> dict[str, str]:
+        """What there is, in words."""
+        timing, (rows, columns) = self.rig.timing, self.rig.sensor.shape
+        length = duration(timing.exposure_steps * timing.fast_step_s)
+        period = duration(timing.frame_period_steps * timing.fast_step_s)
+        return {
+            "exposures": f"{len(self)} of {timing.exposure_steps} fast steps ({length}), one every {period}",
+            "frames": f"{rows} x {columns} pixels",
+            "rig": f"{self.rig.name}: {self.rig.n_inputs} inputs, {self.rig.n_outputs} outputs",
+            "estimates": ", ".join(self.estimators) or "none",
+            "truth": "known" if self.has_truth else "not known",
+        }
+
+    def __repr__(self) -> str:
+        estimators = f", estimates of {', '.join(self.estimators)}" if self.estimators else ""
+        truth = ", truth" if self.has_truth else ""
+        return f"<{self._title()}: {len(self)} exposures, rig {self.rig.name}{estimators}{truth}>"
+
+    def _repr_html_(self) -> str:
+        rows = "".join(f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self.facts().items())
+        return f"<table><caption>{escape(self._title())}</caption>{rows}</table>"
+
+    def _title(self) -> str:
+        return f"Recording {self.path.name}"

@@ -1,0 +1,160 @@
+"""Exposures as AOT telemetry (Gomes et al., aotpy): what adaptive optics has names for, and tables for the rest.
+
+Frames are the pixel intensities of a Shack-Hartmann sensor's detector, with the centres of gravity of its spots as
+measurements; the inputs that the mirror held are a loop's commands, one row for each fast step. A line sensor is one
+spot whose second direction is not measured (NaN). Estimates, truth, the facts about each exposure and the rig file,
+for which the format has no place, are binary tables behind what it knows: aotpy warns that they are not of its format
+and gives them as extra data, and every program that reads FITS reads them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.estimation.frames.spots import profiles
+from aolink.exporting.arrays import ESTIMATE, EXPOSURE, TRUTH, Variable, arrays
+from aolink.exporting.common import Progress, check_frame, facts, needed
+from aolink.exporting.series import Series
+from aolink.optics.camera import to_density
+from aolink.optics.centroid import centre_of_gravity
+from aolink.optics.sensor import SpotSensor
+
+FloatArray = NDArray[np.float64]
+
+_IN_IMAGES = ("pixels", "inputs")
+"""What of an exposure is not in the table, because an image holds it."""
+
+
+def write_fits(series: Series, names: Sequence[str], path: Path, progress: Progress) -> None:
+    """Write a FITS file that aotpy reads. Raises as `arrays`, and ExportError where aotpy is missing."""
+    aot = needed("aotpy", "aot", "AOT telemetry (.fits)")
+    writer = needed("aotpy.io.fits.writer", "aot", "AOT telemetry (.fits)")
+    fits = needed("astropy.io.fits", "aot", "AOT telemetry (.fits)")
+    found = arrays(series, names, progress)  # whose frames are all of one size
+    check_frame(series, next(series.exposures()))
+    hdus = writer.AOTFITSWriter(_system(aot, series, found)).get_hdulist()
+    hdus.append(_table(fits, "EXPOSURES", {k: found[k].values for k in EXPOSURE if k not in _IN_IMAGES}))
+    if "truth_path" in found:
+        hdus.append(_table(fits, "TRUTH", {k: found[k].values for k in TRUTH}))
+    for k, name in enumerate(names):
+        of_one = {"frame_id": found["frame_id"].values} | {each: found[each].values[k] for each in ESTIMATE}
+        hdus.append(_table(fits, _header_text(f"ESTIMATE_{name}"), of_one))
+    keys, texts = zip(*facts(series).items(), strict=True)
+    hdus.append(_table(fits, "FACTS", {"key": np.array(keys), "value": np.array(texts)}))
+    rig_file = np.frombuffer(series.rig.toml.encode(), dtype=np.uint8)
+    hdus.append(_table(fits, "RIG", {"toml_utf8": rig_file[None]}))
+    with path.open("wb") as file:
+        hdus.writeto(file)
+
+
+def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
+    """What AOT has names for."""
+    rig, times = series.rig, found["time"].values
+    step_s, begun = rig.timing.fast_step_s, times.astype(np.int64) / 1e9
+    frames = aot.Time(uid="FRAMES", timestamps=begun.tolist(), frame_numbers=found["frame_id"].values.tolist())
+    telescope = aot.MainTelescope(uid="NONE")  # AOT asks for one, and for a source
+    source = aot.NaturalGuideStar(uid="SPOT")
+    sensor, pixels = rig.sensor, found["pixels"].values
+    spots, centres = _centres(series, pixels, found["mask"].values)
+    shape, lit = (sensor.grid, sensor.lit) if isinstance(sensor, SpotSensor) else ((1, 1), [0])
+    grid = np.full(shape, -1)
+    grid.flat[lit] = np.arange(spots)
+    camera = aot.Detector(
+        uid="CAMERA",
+        pixel_intensities=aot.Image("PIXELS", pixels, unit="adu", time=frames),
+        integration_time=rig.timing.exposure_steps * step_s,
+        frame_rate=1 / (rig.timing.frame_period_steps * step_s),
+    )
+    wavefront_sensor = aot.ShackHartmann(
+        uid="SENSOR",
+        source=source,
+        n_valid_subapertures=spots,
+        measurements=aot.Image("CENTRES_OF_GRAVITY", centres, unit="slope unit", time=frames),
+        subaperture_mask=aot.Image("SUBAPERTURES", grid),
+        mask_offsets=[aot.Coordinates(0, 0)],
+        subaperture_size=float(sensor.window[1]) if isinstance(sensor, SpotSensor) else None,
+        detector=camera,
+        centroiding_algorithm="centre of gravity of the window",
+    )
+    mirrors = {1: aot.LinearStage, 2: aot.TipTiltMirror}
+    sized = {} if rig.n_inputs in mirrors else {"n_valid_actuators": rig.n_inputs}
+    mirror = mirrors.get(rig.n_inputs, aot.DeformableMirror)(uid="MIRROR", telescope=telescope, **sized)
+    steps, commands = _commands(found)
+    # The start of a fast step, by the exposure that it leads to or is in.
+    of_exposure = np.repeat(np.arange(len(times)), found["lead_steps"].values + found["n_steps"].values)
+    stamps = begun[of_exposure] + (steps - found["first_step"].values[of_exposure]) * step_s
+    loop = aot.ControlLoop(
+        uid="LOOP",
+        commanded_corrector=mirror,
+        input_sensor=wavefront_sensor,
+        commands=aot.Image("COMMANDS", commands, unit="input unit"),
+        time=aot.Time(uid="FAST_STEPS", timestamps=stamps.tolist(), frame_numbers=steps.tolist()),
+        closed=False,
+        framerate=1 / step_s,
+    )
+    cameras = []
+    if "scene" in found:
+        scene = aot.Detector(uid="SCENE", pixel_intensities=aot.Image("SCENE", found["scene"].values, "adu", frames))
+        cameras.append(aot.ScoringCamera(uid="SCENE_CAMERA", detector=scene))
+    first, last = (datetime.fromtimestamp(float(each), UTC) for each in (begun[0], begun[-1]))
+    return aot.AOSystem(
+        ao_mode="SCAO", name=_header_text(rig.name), config=_header_text(rig.summary),
+        date_beginning=first, date_end=last,
+        main_telescope=telescope, sources=[source], scoring_cameras=cameras, wavefront_sensors=[wavefront_sensor],
+        wavefront_correctors=[mirror], loops=[loop],
+    )  # fmt: skip
+
+
+def _centres(series: Series, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]) -> tuple[int, FloatArray]:
+    """Number of spots, and centres of gravity of the frames, slope units, (frames, 2, spots).
+
+    NaN where a window holds no light or has lost a pixel.
+    """
+    sensor = series.rig.sensor
+    line = sensor.profile
+    if isinstance(sensor, SpotSensor):
+        each = [profiles(sensor, frame, whole) for frame, whole in zip(pixels, mask, strict=True)]
+        counts, good = np.array([e.counts for e in each]), np.array([e.mask for e in each])
+    else:
+        counts, good = pixels.astype(np.float64), mask
+    light = to_density(line, counts.reshape(-1, 1, line.pixels))
+    found = line.field[0] + (centre_of_gravity(light)[:, 0] + 0.5) * line.pixel_width
+    found = np.where(good.reshape(-1, line.pixels).all(axis=1), found, np.nan).reshape(len(pixels), -1)
+    if not isinstance(sensor, SpotSensor):
+        return 1, np.stack([found, np.full_like(found, np.nan)], axis=1)
+    return sensor.spots, found.reshape(len(pixels), sensor.spots, 2).swapaxes(1, 2)
+
+
+def _commands(found: Mapping[str, Variable]) -> tuple[NDArray[np.int64], FloatArray]:
+    """Fast steps and the inputs in each, between the exposures and in them, in order: (steps,), (steps, inputs)."""
+    leads = np.split(found["lead_inputs"].values, np.cumsum(found["lead_steps"].values)[:-1])
+    steps, rows = [], []
+    for first, lead, inputs in zip(found["first_step"].values, leads, found["inputs"].values, strict=True):
+        steps.append(np.arange(first - len(lead), first + len(inputs)))
+        rows += [lead, inputs]
+    return np.concatenate(steps), np.concatenate(rows)
+
+
+def _table(fits: Any, name: str, columns: Mapping[str, NDArray[Any]]) -> Any:
+    """A binary table with a row for each of the first dimension."""
+    made = []
+    for key, values in columns.items():
+        if values.dtype.kind == "U":
+            values = np.char.encode(values, "ascii", "replace")  # FITS knows no other letters
+        flat = values.reshape(len(values), -1)
+        code = {"f": "D", "i": "K", "u": "B", "b": "L", "S": "A"}[values.dtype.kind]
+        repeat = max(values.dtype.itemsize, 1) if code == "A" else flat.shape[1]
+        dim = f"({','.join(map(str, reversed(values.shape[1:])))})" if values.ndim > 2 else None
+        made.append(fits.Column(name=key, format=f"{repeat}{code}", array=values, dim=dim))
+    return fits.BinTableHDU.from_columns(made, name=name)
+
+
+def _header_text(text: str) -> str:
+    """A text that may stand in a FITS header: one line of printable ASCII."""
+    return "".join(c if " " <= c <= "~" else "?" for c in " ".join(text.split()))

@@ -1,0 +1,113 @@
+"""The jobs of a batch on the workers of a Dask scheduler: work that is lost with a worker is done again by another."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+from aolink.errors import AolinkError
+from aolink.jobs.batch import Done, SideJob, do
+from aolink.jobs.unit import aolink_version
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_CONNECT_S = 5.0
+_POLL_S = 0.1
+"""How often the user's wish to stop is looked for."""
+
+
+def run_on(
+    address: str,
+    todo: Sequence[SideJob],
+    *,
+    stop: Callable[[], bool] = lambda: False,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Iterator[Done]:
+    """Do jobs on the workers of a scheduler; gives each when it is done, in no order. A failed one stops no other.
+
+    Recordings and results are where the workers find them: on a file system that all share, or behind URLs. When
+    ``stop()`` says so those that no worker has begun are taken back; what is on the way is finished there, but not
+    waited for.
+
+    Raises
+    ------
+    AolinkError
+        distributed is not installed, no scheduler answers, it has no workers or goes away, or a worker has another
+        aolink.
+    """
+    with _connected(address) as client:
+        _check_workers(client, address)
+        from distributed import as_completed
+
+        futures = client.map(_on_worker, todo, version=aolink_version(), pure=False)
+        jobs = {future.key: job for future, job in zip(futures, todo, strict=True)}
+        finished = as_completed(futures, loop=client.loop)
+        del futures  # a result that was taken is forgotten by the cluster
+        progress(0)
+        while jobs:
+            if stop():
+                client.cancel(list(finished.futures))
+                return
+            some = finished.next_batch(block=False)
+            for future in some:
+                if future.cancelled():
+                    raise AolinkError(
+                        f"the scheduler at {address} is gone; what was done stays done: give the same command again"
+                    )
+                job = jobs.pop(future.key)
+                error = future.exception()
+                yield Done(job, [], _in_words(error)) if error else future.result()
+                progress(len(todo) - len(jobs))
+            if not some:
+                time.sleep(_POLL_S)
+
+
+def _on_worker(job: SideJob, version: str) -> Done:
+    """What a worker does; one that came late was not asked before what aolink it has."""
+    if aolink_version() != version:
+        return Done(job, [], f"a worker has aolink {aolink_version()}, this is {version}: install the same everywhere")
+    return do(job)
+
+
+def _in_words(error: BaseException) -> str:
+    if type(error).__name__ == "KilledWorker":
+        return "every worker that began it was lost: too little memory, or a signal"
+    return f"its worker cannot do it: {error!r}"
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[Client]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise AolinkError("--scheduler needs Dask: pip install 'aolink[cluster]'") from None
+    for name in ("distributed", "distributed.client", "distributed.core"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what is wrong is said here, once
+    try:
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise AolinkError(
+            f"no Dask scheduler answers at {address}: give what `dask scheduler` says, as tcp://host:8786"
+            f" ({str(error).splitlines()[0]})"
+        ) from None
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def _check_workers(client: Client, address: str) -> None:
+    found: dict[str, Any] = client.run(version, "aolink", on_error="return")
+    if not found:
+        raise AolinkError(f"the scheduler at {address} has no workers: start some with `dask worker {address}`")
+    for worker, theirs in sorted(found.items()):
+        if theirs != aolink_version():
+            what = f"aolink {theirs}" if isinstance(theirs, str) else f"no aolink ({theirs!r})"
+            raise AolinkError(
+                f"the worker at {worker} has {what}, this is aolink {aolink_version()}: install the same everywhere"
+            )

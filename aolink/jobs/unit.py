@@ -1,0 +1,235 @@
+"""The unit of a batch: one recording, one model and one estimator; a function that any engine can call."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aolink.errors import AolinkError, EstimatorError, RecordingError, RigError
+from aolink.estimation import Driver, Engine, Estimate, Scorer, Status
+from aolink.exposure import Exposure
+from aolink.files import check_target, writing
+from aolink.jobs.tables import COLUMNS, is_table_of, rows_into, table_beside
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import check_has_exposures
+from aolink.recording.side import SideFile
+from aolink.rig import parse_rig
+from aolink.rig.edit import with_value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """The rig that recordings are estimated with: their own, or another, with some values changed."""
+
+    name: str = ""
+    """The other rig's name and what was changed; empty for the recording's own."""
+    rig_text: str | None = None
+    """Instead of the rig file in the recording."""
+    changes: tuple[tuple[str, Any], ...] = ()
+    """Dotted keys of the rig file, with their new values."""
+
+    def text_for(self, recorded: str) -> str:
+        """The rig file to use for a recording that was made with ``recorded``. Raises RigError for a key it lacks."""
+        text = recorded if self.rig_text is None else self.rig_text
+        for key, value in self.changes:
+            try:
+                text = with_value(text, key, value)
+            except RigError as error:
+                raise RigError(f"--set {error}") from None
+        return text
+
+    def applied_to(self, recording: Recording) -> Recording:
+        """The same recording to be estimated with this model. Raises RigError where that cannot be."""
+        text = self.text_for(recording.rig.toml)
+        return recording if text == recording.rig.toml else Recording(recording.path, rig=parse_rig(text))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How a recording is estimated: plain data, which can be pickled."""
+
+    estimator: str = "o3"
+    """One of `aolink.estimation.ESTIMATOR_NAMES`."""
+    model: Model = Model()
+    """The recording's own rig, if nothing else is said."""
+    engine: Engine = "aolink"
+    table: bool = False
+    """Write a table in Parquet too, with a row for each exposure: a file of the side file's name that ends with
+    ``.parquet``. Its columns are those of `exposure_row`."""
+    overwrite: bool = False
+    """Estimate again what was done before, and replace a file of that name that is no side file."""
+
+
+def estimate_file(url: str | Path, out: str | Path, settings: Settings | None = None) -> dict[str, Any]:
+    """Estimate one recording and write a side file: its estimates alone, which refer to the recording.
+
+    What was done before with the same recording, settings and version of aolink is not done again. The recording is
+    read once from its start to its end. Several processes may call this at the same time, on any machines that share
+    the folder of ``out``; the file appears when it is whole.
+
+    Parameters
+    ----------
+    url:
+        The recording: a file, or a URL that fsspec knows.
+    out:
+        The side file to write, such as ``session.o3.mcap``: `Recording` takes it as ``side``, and `aolink view` beside
+        the recording.
+    settings:
+        The defaults of `Settings` if not given.
+
+    Returns
+    -------
+    A row by `COLUMNS` of numbers and texts; what is not known is None. RMSE in slope units, ``seconds`` of this call.
+
+    Raises
+    ------
+    RecordingError
+        The recording cannot be read or holds no exposure, or the side file cannot be written.
+    RigError, EstimatorError
+        The model does not fit the recording, or the estimator cannot work with it.
+    """
+    return estimated(url, Path(out), settings or Settings())[0]
+
+
+def estimated(url: str | Path, out: Path, settings: Settings) -> tuple[dict[str, Any], bool]:
+    """The row of `estimate_file`, and whether it had been done before."""
+    begin = time.perf_counter()
+    recording = settings.model.applied_to(Recording(url))
+    digest = _digest(recording, settings)
+    if not settings.overwrite and (before := _row_before(out, digest, settings)) is not None:
+        return {**before, "recording": str(recording.path), "output": out.name}, True
+    check_has_exposures(recording)
+    notes = {"aolink_version": aolink_version(), "estimators": settings.estimator, "job": digest}
+    if settings.engine != "aolink":
+        notes["engine"] = settings.engine
+    scorer = Scorer()
+    count = not_ok = 0
+    row: dict[str, Any] = dict.fromkeys(COLUMNS)
+    row |= {
+        "recording": str(recording.path), "model": settings.model.name, "estimator": settings.estimator,
+        "output": out.name,
+    }  # fmt: skip
+    names = {key: row[key] for key in ("recording", "model", "estimator")}
+    with (
+        writing(out, overwrite=True, sources=recording.files, error=RecordingError) as partial,
+        SideFile(recording, partial, notes) as side,
+        rows_into(table_beside(out) if settings.table else None, digest) as add_row,
+    ):
+        for time_ns, exposure, estimate in _estimates(recording, settings):
+            side.add(estimate, time_ns)
+            scorer.add(exposure, estimate)
+            count += 1
+            not_ok += estimate.status not in (Status.OK, Status.PREDICTED)
+            if settings.table:
+                add_row(names | exposure_row(time_ns, exposure, estimate))
+        score = scorer.result()
+        values = {
+            "path_rmse": score.path_rmse, "start_rmse": score.start_rmse, "end_rmse": score.end_rmse,
+            "nis": score.nis.mean, "nis_low": score.nis.low, "nis_high": score.nis.high,
+            "start_nees": score.start_nees.mean, "end_nees": score.end_nees.mean,
+            "nees_low": score.end_nees.low, "nees_high": score.end_nees.high,
+        }  # fmt: skip
+        row |= {key: value for key, value in values.items() if not math.isnan(value)}
+        row |= {
+            "exposures": count, "not_ok": not_ok, "nothing_measured": score.nothing_measured or None,
+            "seconds": round(time.perf_counter() - begin, 3), "damage": recording.damage or None,
+        }  # fmt: skip
+        side.finish({"row": json.dumps(row)})
+    return row, False
+
+
+def exposure_row(time_ns: int, exposure: Exposure, estimate: Estimate) -> dict[str, Any]:
+    """What the table of exposures has of one, besides recording, model and estimator.
+
+    ``time_ns`` is the log time. ``nis`` is the sum over the axes that were measured, and follows chi-square with
+    ``nis_degrees`` degrees of freedom. In slope units: ``path_rms`` of the estimated path, ``path_sd`` of its standard
+    deviation (root mean squares over outputs and fast steps), and the errors ``path_rmse``, ``start_rmse`` and
+    ``end_rmse`` (as in `aolink.estimation.Score`), which are None where there is no truth.
+    """
+    seen, truth = estimate.nis > 0, exposure.truth
+    row: dict[str, Any] = {
+        "frame_id": estimate.frame_id, "time_ns": time_ns, "first_step": estimate.first_step,
+        "status": estimate.status.name, "reason": estimate.reason,
+        "nis": float(estimate.nis[seen].sum()), "nis_degrees": estimate.innovation.shape[1] * int(seen.sum()),
+        "path_rms": _rms(estimate.path), "path_sd": _rms(estimate.path_sd),
+        "path_rmse": None, "start_rmse": None, "end_rmse": None,
+    }  # fmt: skip
+    if truth is not None:
+        row["path_rmse"] = _rms(estimate.path - truth.path)
+        for name, error in (
+            ("start_rmse", estimate.start_state - truth.start_state),
+            ("end_rmse", estimate.end_state - truth.end_state),
+        ):
+            row[name] = _rms(np.linalg.norm(error, axis=1))
+    return row
+
+
+def _rms(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+    return math.sqrt(float(np.mean(values**2)))
+
+
+def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, Exposure, Estimate]]:
+    """Log times, exposures and their estimates."""
+    times: deque[int] = deque()
+
+    def exposures() -> Iterator[Exposure]:
+        for time_ns, exposure in recording.timed_exposures():
+            times.append(time_ns)
+            yield exposure
+
+    try:
+        for exposure, (estimate,) in Driver(recording.rig, [settings.estimator], settings.engine).steps(exposures()):
+            yield times.popleft(), exposure, estimate
+    except (ArithmeticError, ValueError) as error:
+        if settings.model == Model():
+            raise
+        raise EstimatorError(
+            f"{recording.path} cannot be estimated with this model: {error!r}; are its numbers meant?"
+        ) from None
+
+
+@lru_cache(maxsize=1)
+def aolink_version() -> str:
+    """The installed one, looked up once: that takes longer than to open a recording."""
+    return version("aolink")
+
+
+def _digest(recording: Recording, settings: Settings) -> str:
+    """Of all that the result depends on."""
+    facts = [
+        recording.digest, aolink_version(), settings.estimator, settings.engine, settings.model.rig_text,
+        [[key, str(value)] for key, value in settings.model.changes],
+    ]  # fmt: skip
+    return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
+
+
+def _row_before(out: Path, digest: str, settings: Settings) -> dict[str, Any] | None:
+    """The row of a side file that is there already; None if it is to be made.
+
+    Raises RecordingError where something else has the name.
+    """
+    if not out.exists():
+        return None
+    try:
+        before = Recording(out)
+    except AolinkError:
+        before = None
+    if before is None or not before.side_of:
+        check_target(out, error=RecordingError)
+        return None
+    if before.metadata.get("job") != digest or "row" not in before.end_metadata:
+        return None
+    if settings.table and not is_table_of(table_beside(out), digest):
+        return None
+    return dict(json.loads(before.end_metadata["row"]))

@@ -1,0 +1,79 @@
+"""Where in a file an exposure begins, by the file's own index: what a slice of a recording has to read."""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+
+from mcap.opcode import Opcode
+from mcap.records import ChunkIndex
+
+from aolink.recording.scan import open_recording
+from aolink.recording.search import HEAD
+
+_INDEX_HEAD = struct.Struct("<HI")
+"""Channel and bytes of a message index, ..."""
+_ENTRY_BYTES = 16
+"""... each of whose entries has so many."""
+
+StepRun = tuple[str, int]
+"""Topic of a command or a report, and the fast step after its last."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameIndex:
+    """How many frames there are before each chunk of a file."""
+
+    before: Sequence[int]
+    """(chunks + 1,): the last is the number of all frames."""
+
+    @classmethod
+    def of(cls, path: Path, chunks: Sequence[ChunkIndex], frames: Collection[int]) -> FrameIndex | None:
+        """Count the messages of the channels ``frames``; None where the file does not index its messages."""
+        counts = []
+        with open_recording(path) as file:
+            unbuffered = getattr(file, "raw", file)  # a few bytes of each chunk are wanted, and not a page of it
+            for chunk in chunks:
+                count = 0
+                for channel, offset in chunk.message_index_offsets.items():
+                    if channel not in frames:
+                        continue
+                    unbuffered.seek(offset)
+                    head = unbuffered.read(HEAD.size + _INDEX_HEAD.size)
+                    if len(head) < HEAD.size + _INDEX_HEAD.size or head[0] != Opcode.MESSAGE_INDEX:
+                        return None
+                    found, length = _INDEX_HEAD.unpack_from(head, HEAD.size)
+                    if found != channel:
+                        return None
+                    count += length // _ENTRY_BYTES
+                counts.append(count)
+        return cls([0, *accumulate(counts)])
+
+    def chunk_of(self, frame: int) -> int:
+        """Number of the chunk that a frame, by its number from 0 on, is in."""
+        return bisect_right(self.before, frame) - 1
+
+    def first_chunk(self, frame: int, reach: Mapping[str, int], runs_in: Callable[[int], Iterator[StepRun]]) -> int:
+        """Number of the chunk from which on all commands and reports are that a frame is made with.
+
+        Parameters
+        ----------
+        frame:
+            Its number.
+        reach:
+            By topic: before a message whose steps end at this step or earlier, there is nothing that the frame needs.
+        runs_in:
+            What of these topics is in a chunk.
+        """
+        missing, chunk = set(reach), self.chunk_of(frame)
+        while missing and chunk > 0:
+            latest: dict[str, int] = {}
+            for topic, end in runs_in(chunk):
+                latest[topic] = max(end, latest.get(topic, 0))
+            missing -= {topic for topic, end in latest.items() if end <= reach[topic]}
+            chunk -= bool(missing)
+        return chunk

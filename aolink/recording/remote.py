@@ -1,0 +1,224 @@
+"""Recordings by URL: object storage and web servers, through fsspec, by the ranges that are needed."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from aolink.errors import RecordingError
+
+if TYPE_CHECKING:
+    from _typeshed import WriteableBuffer
+
+AHEAD = 64 << 10
+"""Bytes that are asked for where nobody has said what comes next, ..."""
+MOST_AHEAD = 1 << 20
+"""... and the most that are asked for at once where somebody has, if no single record is larger."""
+_GAP = 16 << 10
+"""Bytes between two ranges that are read with them: another request would take longer."""
+_KEPT = 3
+"""Ranges that stay in memory, besides the first and the last of the file."""
+_URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+://")
+
+
+def location(path: str | Path | Url) -> Path | Url:
+    """A path, or a URL where it is one: ``s3://bucket/session.mcap``, ``https://...``, ``memory://...``."""
+    return Url(path) if isinstance(path, str) and _URL.match(path) else path if isinstance(path, Url) else Path(path)
+
+
+def only_paths(places: Iterable[Path | Url]) -> list[Path]:
+    """Those that are files of this machine."""
+    return [each for each in places if isinstance(each, Path)]
+
+
+class Url:
+    """Where a recording is that is no file of this machine.
+
+    It keeps the first and the last bytes that were read, so that a recording that is opened again asks for nothing
+    twice. Between processes only the URL itself travels.
+    """
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        """The whole of it. What is shown is without a password and without a query, which may hold a signature."""
+        self.ends: dict[int, bytes] = {}
+        """The first and the last bytes, as far as they were read, by where they begin."""
+
+    def __str__(self) -> str:
+        parts = urlsplit(self.text)
+        return f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}{parts.path}"
+
+    def __repr__(self) -> str:
+        return f"Url({str(self)!r})"
+
+    def __reduce__(self) -> tuple[type[Url], tuple[str]]:
+        return Url, (self.text,)
+
+    @property
+    def name(self) -> str:
+        """The last part of its path."""
+        return PurePosixPath(urlsplit(self.text).path).name
+
+    @property
+    def stem(self) -> str:
+        """The name without its suffix."""
+        return PurePosixPath(self.name).stem
+
+    @property
+    def suffix(self) -> str:
+        """The end of the name from its last dot on."""
+        return PurePosixPath(self.name).suffix
+
+    @cached_property
+    def size(self) -> int:
+        """Bytes of the file. Raises RecordingError as `open` does."""
+        with self._asked():
+            system, path = self._place
+            size = system.info(path)["size"]
+        if not isinstance(size, int):
+            raise RecordingError(f"{self} does not say how long it is: copy the file here")
+        return size
+
+    def open(self, expected: Sequence[tuple[int, int]] = ()) -> RangeFile:
+        """The file, to be read.
+
+        Parameters
+        ----------
+        expected:
+            First byte and length of the ranges that will be read, in ascending order: these are asked for together as
+            far as they are neighbours, and nothing between them.
+
+        Raises
+        ------
+        RecordingError
+            There is nothing, nobody may read it, no server answers, or the extra ``remote`` is not installed.
+        """
+        return RangeFile(self, expected)
+
+    def read(self, start: int, end: int) -> bytes:
+        """Bytes from ``start`` up to ``end``. Raises RecordingError as `open` does."""
+        with self._asked():
+            system, path = self._place
+            data: bytes = system.cat_file(path, start=start, end=end)
+        if len(data) != end - start:
+            raise RecordingError(
+                f"{self}: {end - start} bytes were asked for and {len(data)} came; its server gives no ranges, or the"
+                " file has changed: copy it here"
+            )
+        if start == 0 or end == self.size:
+            self.ends[start] = data
+        return data
+
+    @cached_property
+    def _place(self) -> tuple[Any, str]:
+        """A file system of fsspec, and the path in it."""
+        try:
+            from fsspec.core import url_to_fs
+        except ImportError:
+            raise RecordingError(f"reading {self} needs fsspec: pip install 'aolink[remote]'") from None
+        try:
+            found: tuple[Any, str] = url_to_fs(self.text)
+        except ImportError as error:
+            raise RecordingError(f"reading {self} needs more: {error}; pip install 'aolink[remote]'") from None
+        except ValueError as error:
+            raise RecordingError(f"cannot read {self}: {error}") from None
+        return found
+
+    @contextmanager
+    def _asked(self) -> Iterator[None]:
+        """What a file system of fsspec raises, as one error: each has its own."""
+        try:
+            yield
+        except RecordingError:
+            raise
+        except Exception as error:
+            cause = error.__cause__ or error  # some file systems say that nothing is there, whatever is the matter
+            denied = isinstance(error, PermissionError) or getattr(cause, "status", 0) in (401, 403)
+            if denied or type(error).__name__ in ("NoCredentialsError", "PartialCredentialsError"):
+                why = "no right to read it; give the credentials that its server wants, as AWS_PROFILE for s3"
+            elif isinstance(error, FileNotFoundError):
+                what = "" if cause is error else f" ({_first_line(cause)})"
+                why = f"there is no such file, or nobody may know of it{what}"
+            else:
+                why = _first_line(error)
+            raise RecordingError(f"cannot read {self}: {why}") from None
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]
+
+
+class RangeFile(io.RawIOBase):
+    """A file behind a URL, which is asked for in ranges."""
+
+    def __init__(self, url: Url, expected: Sequence[tuple[int, int]] = ()) -> None:
+        self._url, self._size, self._at = url, url.size, 0
+        self._spans = deque(_joined(expected))
+        self._kept: deque[tuple[int, bytes]] = deque(maxlen=_KEPT)
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def tell(self) -> int:
+        return self._at
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._size}[whence]
+        self._at = max(0, base + offset)
+        return self._at
+
+    def readinto(self, buffer: WriteableBuffer) -> int:
+        view = memoryview(buffer).cast("B")
+        end = min(self._at + len(view), self._size)
+        done = 0
+        while self._at < end:
+            start, data = self._around(self._at, end)
+            part = data[self._at - start : end - start]
+            view[done : done + len(part)] = part
+            done, self._at = done + len(part), self._at + len(part)
+        return done
+
+    def _around(self, position: int, end: int) -> tuple[int, bytes]:
+        """A range that has the byte at a position, and where it begins; ``end`` is how far it will be read."""
+        for start, data in (*self._url.ends.items(), *self._kept):
+            if start <= position < start + len(data):
+                return start, data
+        start, stop = self._range(position, end)
+        stop = min([stop, *(there for there in self._url.ends if there > position)])  # that is known already
+        self._kept.append((start, self._url.read(start, stop)))
+        return self._kept[-1]
+
+    def _range(self, position: int, end: int) -> tuple[int, int]:
+        while self._spans and self._spans[0][1] <= position:
+            self._spans.popleft()
+        if self._spans and self._spans[0][0] <= position:
+            return position, max(end, min(self._spans[0][1], position + MOST_AHEAD))
+        if position < AHEAD:
+            return 0, min(max(end, AHEAD), self._size)
+        if position >= self._size - AHEAD:  # the index is at the end, and its length is in the last bytes
+            return self._size - AHEAD, self._size
+        return position, min(max(end, position + AHEAD), self._size)
+
+
+def _joined(ranges: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """First byte and end of ranges, those together that are neighbours."""
+    start = end = -1
+    for first, length in ranges:
+        if start >= 0 and first - end <= _GAP:
+            end = max(end, first + length)
+            continue
+        if start >= 0:
+            yield start, end
+        start, end = first, first + length
+    if start >= 0:
+        yield start, end

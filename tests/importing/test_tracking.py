@@ -1,0 +1,148 @@
+"""Objects followed through a film: places, windows, the first rig file, and what estimators make of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.errors import ImportingError
+from aolink.estimation import run, smooth
+from aolink.importing.exposures import Settings
+from aolink.importing.first_rig import first_rig, fit_motion
+from aolink.importing.readers import array_film
+from aolink.importing.recording import import_film
+from aolink.importing.tracking import find_objects, survey
+from aolink.recording.reader import Recording
+from aolink.rig import Rig, parse_rig
+from tests.importing.synthetic import SpotFilm, random_walk, resonance, spot_film
+from tests.kinds import truth_of
+
+MIDDLES = np.array([[24.0, 32.0], [70.0, 30.0]])
+K = 8
+
+
+@pytest.fixture(scope="module")
+def walkers() -> SpotFilm:
+    rng = np.random.default_rng(5)
+    return spot_film(rng, random_walk(rng, 320, 2, 0.5), MIDDLES)
+
+
+SETTINGS = Settings(
+    rate_hz=100.0, subtract_median=True, track=2, frames_per_exposure=K, places=tuple(map(tuple, MIDDLES.tolist()))
+)
+
+
+def test_objects_are_found_and_followed_to_a_tenth_of_a_pixel(walkers: SpotFilm) -> None:
+    film = array_film(walkers.frames, "walkers")
+    objects = find_objects(film, SETTINGS)
+    known = survey(film, SETTINGS, objects)
+    error = known.places - walkers.places
+    assert np.sqrt(np.mean(error**2)) < 0.1
+    assert known.sd == pytest.approx(1.8, rel=0.05)
+    assert known.walk == pytest.approx(0.25, rel=0.2)
+    assert np.sqrt(np.mean(error**2)) / 3 < known.place_sd < 0.3
+
+
+@pytest.mark.parametrize(("asked", "what"), [(9, "shows . objects, 9 are asked for"), (1, None)])
+def test_as_many_objects_as_asked_for(walkers: SpotFilm, asked: int, what: str | None) -> None:
+    film = array_film(walkers.frames[:10], "walkers")
+    if what is None:
+        assert len(find_objects(film, Settings(track=asked)).places) == asked
+    else:
+        with pytest.raises(ImportingError, match=what):
+            find_objects(film, Settings(track=asked))
+
+
+def test_a_film_without_light_has_no_objects() -> None:
+    with pytest.raises(ImportingError, match="no objects can be found"):
+        find_objects(array_film(np.zeros((5, 64, 64), np.uint8), "dark"), Settings(track=1))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_walk_and_a_bound_motion_are_told_apart_and_fitted(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    noise = 0.1
+    walk = np.cumsum(rng.normal(size=(400, 6)) * 0.4, axis=0) + noise * rng.normal(size=(400, 6))
+    found = fit_motion(walk)
+    assert found.a == 1
+    assert abs(found.q - 0.16) < 5 * found.q_sd
+    bound = np.zeros((400, 6))
+    for k in range(1, 400):
+        bound[k] = 0.9 * bound[k - 1] + 0.4 * rng.normal(size=6)
+    found = fit_motion(bound + noise * rng.normal(size=(400, 6)))
+    assert abs(found.a - 0.9) < 5 * found.a_sd < 0.1
+    assert abs(found.q - 0.16) < 5 * found.q_sd
+
+
+def imported_film(film: SpotFilm, path: Path) -> tuple[Rig, Recording]:
+    source = array_film(film.frames, "film")
+    rig = parse_rig(first_rig(source, SETTINGS, "film"))
+    import_film(source, rig, SETTINGS, path)
+    return rig, Recording(path)
+
+
+def test_the_path_of_walkers_is_found_and_its_intervals_hold(walkers: SpotFilm, tmp_path: Path) -> None:
+    rig, recording = imported_film(walkers, tmp_path / "walkers.mcap")
+    exposures = list(recording.exposures())
+    assert len(exposures) == len(walkers.frames) // K
+    assert any(each.inputs.any() for each in exposures), "the walkers leave the middles of their windows"
+    # The recorded truth is the true motion: a place in a window, which the inputs move.
+    moved = np.cumsum([each.inputs.sum(axis=0) for each in exposures], axis=0)
+    moved = np.vstack([np.zeros(4), moved[:-1]])
+    unit = 1 / rig.sensor.pixel_width
+    seen = np.array([truth_of(each).path - shift[:, None] for each, shift in zip(exposures, moved, strict=True)]) * unit
+    true = walkers.places.reshape(-1, K, 4).swapaxes(1, 2)
+    error = (seen - seen[:1, :, :1]) - (true - true[:1, :, :1])
+    assert np.sqrt(np.mean(error**2)) < 0.2
+    (estimates,) = run(rig, exposures, ["profile"]).values()
+    errors = np.array([e.path - truth_of(x).path for e, x in zip(estimates, exposures, strict=True)])[1:] * unit
+    held = np.array([truth_of(x).path - truth_of(x).path.mean(axis=1, keepdims=True) for x in exposures])[1:] * unit
+    assert np.mean(errors**2) < np.mean(held**2), "nearer than the best constant, the path's own mean"
+    smoothed = smooth(rig.plant, exposures, estimates)
+    after = np.array([e.path - truth_of(x).path for e, x in zip(smoothed, exposures, strict=True)])[1:] * unit
+    assert np.mean(after**2) < np.mean(errors**2)
+    spread = np.hypot([e.path_sd for e in estimates[1:]], truth_of(exposures[0]).path_sd) * unit
+    assert 0.9 < np.mean(np.abs(errors) < 1.96 * spread) < 0.98
+
+
+def test_a_resonance_inside_the_exposure_is_found_with_its_plant(tmp_path: Path) -> None:
+    """A user who knows the resonance puts it into [plant]: half of what the path's own mean leaves, or less."""
+    rng = np.random.default_rng(11)
+    film = spot_film(rng, resonance(rng, 320, 2, 1.5, 5.3), MIDDLES, light=60_000.0)
+    source = array_film(film.frames, "film")
+    text = first_rig(source, SETTINGS, "film")
+    side = parse_rig(text).sensor.shape[0]
+    decay, turn = np.exp(-0.02 / 5.3), 2 * np.pi / 5.3
+    A = decay * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    variance = (1.5 / (side / 2)) ** 2
+    lines = text.splitlines()
+    start, end = lines.index(next(one for one in lines if one.startswith("[plant]"))), lines.index("[timing]")
+    plant = f"""[plant]
+axes = 4
+A = [[{A[0, 0]}, {A[0, 1]}, 0.0], [{A[1, 0]}, {A[1, 1]}, 0.0], [0.0, 0.0, 1.0]]
+B = [[0.0], [0.0], [1.0]]
+B_w = [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]
+C = [[1.0, 0.0, 1.0]]
+process_noise = [[{variance * (1 - decay**2)}, 0.0], [0.0, {variance * (1 - decay**2)}]]
+initial_covariance = [[{variance}, 0.0, 0.0], [0.0, {variance}, 0.0], [0.0, 0.0, 0.1]]
+"""
+    rig = parse_rig("\n".join([*lines[:start], *plant.splitlines(), "", *lines[end:]]))
+    import_film(source, rig, SETTINGS, tmp_path / "a.mcap")
+    exposures = list(Recording(tmp_path / "a.mcap").exposures())
+    (estimates,) = run(rig, exposures, ["profile"]).values()
+    scored = slice(8, None)
+    pairs = list(zip(estimates, exposures, strict=True))[scored]
+    errors = np.array([e.path - truth_of(x).path for e, x in pairs])
+    held = np.array([truth_of(x).path - truth_of(x).path.mean(axis=1, keepdims=True) for _, x in pairs])
+    assert np.sqrt(np.mean(errors**2)) < 0.5 * np.sqrt(np.mean(held**2))
+    spread = np.hypot([e.path_sd for e, _ in pairs], truth_of(exposures[0]).path_sd)
+    assert 0.88 < np.mean(np.abs(errors) < 1.96 * spread) < 0.99
+
+
+def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
+    text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").replace("B = [[1.0]]", "B = [[0.0]]")
+    rig = parse_rig(text)
+    import_film(array_film(walkers.frames, "film"), rig, SETTINGS, tmp_path / "a.mcap")
+    assert not any(each.inputs.any() for each in Recording(tmp_path / "a.mcap").exposures())

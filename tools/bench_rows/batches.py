@@ -1,0 +1,214 @@
+"""Figures of batches: many small recordings, recordings behind URLs, a cluster."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from aolink.batch import Settings, estimate_file
+from aolink.jobs import batch
+from bench_rows.recording import record_long
+from bench_rows.row import Effort, Row, resident_mb, timed
+
+_TINY = 10_000
+_WORKERS = 2
+
+
+def tiny_recordings(effort: Effort) -> list[Row]:
+    """Ten thousand recordings of three exposures into side files, in one folder: what each costs besides its estimates.
+
+    That is the time of each less that of the estimates, which is the slope of time against exposures; and the memory
+    that the process has at the end and did not have after the first thousand.
+    """
+    count = effort.of(_TINY, 20)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        record_long(folder / "3.mcap", 3)
+        record_long(folder / "203.mcap", 203)
+        (folder / "in").mkdir()
+        (folder / "out").mkdir()
+        sources = [folder / "in" / f"{k}.mcap" for k in range(count)]
+        for each in sources:
+            os.link(folder / "3.mcap", each)
+
+        def work(source: Path) -> float:
+            out = folder / "out" / f"{source.stem}.o3.mcap"
+            return timed(lambda: estimate_file(source, out, Settings(overwrite=True)))
+
+        few, many = (min(work(folder / f"{each}.mcap") for _ in range(5)) for each in (3, 203))
+        of_one = max(0.0, (many - few) / 200)
+        begin, begin_cpu, marks = time.perf_counter(), time.process_time(), []
+        for k, each in enumerate(sources):
+            work(each)
+            if k in (count // 10, count - 1):
+                marks.append(resident_mb())
+        overhead_ms = 1e3 * ((time.perf_counter() - begin) / count - 3 * of_one)
+        cpu_ms = 1e3 * (time.process_time() - begin_cpu) / count
+    growth = marks[-1] - marks[0]
+    return [
+        Row(
+            f"{count} tiny recordings, each",
+            f"{overhead_ms:.1f} ms",
+            f"limit 20 ms; processor {cpu_ms:.1f} ms",
+            20 / overhead_ms,
+            1.0,
+        ),
+        Row(f"memory over {count} recordings", f"+{growth:.1f} MB", "limit 10 MB", 10 / max(growth, 0.1), 1.0),
+    ]
+
+
+def read_over_needed(effort: Effort) -> list[Row]:
+    """Bytes that a server on this machine that speaks S3 sends, against those that are needed.
+
+    To estimate, all of the file is needed; to read a tenth of its time, a tenth of its chunks and its index.
+    """
+    import s3fs
+
+    from aolink.recording import topics
+    from aolink.recording.reader import Recording
+
+    with tempfile.TemporaryDirectory() as name, _serving_s3() as sent:
+        source = Path(name) / "a.mcap"
+        record_long(source, effort.of(20_000, 200))
+        s3fs.S3FileSystem.clear_instance_cache()
+        storage = s3fs.S3FileSystem()
+        storage.mkdir("bench")
+        storage.put(str(source), "bench/a.mcap")
+        sent.clear()
+        estimate_file("s3://bench/a.mcap", Path(name) / "a.o3.mcap")
+        whole, requests, size = sum(sent), len(sent), source.stat().st_size
+        sent.clear()
+        recording, local = Recording("s3://bench/a.mcap"), Recording(source)
+        span = (local.end_ns - local.start_ns) // 10
+        times = {"start_ns": local.start_ns + 4 * span, "end_ns": local.start_ns + 5 * span}
+        found = sum(1 for _ in recording.messages(topics.IMAGE, **times))
+        part = sum(sent)
+        needed = size / 10 + _index_bytes(source)
+        assert found
+        s3fs.S3FileSystem.clear_instance_cache()
+    return [
+        Row(
+            "bytes read of S3, estimated", f"{whole / 1e6:.2f} MB in {requests}",
+            f"needed {size / 1e6:.2f} MB: {whole / size:.2f} times", 1.3 * size / whole, 1.0,
+        ),
+        Row(
+            "bytes read of S3, a tenth of the time", f"{part / 1e6:.2f} MB",
+            f"needed {needed / 1e6:.2f} MB: {part / needed:.2f} times", 1.3 * needed / part, 1.0,
+        ),
+    ]  # fmt: skip
+
+
+def _index_bytes(path: Path) -> int:
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        return path.stat().st_size - max(each.chunk_start_offset + each.chunk_length for each in summary.chunk_indexes)
+
+
+@contextmanager
+def _serving_s3() -> Iterator[list[int]]:
+    """A server; gives the bytes of its answers to requests for objects."""
+    from moto.server import DomainDispatcherApplication, create_backend_app  # type: ignore[attr-defined]
+    from werkzeug.serving import WSGIRequestHandler, make_server
+
+    class Quiet(WSGIRequestHandler):
+        def log(self, type: str, message: str, *arguments: Any) -> None:
+            """Requests are no news."""
+
+    sent: list[int] = []
+    answer = DomainDispatcherApplication(create_backend_app)
+
+    def counted(environment: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+        def start(status: str, headers: list[tuple[str, str]], *rest: Any) -> Any:
+            if environment["REQUEST_METHOD"] == "GET" and status[:3] in ("200", "206"):
+                sent.append(int(dict(headers).get("Content-Length", 0)))
+            return start_response(status, headers, *rest)
+
+        return list[bytes](answer(environment, start))
+
+    server = make_server("127.0.0.1", 0, counted, threaded=True, request_handler=Quiet)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    known = {
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{server.server_port}", "AWS_ACCESS_KEY_ID": "me",
+        "AWS_SECRET_ACCESS_KEY": "secret", "AWS_DEFAULT_REGION": "us-east-1",
+    }  # fmt: skip
+    before = {name: os.environ.get(name) for name in known}
+    os.environ.update(known)
+    try:
+        yield sent
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def cluster_workers(effort: Effort) -> Row:
+    """Eight recordings estimated with moments on two workers of a Dask scheduler, against one worker."""
+    from distributed import Client
+
+    from aolink.jobs.cluster import run_on
+
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
+        folder = Path(name)
+        for k in range(8):
+            record_long(folder / f"{k}.mcap", effort.of(1500, 5))
+        sources = [str(folder / f"{k}.mcap") for k in range(8)]
+        (folder / "out").mkdir()
+        options = ["--host", "127.0.0.1", "--no-dashboard"]
+        file = folder / "scheduler.json"
+        stack.enter_context(_dask("scheduler", *options, "--port", "0", "--scheduler-file", str(file)))
+        while not (file.exists() and file.read_text().endswith("}")):
+            time.sleep(0.05)
+        address = json.loads(file.read_text())["address"]
+        todo = [
+            batch.SideJob(each.source, each.output, Settings(estimator="moments", overwrite=True))
+            for each in batch.side_jobs(sources, batch.models(None, []), ["moments"], folder / "out")
+        ]
+
+        def work() -> float:
+            start = time.perf_counter()
+            assert not [each.error for each in run_on(address, todo) if each.error]
+            return time.perf_counter() - start
+
+        times = []
+        for count in range(1, _WORKERS + 1):
+            stack.enter_context(_dask("worker", address, *options, "--no-nanny", "--nthreads", "1"))
+            with Client(address, set_as_default=False) as client:
+                client.wait_for_workers(count)
+            work()  # they load what they need
+            times.append(min(work() for _ in range(effort.of(3))))
+    one, two = times[0], times[-1]
+    return Row("8 recordings on 2 Dask workers", f"{two:.1f} s", f"on one {one:.1f} s", one / two, 1.8)
+
+
+@contextmanager
+def _dask(*arguments: str) -> Iterator[None]:
+    """A process of a cluster; its linear algebra has one thread."""
+    root = str(Path(__file__).resolve().parents[2])
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": root}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dask", *arguments], env=environment,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    try:
+        yield
+    finally:
+        process.kill()
+        process.wait()
