@@ -287,6 +287,8 @@ WRITING = {
     "deblur": "deblur {session} -e o1 -o {target}.mcap",
     "deblur --image": "deblur --image {picture} --psf {psf} --noise-sd 0.1 -o {target}.npy",
     "view": "view {session} --save {target}.rrd",
+    "import": "import {session} --rig section-vi-lively -o {target}.mcap",
+    "export": "export {session} -o {target}.npz",
     "slopes -o": "slopes {frame} --reference {reference} -o {target}.npz",
     "slopes --rrd": "slopes {frame} --reference {reference} --rrd {target}.rrd",
 }

@@ -43,6 +43,8 @@ COMMANDS = {
     "cut": "cut {session} -o a.mcap",
     "merge": "merge {first} {second} -o a.mcap",
     "deblur": "deblur {session} -e o1 -o a.mcap",
+    "import": "import {session} -o a.mcap --rig section-vi-lively --overwrite",
+    "export": "export {session} -o a.npz",
     "slopes": "slopes {frame} --reference {reference} -o a.npz",
     "view": "view {session} --save a.rrd",
 }
