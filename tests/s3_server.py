@@ -8,7 +8,11 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+<<<<<<< HEAD
 from moto.server import DomainDispatcherApplication, create_backend_app  # type: ignore[attr-defined] # as its own main
+=======
+from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
+>>>>>>> batch
 from werkzeug.serving import WSGIRequestHandler, make_server
 
 

@@ -496,7 +496,7 @@ def test_a_tcp_port_that_another_host_has(aolink: Run) -> None:
 
 
 def test_help_has_an_example_for_every_command() -> None:
-    for command in [each.callback.__name__ for each in app.registered_commands if each.callback]:
+    for command in [each.name or each.callback.__name__ for each in app.registered_commands if each.callback]:
         result = CliRunner().invoke(app, [command, "--help"])
         assert result.exit_code == 0
         assert f"Example: aolink {command}" in result.stdout
