@@ -8,11 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-<<<<<<< HEAD
-from moto.server import DomainDispatcherApplication, create_backend_app  # type: ignore[attr-defined] # as its own main
-=======
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
->>>>>>> batch
 from werkzeug.serving import WSGIRequestHandler, make_server
 
 
@@ -36,8 +32,7 @@ class S3Server:
                 self.sent.append(int(dict(headers).get("Content-Length", 0)))
             return start_response(status, headers, *rest)
 
-        answer: Iterable[bytes] = self._application(environment, start)
-        return answer
+        return self._application(environment, start)
 
     def refuse_strangers(self) -> None:
         """From now on only users that the server knows may do anything; it knows none."""

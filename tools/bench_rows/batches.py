@@ -119,11 +119,7 @@ def _index_bytes(path: Path) -> int:
 @contextmanager
 def _serving_s3() -> Iterator[list[int]]:
     """A server; gives the bytes of its answers to requests for objects."""
-<<<<<<< HEAD
-    from moto.server import DomainDispatcherApplication, create_backend_app  # type: ignore[attr-defined]
-=======
     from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
->>>>>>> batch
     from werkzeug.serving import WSGIRequestHandler, make_server
 
     class Quiet(WSGIRequestHandler):
@@ -139,7 +135,7 @@ def _serving_s3() -> Iterator[list[int]]:
                 sent.append(int(dict(headers).get("Content-Length", 0)))
             return start_response(status, headers, *rest)
 
-        return list[bytes](answer(environment, start))
+        return answer(environment, start)
 
     server = make_server("127.0.0.1", 0, counted, threaded=True, request_handler=Quiet)
     thread = threading.Thread(target=server.serve_forever)
