@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import statistics
 import subprocess
@@ -192,7 +193,7 @@ def cluster_workers(effort: Effort) -> Row:
             """Time that the workers were busy, s."""
             done = list(run_on(address, todo))
             assert not any(each.error for each in done)
-            return sum(row["seconds"] for each in done for row in each.rows)
+            return math.fsum(row["seconds"] for each in done for row in each.rows)
 
         small, large = cluster(1), cluster(2)
         median_s(lambda: work(small), 1, lambda: work(large))  # they load what they need
