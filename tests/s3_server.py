@@ -32,7 +32,8 @@ class S3Server:
                 self.sent.append(int(dict(headers).get("Content-Length", 0)))
             return start_response(status, headers, *rest)
 
-        return self._application(environment, start)
+        answer: Iterable[bytes] = self._application(environment, start)
+        return answer
 
     def refuse_strangers(self) -> None:
         """From now on only users that the server knows may do anything; it knows none."""
