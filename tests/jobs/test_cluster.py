@@ -36,7 +36,18 @@ class Cluster:
         """A worker process; ``path`` comes first on its module search path."""
         root = str(Path(__file__).parents[2])
         environment = os.environ | {"PYTHONPATH": f"{path}{os.pathsep}{root}" if path else root, "OMP_NUM_THREADS": "1"}
-        options = ["--no-nanny", "--nthreads", "1", "--no-dashboard", "--host", "127.0.0.1", "--name", name]
+        options = [
+            "--no-nanny",
+            "--nthreads",
+            "1",
+            "--death-timeout",
+            "30",
+            "--no-dashboard",
+            "--host",
+            "127.0.0.1",
+            "--name",
+            name,
+        ]
         with _process("worker", self.address, *options, environment=environment) as process:
             yield process
 

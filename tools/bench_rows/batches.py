@@ -184,7 +184,9 @@ def cluster_workers(effort: Effort) -> Row:
                 time.sleep(0.05)
             address: str = json.loads(file.read_text())["address"]
             for _ in range(count):
-                stack.enter_context(_dask("worker", address, *options, "--no-nanny", "--nthreads", "1"))
+                stack.enter_context(
+                    _dask("worker", address, *options, "--no-nanny", "--nthreads", "1", "--death-timeout", "30")
+                )
             with Client(address, set_as_default=False) as client:
                 client.wait_for_workers(count)
             return address
