@@ -207,9 +207,10 @@ def flood(after: type[Message], begun: threading.Event) -> Lie:
 @pytest.mark.parametrize("real_time", [False, True])
 def test_a_flood_ends_the_session_before_it_fills_the_memory(tmp_path: Path, real_time: bool) -> None:
     lies = {"camera": flood(pb.Ack, threading.Event())}
-    assert_caught(
-        tmp_path, lies, "have sent messages of .* MiB without answering, expected at most", real_time=real_time
-    )
+    found = "have sent messages of .* MiB without answering, expected at most"
+    # By the clock, a machine that is busy may give the silent camera up before so much has come.
+    late = "|camera does not answer|has sent no frame" if real_time else ""
+    assert_caught(tmp_path, lies, found + late, real_time=real_time)
 
 
 def test_a_stop_is_heard_in_a_flood(tmp_path: Path) -> None:

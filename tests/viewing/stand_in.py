@@ -65,6 +65,7 @@ class StandIn:
     path: Path = Path("session.mcap")
     metadata: dict[str, str] = field(default_factory=dict)
     digest: str = "0" * 64
+    files: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(7)

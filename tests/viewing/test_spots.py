@@ -33,6 +33,7 @@ class Simulated:
     path: Path = Path("session.mcap")
     metadata: dict[str, str] = field(default_factory=dict)
     digest: str = "1" * 64
+    files: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         self._exposures = simulate(self.rig, N)
