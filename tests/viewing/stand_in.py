@@ -66,6 +66,7 @@ class StandIn:
     metadata: dict[str, str] = field(default_factory=dict)
     digest: str = "0" * 64
     files: tuple[Path, ...] = ()
+    side_of: str = ""
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(7)

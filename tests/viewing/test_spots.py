@@ -34,6 +34,7 @@ class Simulated:
     metadata: dict[str, str] = field(default_factory=dict)
     digest: str = "1" * 64
     files: tuple[Path, ...] = ()
+    side_of: str = ""
 
     def __post_init__(self) -> None:
         self._exposures = simulate(self.rig, N)
