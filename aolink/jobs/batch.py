@@ -22,7 +22,7 @@ from aolink.estimation import Engine, Scorer
 from aolink.estimation.registry import DEFAULT_ESTIMATOR
 from aolink.files import remove_unfinished, writing
 from aolink.jobs.tables import COLUMNS
-from aolink.jobs.unit import Model, Settings, estimated
+from aolink.jobs.unit import Model, Settings, estimated, score_values
 from aolink.numerics.workers import processes
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures, fill_reestimated
@@ -384,12 +384,7 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     rows = []
     for name, scorer in scorers.items():
         score = scorer.result()
-        values = {
-            "path_rmse": score.path_rmse, "start_rmse": score.start_rmse, "end_rmse": score.end_rmse,
-            "nis": score.nis.mean, "nis_low": score.nis.low, "nis_high": score.nis.high,
-            "start_nees": score.start_nees.mean, "end_nees": score.end_nees.mean,
-            "nees_low": score.end_nees.low, "nees_high": score.end_nees.high,
-        }  # fmt: skip
+        values = score_values(score)
         known = {key: value if value == value else None for key, value in values.items()}
         rows.append(
             {

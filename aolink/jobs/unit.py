@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import AolinkError, EstimatorError, RecordingError, RigError
-from aolink.estimation import Driver, Engine, Estimate, Scorer, Status
+from aolink.estimation import Driver, Engine, Estimate, Score, Scorer, Status
 from aolink.exposure import Exposure
 from aolink.files import check_target, writing
 from aolink.jobs.tables import COLUMNS, is_table_of, rows_into, table_beside
@@ -134,12 +134,7 @@ def estimated(url: str | Path, out: Path, settings: Settings) -> tuple[dict[str,
             if settings.table:
                 add_row(names | exposure_row(time_ns, exposure, estimate))
         score = scorer.result()
-        values = {
-            "path_rmse": score.path_rmse, "start_rmse": score.start_rmse, "end_rmse": score.end_rmse,
-            "nis": score.nis.mean, "nis_low": score.nis.low, "nis_high": score.nis.high,
-            "start_nees": score.start_nees.mean, "end_nees": score.end_nees.mean,
-            "nees_low": score.end_nees.low, "nees_high": score.end_nees.high,
-        }  # fmt: skip
+        values = score_values(score)
         row |= {key: value for key, value in values.items() if not math.isnan(value)}
         row |= {
             "exposures": count, "not_ok": not_ok, "nothing_measured": score.nothing_measured or None,
@@ -233,3 +228,13 @@ def _row_before(out: Path, digest: str, settings: Settings) -> dict[str, Any] | 
     if settings.table and not is_table_of(table_beside(out), digest):
         return None
     return dict(json.loads(before.end_metadata["row"]))
+
+
+def score_values(score: Score) -> dict[str, float]:
+    """What a row of a table says of a score, by column; NaN for what is not known."""
+    return {
+        "path_rmse": score.path_rmse, "start_rmse": score.start_rmse, "end_rmse": score.end_rmse,
+        "nis": score.nis.mean, "nis_low": score.nis.low, "nis_high": score.nis.high,
+        "start_nees": score.start_nees.mean, "end_nees": score.end_nees.mean,
+        "nees_low": score.end_nees.low, "nees_high": score.end_nees.high,
+    }  # fmt: skip
