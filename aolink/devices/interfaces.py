@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.devices.clock import ClockExchange, ClockRegression, ClockStep
+from aolink.devices.simple import Lacks
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.port import Served
 
@@ -55,6 +56,10 @@ class Device(Protocol):
     description: str
     """Model, serial number and firmware, for the recording."""
     clock: ClockRegression
+
+    @property
+    def lacks(self) -> Sequence[Lacks]:
+        """What the device cannot do, for the recording."""
 
     def query_clock(self, now_ns: int) -> None:
         """Ask the device for its time; the answer is an event."""
@@ -104,8 +109,13 @@ class Mirror(Device, Protocol):
     def in_flight(self) -> int:
         """Blocks sent and not yet answered."""
 
-    latched: bool
-    """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
+    commanded: bool
+    """Whether there is a mirror: where there is none, nothing is commanded, and the rig's safe input counts as held."""
+
+    @property
+    def latched(self) -> bool:
+        """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
+
     outage_s: float
     """How long the mirror had taken no command when it reported that it is latched, s; 0 at the start of a session."""
 
@@ -115,6 +125,9 @@ class Mirror(Device, Protocol):
 
     def since_zero_ns(self, host_ns: int) -> int:
         """Time from the beginning of its fast step 0 to a host time, on the mirror's own clock, ns."""
+
+    def step_sigma_ns(self, host_ns: int) -> float:
+        """Standard deviation of `since_zero_ns`, as far as the inputs' times depend on it, ns."""
 
     def start_step(self, now_ns: int) -> int:
         """The fast step that it is in, or, on virtual time, waits at. Raises DeviceError for an impossible one."""

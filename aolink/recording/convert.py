@@ -38,6 +38,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
         device_end_ns=frame.device_end_ns,
         host_start_ns=frame.host_start_ns,
         clock_sigma_ns=frame.clock_sigma_ns,
+        alignment_sigma_ns=frame.alignment_sigma_ns,
         host_first_byte_ns=frame.host_first_byte_ns,
         host_receive_ns=frame.host_receive_ns,
         chunks_lost=frame.chunks_lost,
@@ -122,6 +123,7 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
         host_receive_ns=info.host_receive_ns,
         host_start_ns=info.host_start_ns,
         clock_sigma_ns=info.clock_sigma_ns,
+        alignment_sigma_ns=info.alignment_sigma_ns,
         exposure_offset_ns=info.exposure_offset_ns,
     )
 
