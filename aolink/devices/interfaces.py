@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,7 +15,6 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.devices.clock import ClockExchange, ClockRegression, ClockStep
-from aolink.devices.simple import Lacks
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.port import Served
 
@@ -46,6 +46,19 @@ class CommandAnswered:
 
 Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswered
 """What a device may report. Texts in it can be printed."""
+
+
+class Lacks(StrEnum):
+    """What a device cannot do. A driver lists it as ``lacks``; `aolink devices` shows it, and a recording keeps it."""
+
+    TIME = "tells no time: the arrival of its frames stands for it"
+    COUNT = "does not count its frames: lost ones show by their time only"
+    TRIGGER = "starts when it likes: its exposures begin anywhere in a fast step"
+    QUEUE = "queues no inputs: the host sends each when its fast step begins"
+    ANSWER = "acknowledges nothing: what was sent counts as taken"
+    READ_BACK = "does not say what it holds: what was sent counts as held"
+    WATCHDOG = "has no watchdog: while the host's program runs, the host parks it"
+    STOP = "cannot empty its queue: parking waits for what is queued"
 
 
 class Device(Protocol):

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
 from aolink.devices.clock import ClockExchange, ClockRegression, StepClock
 from aolink.devices.gate import Gate, lie, printable
-from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Lacks
 from aolink.devices.reports import AppliedReports
-from aolink.devices.simple import Lacks
 from aolink.errors import DeviceError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import ANSWER_S, TRIES, Hub

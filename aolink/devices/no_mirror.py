@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.clock import ClockExchange, ClockRegression
-from aolink.devices.interfaces import Event
-from aolink.devices.simple import Lacks
+from aolink.devices.interfaces import Event, Lacks
 from aolink.errors import DeviceError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb

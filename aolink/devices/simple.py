@@ -9,26 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.devices.interfaces import Lacks as Lacks
 from aolink.exposure import Truth
-
-
-class Lacks(StrEnum):
-    """What a device cannot do. A driver lists it as ``lacks``; `aolink devices` shows it, and a recording keeps it."""
-
-    TIME = "tells no time: the arrival of its frames stands for it"
-    COUNT = "does not count its frames: lost ones show by their time only"
-    TRIGGER = "starts when it likes: its exposures begin anywhere in a fast step"
-    QUEUE = "queues no inputs: the host sends each when its fast step begins"
-    ANSWER = "acknowledges nothing: what was sent counts as taken"
-    READ_BACK = "does not say what it holds: what was sent counts as held"
-    WATCHDOG = "has no watchdog: while the host's program runs, the host parks it"
-    STOP = "cannot empty its queue: parking waits for what is queued"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
