@@ -158,6 +158,7 @@ def test_a_session_is_recorded_estimated_and_replayed(tmp_path: Path) -> None:
     assert (report.ended, report.steps_commanded, report.estimation["o3"].failed) == ("complete", 0, "")
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["camera"].startswith("Aravis Fake, serial number GV01")
+    assert recording.metadata["camera_lacks"] == Lacks.TRIGGER
     link = messages_of(LinkStatistics, recording, topics.LINK)[-1]
     chunks_lost = sum(each.chunks_lost for each in messages_of(ExposureInfo, recording, topics.EXPOSURE))
     assert (link.device, report.packets_missing) == ("camera", link.sequence_gaps)
