@@ -7,36 +7,23 @@ picture whose counts take two bytes goes to the session as it lies there, withou
 from __future__ import annotations
 
 import ctypes
-import math
-import os
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from aolink.devices.cameras.aravis_library import G_TYPE_INT, Aravis, GValue, Refused
+from aolink.devices.cameras.aravis_library import Aravis, Refused
+from aolink.devices.cameras.aravis_stream import Picture, PictureStream
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
 
-_SUCCESS, _TIMEOUT, _MISSING_PACKETS = 0, 2, 3
-"""`ArvBufferStatus` of a whole frame, and of two kinds of incomplete ones."""
+_PACKET_OVERHEAD, _PACKET_OVERHEAD_EXTENDED = 36, 48
+"""Bytes of a packet that are not of the picture, with frame ids of 16 and of 64 bits: headers of IP, UDP and GVSP."""
 _ID_PERIOD = 65535
 """A 16-bit frame id goes from 65535 to 1: 0 is not valid."""
-_PACKET_OVERHEAD = 36
-"""Bytes of a GigE Vision packet that are not of the picture: headers of IP, UDP and GVSP (with 16-bit ids)."""
-_PACKET_OVERHEAD_EXTENDED = 48
-_MARK = 16
-"""Bytes of memory that are marked before a packet is written over them."""
-_BUFFERED_S = 0.5
-"""How much of the stream is kept while the session is busy."""
-_FEWEST_BUFFERS, _MOST_BYTES = 16, 256 << 20
-_SOCKET_BYTES = 4 << 20
 _RATE_TOLERANCE = 0.01
 _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, _TIMESTAMP_VALUE = 0x0944, 2, 0x0948
 """Registers that GigE Vision lays down: what is written to latch the clock, and where its latched value lies."""
@@ -122,14 +109,11 @@ class AravisCamera:
         self._period_ns = timing.frame_period_steps * timing.fast_step_ns
         self._aravis = Aravis()
         self._address = address or self._only_camera()
-        self._camera = self._stream = None
-        self._memory: dict[int, NDArray[np.uint8]] = {}
-        """What the buffers that Aravis has may write to, by buffer."""
+        self._camera = None
         self._running = False
         self._start_ns = 0
         self._before: tuple[int, int, int] | None = None
         """Of the frame before: its id as the camera has it, its number without wrapping, and its time, ns."""
-        self._lost = 0
         try:
             self._camera = self._do("arv_camera_new", self._address.encode(), to="be opened")
             self._device = self._aravis("arv_camera_get_device", self._camera)
@@ -143,7 +127,7 @@ class AravisCamera:
             self._set_region(offset)
             self._exposure_ns = self._set_timing(trigger)
             self.description = self._describe()
-            self._open_stream(resend, packet_size)
+            self._stream = self._open_stream(resend, packet_size)
             self._latch = self._find_latch()
         except BaseException:
             self.close()
@@ -155,18 +139,15 @@ class AravisCamera:
         return self._latched_ns(self._latch) if self._latch else None
 
     def start(self, start_ns: int, exposures: int) -> None:
-        while buffer := self._aravis("arv_stream_try_pop_buffer", self._stream):  # what is left from before
-            self._memory.pop(buffer)
-            self._aravis("g_object_unref", buffer)
-            self._offer()
+        for _ in self._stream.pictures():
+            pass  # what is left from before
         self._start_ns, self._before = start_ns, None
         self._do("arv_camera_start_acquisition", self._camera, to="be started")
         self._running = True
 
     def frames(self) -> Iterator[SimpleFrame]:
-        while buffer := self._aravis("arv_stream_try_pop_buffer", self._stream):
-            frame = self._take(buffer)
-            self._offer()
+        for picture in self._stream.pictures():
+            frame = self._frame(picture)
             if frame is not None:
                 yield frame
         self._check_control("no longer answers, or another program has taken it: is it connected, is its power on?")
@@ -181,33 +162,24 @@ class AravisCamera:
 
         ``sequence_gaps`` are the packets of pictures that are missing in the frames that came.
         """
-        if not self._is_gige:
-            return {}
-        names = {"packets_received": "n_received_packets", "bytes_received": "n_transferred_bytes",
-                 "duplicates": "n_duplicated_packets", "retransmits": "n_resent_packets"}  # fmt: skip
-        counts = {
-            field: int(self._aravis("arv_stream_get_info_uint64_by_name", self._stream, name.encode()))
-            for field, name in names.items()
-        }
-        return {**counts, "sequence_gaps": self._lost}
+        return self._stream.counts() if self._is_gige else {}
 
     def close(self) -> None:
-        stream, camera, memory, running = self._stream, self._camera, self._memory, self._running
-        self._stream = self._camera = None
-        self._memory, self._running = {}, False
+        camera, running = self._camera, self._running
+        self._camera, self._running = None, False
 
         def release() -> None:
             if running:
                 with suppress(Refused):
                     self._aravis("arv_camera_stop_acquisition", camera)
-            for each in filter(None, (stream, camera)):
-                self._aravis("g_object_unref", each)
-            memory.clear()  # only now: the stream's thread writes no more
+            if hasattr(self, "_stream"):
+                self._stream.release()
+            self._aravis("g_object_unref", camera)
 
-        # A camera that no longer answers is asked again for many seconds, which nobody need wait for.
-        releasing = threading.Thread(target=release, name="aolink-aravis-release", daemon=True)
-        releasing.start()
-        releasing.join(_RELEASE_S)
+        if camera:  # one that no longer answers is asked again for many seconds, which nobody need wait for
+            releasing = threading.Thread(target=release, name="aolink-aravis-release", daemon=True)
+            releasing.start()
+            releasing.join(_RELEASE_S)
 
     # Opening
 
@@ -336,105 +308,42 @@ class AravisCamera:
 
     # Frames
 
-    def _open_stream(self, resend: bool, packet_size: int) -> None:
-        payload = int(self._get("get_payload"))
-        self._marked = self._blocks = np.zeros(0, dtype=np.intp)
+    def _open_stream(self, resend: bool, packet_size: int) -> PictureStream:
+        block = 0
         if self._is_gige:
             # Packet sockets need privileges, and nothing here needs their speed.
             self._aravis("arv_camera_gv_set_stream_options", self._camera, 1)
             if packet_size:
                 self._set("gv_set_packet_size", packet_size, to=f"send packets of {packet_size} bytes")
-        self._stream = self._do("arv_camera_create_stream", self._camera, None, None, to="be read")
+        stream = self._do("arv_camera_create_stream", self._camera, None, None, to="be read")
         if self._is_gige:
-            resend_type = self._aravis("arv_gv_stream_packet_resend_get_type")
-            self._set_stream("packet-resend", resend_type, "g_value_set_enum", int(resend))
-            self._set_stream("socket-buffer-size", G_TYPE_INT, "g_value_set_int", _SOCKET_BYTES)
-            if packet_size not in (0, has := int(self._get("gv_get_packet_size"))):
-                raise DeviceError(
-                    f"the camera {self._address} sends packets of {has} bytes, {packet_size} are asked for: correct"
-                    " devices.camera.packet_size"
-                )
-            self._block = has - (_PACKET_OVERHEAD_EXTENDED if self._extended_ids() else _PACKET_OVERHEAD)
-            starts = np.arange(0, payload, self._block)
-            marks = starts[:, None] + np.arange(_MARK)
-            inside = marks < np.minimum(starts + self._block, payload)[:, None]
-            self._marked = marks[inside]
-            self._blocks = np.concatenate([[0], inside.sum(axis=1).cumsum()[:-1]])
-        self._mark = np.frombuffer(os.urandom(len(self._marked)), dtype=np.uint8)
-        self._payload = payload
-        buffers = max(_FEWEST_BUFFERS, math.ceil(_BUFFERED_S * 1e9 / self._period_ns))
-        for _ in range(max(min(buffers, _MOST_BYTES // payload), 2)):
-            self._offer()
-
-    def _set_stream(self, name: str, kind: int, setter: str, value: int) -> None:
-        boxed = GValue()
-        self._aravis("g_value_init", ctypes.byref(boxed), kind)
-        self._aravis(setter, ctypes.byref(boxed), value)
-        self._aravis("g_object_set_property", self._stream, name.encode(), ctypes.byref(boxed))
+            has = int(self._get("gv_get_packet_size"))
+            block = has - (_PACKET_OVERHEAD_EXTENDED if self._extended_ids() else _PACKET_OVERHEAD)
+        pictures = PictureStream(
+            self._aravis, stream, name=self._address, shape=self._shape, pixel_format=self._format,
+            payload=int(self._get("get_payload")), block=block, period_s=self._period_ns / 1e9,
+        )  # fmt: skip
+        if self._is_gige:
+            pictures.set_resend(resend)
+        return pictures
 
     def _extended_ids(self) -> bool:
         feature = b"GevGVSPExtendedIDMode"
         return bool(self._get("is_feature_available", feature)) and self._get("get_string", feature) == b"On"
 
-    def _offer(self) -> None:
-        """Give Aravis memory for another frame.
-
-        It does not say which packets of a frame came. So where each packet will be written a mark lies before, of
-        random bytes: where it still lies afterwards, no packet came.
-        """
-        memory = np.empty(self._payload, dtype=np.uint8)
-        memory[self._marked] = self._mark
-        buffer = self._aravis("arv_buffer_new", memory.nbytes, memory.ctypes.data)
-        self._memory[buffer] = memory
-        self._aravis("arv_stream_push_buffer", self._stream, buffer)
-
-    def _take(self, buffer: int) -> SimpleFrame | None:
-        """The frame that Aravis has put into a buffer; None where there is none to be had: it shows by its number."""
-        memory = self._memory.pop(buffer)
-        status, frame_id, stamp_ns, leader_ns = (
-            self._aravis(f"arv_buffer_get_{what}", buffer)
-            for what in ("status", "frame_id", "timestamp", "system_timestamp")
-        )
-        if status == _SUCCESS:
-            self._check_picture(buffer)
-        self._aravis("g_object_unref", buffer)
-        if not frame_id or status not in (_SUCCESS, _TIMEOUT, _MISSING_PACKETS) or (status and not self._is_gige):
-            return None  # without an id the packet never came that has the time as well
-        # A camera without a latch is timed by the arrival of its leaders, on the clock of SimpleFrame.arrived_ns.
-        arrived_ns = time.monotonic_ns() - (time.time_ns() - leader_ns)
-        number = self._number(frame_id, stamp_ns if self._latch else arrived_ns)
-        start_ns = stamp_ns - (self._exposure_ns if self._stamp_at == "end" else 0) if self._latch else None
+    def _frame(self, picture: Picture) -> SimpleFrame | None:
+        """The frame of a picture; None for one from before the session."""
+        # A camera without a latch is timed by the arrival of its pictures, on the clock of SimpleFrame.arrived_ns.
+        arrived_ns = time.monotonic_ns() - (time.time_ns() - picture.leader_ns)
+        number = self._number(picture.frame_id, picture.stamp_ns if self._latch else arrived_ns)
+        since_start_ns = self._exposure_ns if self._stamp_at == "end" else 0
+        start_ns = picture.stamp_ns - since_start_ns if self._latch else None
         if (arrived_ns - self._exposure_ns if start_ns is None else start_ns) < self._start_ns:
             return None
-        arrived = np.ones(len(self._blocks), dtype=np.bool_)
-        if status != _SUCCESS:
-            arrived = ~np.logical_and.reduceat(memory[self._marked] == self._mark, self._blocks)
-        mask, chunks_lost = None, 0
-        if not arrived.all():
-            chunks_lost = int(np.count_nonzero(~arrived))
-            self._lost += chunks_lost
-            whole = np.repeat(arrived, self._block)[: self._payload]
-            mask = self._format.whole(whole, self._shape)
-        pixels = self._format.counts(memory, self._shape)
-        if mask is not None:
-            pixels[~mask] = 0
         return SimpleFrame(
-            pixels=pixels, exposure_ns=self._exposure_ns, start_ns=start_ns, arrived_ns=arrived_ns, number=number,
-            mask=mask, chunks_lost=chunks_lost,
+            pixels=picture.pixels, exposure_ns=self._exposure_ns, start_ns=start_ns, arrived_ns=arrived_ns,
+            number=number, mask=picture.mask, chunks_lost=picture.chunks_lost,
         )  # fmt: skip
-
-    def _check_picture(self, buffer: int) -> None:
-        code, width, height = (
-            self._aravis(f"arv_buffer_get_image_{what}", buffer) for what in ("pixel_format", "width", "height")
-        )
-        padding = [ctypes.c_int(), ctypes.c_int()]
-        self._aravis("arv_buffer_get_image_padding", buffer, *map(ctypes.byref, padding))
-        if (height, width) != self._shape or code != self._format.code or padding[0].value:
-            raise DeviceError(
-                f"the camera {self._address} has changed its picture to {width} x {height} pixels of format {code:#x}"
-                f" with {padding[0].value} bytes after each row, from {self._shape[1]} x {self._shape[0]} of"
-                f" {self._format.code:#x} with none: another program must not set it meanwhile"
-            )
 
     def _number(self, frame_id: int, at_ns: int) -> int:
         """A frame's number without wrapping. Raises DeviceError where the camera has begun to count anew."""
