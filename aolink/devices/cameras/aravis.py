@@ -35,12 +35,9 @@ _RELEASE_S = 2.0
 def discover() -> list[tuple[str, str]]:
     """The cameras that answer on this machine's networks and buses: (address, description). It takes a second.
 
-    None is opened. The list is empty where Aravis is missing.
+    None is opened. Raises DeviceError where Aravis is missing.
     """
-    try:
-        aravis = Aravis()
-    except DeviceError:
-        return []
+    aravis = Aravis()
     aravis("arv_update_device_list")
     found = []
     for k in range(aravis("arv_get_n_devices")):
