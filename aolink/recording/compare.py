@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, NamedTuple, Self
@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.wrappers_pb2 import BytesValue
 
 from aolink.errors import RecordingError
+from aolink.exporting.common import Progress, no_progress
 from aolink.recording import schemas_pb2, topics
 from aolink.recording.reader import Recording
 from aolink.wire import messages_pb2 as wire
@@ -85,7 +86,7 @@ def compare(
     absolute: float = ABSOLUTE,
     only: Sequence[str] = (),
     relative_to_start: bool = False,
-    progress: Callable[[int], None] = lambda messages: None,
+    progress: Progress = no_progress,
 ) -> dict[str, TopicComparison]:
     """Compare two recordings by topic.
 

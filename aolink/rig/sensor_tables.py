@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -99,13 +99,10 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
     field = known_field or table.vector("field", 2, "lower and upper edge")
     if field[0] >= field[1]:
         raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
-    kernel_table = table.table("kernel")
-    kernel = read_kernel(kernel_table)
-    kernel_table.finish()
     return {
         "field": (float(field[0]), float(field[1])),
         "noise_density": table.number("noise_density", low=0.0),
-        "kernel": kernel,
+        "kernel": read_kernel(table.table("kernel")),
         "bit_depth": table.integer("bit_depth", 16, low=1, high=16),
         "black_level": table.number("black_level", 0.0, low=0.0),
         "counts_per_density": table.number("counts_per_density", above=0.0),
@@ -116,7 +113,9 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
 def read_kernel(table: Table) -> Kernel:
     """A table ``kernel``. Raises `RigError`."""
     shape = table.choice("shape", ("gaussian",))
-    if not isinstance(table.get("sigma"), list):
+    sigma = table.get("sigma")
+    table.finish()
+    if not isinstance(sigma, list):
         return Kernel(shape=shape, sigma=table.number("sigma", above=0.0))
     width = table.matrix("sigma", (2, 2), "Sigma of the plane, or a number for a round kernel")
     if width[0, 1] != width[1, 0] or float(np.linalg.eigvalsh(width).min()) <= 0:
@@ -128,16 +127,9 @@ def read_kernel(table: Table) -> Kernel:
 
 def read_calibration(table: Table) -> CalibrationTable:
     """The table ``[calibration]``. Raises `RigError`."""
-    calibration = CalibrationTable(
-        black_level_sd=table.optional_number("black_level_sd", low=0.0),
-        noise_density_sd=table.optional_number("noise_density_sd", low=0.0),
-        counts_per_density_sd=table.optional_number("counts_per_density_sd", low=0.0),
-        photoelectrons_sd=table.optional_number("photoelectrons_sd", low=0.0),
-        kernel_sigma_sd=table.optional_number("kernel_sigma_sd", low=0.0),
-        dark_frames=table.integer("dark_frames", 0, low=0),
-        flat_frames=table.integer("flat_frames", 0, low=0),
-        still_frames=table.integer("still_frames", 0, low=0),
-        sources=table.texts("sources"),
-    )
+    names = [each.name for each in fields(CalibrationTable)]
+    deviations: dict[str, Any] = {name: table.optional_number(name, low=0.0) for name in names if name.endswith("_sd")}
+    frames = {name: table.integer(name, 0, low=0) for name in names if name.endswith("_frames")}
+    calibration = CalibrationTable(**deviations, **frames, sources=table.texts("sources"))
     table.finish()
     return calibration

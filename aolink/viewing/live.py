@@ -106,11 +106,6 @@ class LiveView:
             truth=exposure.truth is not None,
             scenes=self._scenes,
             restored_spots=False,
-            commands=False,
-            clock=False,
-            link=False,
-            latency=False,
-            log=False,
         )
         self._stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
 

@@ -84,7 +84,6 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
     true_scene = recording.true_scene
     if rig.scene is not None and true_scene is not None:
         scene.log_true_scene(stream, rig.scene, true_scene)
-    found = _send_devices(stream, recording, timebase)
     stream.log(
         "session", rr.TextDocument(_summary(recording, exposures, estimates), media_type="text/markdown"), static=True
     )
@@ -104,11 +103,7 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
             if shown
         ],
         restored_spots=any(each.spots is not None for each in restored),
-        commands=bool(found & {topics.COMMAND, topics.APPLIED}),
-        clock=topics.CLOCK in found,
-        link=topics.LINK in found,
-        latency=topics.LATENCY in found,
-        log=topics.LOG in found,
+        topics=_send_devices(stream, recording, timebase),
     )
 
 
@@ -147,7 +142,7 @@ def send_camera(
     return top
 
 
-def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> set[str]:
+def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> frozenset[str]:
     """Send what does not come from exposures and estimates; the topics that had messages."""
     by_topic: dict[str, list[RecordedMessage]] = {
         topic: [] for topic in recording.counts if topics.named(topic).name in devices.LOGS
@@ -156,9 +151,9 @@ def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Ti
         by_topic[record.topic].append(record)
     for name, log in devices.LOGS.items():
         for topic, records in by_topic.items():
-            if topics.named(topic).name == name:
+            if topics.named(topic).name == name and records:
                 log(stream, timebase, records)
-    return set(by_topic)
+    return frozenset(by_topic)
 
 
 def _summary(recording: Recording, exposures: list[Exposure], estimates: dict[str, list[Estimate]]) -> str:
