@@ -13,10 +13,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame
+from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
 from aolink.devices.interfaces import CommandAnswered, Event
-from aolink.devices.simple import AdaptedCamera, AdaptedMirror, SimpleFrame
+from aolink.devices.simple import SimpleFrame
 from aolink.errors import DeviceError
 from aolink.rig import load_rig
+from aolink.rig.device_tables import Delay
 from aolink.session.account import Account
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as pb
@@ -79,7 +81,7 @@ class CameraBench(Bench):
 
 
 def mirror_of(bench: Bench) -> AdaptedMirror:
-    mirror = AdaptedMirror(RIG, bench, bench.now_ns)
+    mirror = AdaptedMirror(RIG, bench, Delay(), bench.now_ns)
     mirror.query_clock(bench.host_ns)
     mirror.poll()
     return mirror
@@ -181,7 +183,7 @@ def bench() -> CameraBench:
 def camera(bench: CameraBench) -> AdaptedCamera:
     """Started at fast step 100."""
     mirror_bench = Bench()
-    camera = AdaptedCamera(RIG, bench, mirror_of(mirror_bench), bench.now_ns)
+    camera = AdaptedCamera(RIG, bench, mirror_of(mirror_bench), Delay(), bench.now_ns)
     camera.query_clock(bench.host_ns)
     camera.poll()
     assert camera.start(100, 0)
@@ -242,4 +244,4 @@ def test_a_step_that_has_gone_by_is_too_late_to_start_at(camera: AdaptedCamera) 
 
 def test_a_second_picture_is_not_to_be_had_of_a_simple_driver(bench: CameraBench) -> None:
     with pytest.raises(DeviceError, match="no second picture"):
-        AdaptedCamera(load_rig("moving-scene"), bench, mirror_of(Bench()), bench.now_ns)
+        AdaptedCamera(load_rig("moving-scene"), bench, mirror_of(Bench()), Delay(), bench.now_ns)
