@@ -28,7 +28,8 @@ _MOST_STEPS = 1_000_000
 # What a frame, restored pictures and an estimate have alike with their messages.
 _OF_FRAME = (
     "frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns",
-    "alignment_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "frames_lost_before", "exposure_offset_ns",
+    "alignment_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "frames_lost_before",
+    "exposure_offset_ns",
 )  # fmt: skip
 _OF_RESTORATION = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
 _OF_ESTIMATE = ("estimator", "frame_id", "first_step", "n_steps", "reason")

@@ -48,7 +48,6 @@ def read_sensor(
         sensor = _spots(table, axes, n_outputs, read_out | {"light": light})
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
-    table.finish()
     return sensor
 
 
@@ -102,7 +101,7 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
     return {
         "field": (float(field[0]), float(field[1])),
         "noise_density": table.number("noise_density", low=0.0),
-        "kernel": read_kernel(table.table("kernel")),
+        "kernel": table.read("kernel", read_kernel),
         "bit_depth": table.integer("bit_depth", 16, low=1, high=16),
         "black_level": table.number("black_level", 0.0, low=0.0),
         "counts_per_density": table.number("counts_per_density", above=0.0),
@@ -113,9 +112,7 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
 def read_kernel(table: Table) -> Kernel:
     """A table ``kernel``. Raises `RigError`."""
     shape = table.choice("shape", ("gaussian",))
-    sigma = table.get("sigma")
-    table.finish()
-    if not isinstance(sigma, list):
+    if not isinstance(table.get("sigma"), list):
         return Kernel(shape=shape, sigma=table.number("sigma", above=0.0))
     width = table.matrix("sigma", (2, 2), "Sigma of the plane, or a number for a round kernel")
     if width[0, 1] != width[1, 0] or float(np.linalg.eigvalsh(width).min()) <= 0:
@@ -130,6 +127,4 @@ def read_calibration(table: Table) -> CalibrationTable:
     names = [each.name for each in fields(CalibrationTable)]
     deviations: dict[str, Any] = {name: table.optional_number(name, low=0.0) for name in names if name.endswith("_sd")}
     frames = {name: table.integer(name, 0, low=0) for name in names if name.endswith("_frames")}
-    calibration = CalibrationTable(**deviations, **frames, sources=table.texts("sources"))
-    table.finish()
-    return calibration
+    return CalibrationTable(**deviations, **frames, sources=table.texts("sources"))

@@ -8,8 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 import rerun as rr
 
+from aolink.colours import estimator_colour
 from aolink.recording import topics
-from aolink.viewing.palette import APPLIED, COMMANDED, estimator_colour, series_colour
+from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
 from aolink.viewing.series import Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -93,15 +94,7 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
         measuring=[name for name, sequence in estimates.items() if any(e.innovation.shape[1] for e in sequence)],
         density_top=top,
         truth=bool(truths),
-        scenes=[
-            path
-            for path, shown in (
-                (scene.SCENE, scenes),
-                (scene.RESTORED_SCENE, scenes_restored),
-                (scene.TRUE_SCENE, true_scene is not None),
-            )
-            if shown
-        ],
+        scenes=list(compress(scene.SCENES, (scenes, scenes_restored, true_scene is not None))),
         restored_spots=any(each.spots is not None for each in restored),
         topics=_send_devices(stream, recording, timebase),
     )

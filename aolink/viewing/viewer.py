@@ -154,9 +154,14 @@ def settled_picture(client: ViewerClient, view_id: str | None = None) -> NDArray
     return pixels
 
 
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def check_display() -> None:
     """Raise `ViewerError` where a window cannot be opened."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not has_display():
         raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
 
 
