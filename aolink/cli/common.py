@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -21,13 +21,6 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
     from aolink.recording.remote import Url
     from aolink.rig import Rig
-
-
-class Tell(Protocol):
-    """Moves a progress bar."""
-
-    def __call__(self, done: int, note: str = "") -> None:
-        """``note`` is shown behind the bar."""
 
 
 app = typer.Typer(
@@ -59,8 +52,8 @@ def warn(text: str) -> None:
 
 
 @contextmanager
-def progress(what: str, total: int | None) -> Iterator[Tell]:
-    """A progress bar on a terminal; gives ``tell(done)``."""
+def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """A progress bar on a terminal; gives ``tell(done, note="")``, whose note is shown behind the bar."""
     with progress_bar(stderr, total) as tell:
         yield partial(tell, what)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -49,14 +49,16 @@ from aolink.files import check_target, writing
 from aolink.signals import Interrupted, StopRequest, stop_after
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Sequence
 
-    from aolink.estimation import Estimate
-    from aolink.exposure import Exposure
+    import numpy as np
+    from numpy.typing import NDArray
+
     from aolink.importing.exposures import Settings
     from aolink.recording.reader import Recording
     from aolink.rig import Rig
     from aolink.session import Report
+    from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
 
@@ -301,12 +303,12 @@ def record(
         skipped = report.exposures_skipped.items()
         tell(done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
 
-    with _live_view(loaded, estimator or [], shown=view) as watch:
+    with _live_view(loaded, estimator or [], shown=view) as live:
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
-                calibration=calibration or "", watch=watch, overwrite=overwrite, options=options, stop=stop,
-                progress=told, report=report,
+                calibration=calibration or "", watch=live.show if live else None, overwrite=overwrite,
+                options=options, stop=stop, progress=told, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
     stop.raise_if_asked()
@@ -329,18 +331,15 @@ def _print_session(report: Report, output: Path, as_json: bool) -> None:
         stdout.print(text, markup=False)
 
 
-@contextmanager
 def _live_view(
-    rig: Rig, estimators: Sequence[str], *, shown: bool
-) -> Iterator[Callable[[Exposure, Sequence[Estimate]], None] | None]:
-    """A function that shows a session's exposures, or None."""
+    rig: Rig, estimators: Sequence[str], true_scene: NDArray[np.uint16] | None = None, *, shown: bool
+) -> AbstractContextManager[LiveView | None]:
+    """What shows exposures in the viewer, or None."""
     if not shown:
-        yield None
-        return
+        return nullcontext()
     from aolink import viewing
 
-    with viewing.live_viewer(rig, estimators) as live:
-        yield live.show
+    return viewing.live_viewer(rig, estimators, true_scene)
 
 
 @app.command(
@@ -385,16 +384,13 @@ def replay(
         return
     if camera or mirror or output:
         raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
-    from contextlib import nullcontext
-
-    from aolink import viewing
     from aolink.cli.tables import scores as tables
     from aolink.estimation import Scorer
     from aolink.session.replay import replay as replay_recording
 
     scorers = {name: Scorer() for name in names}
-    viewer = viewing.live_viewer(recording.rig, names, recording.true_scene) if view else nullcontext()
-    with viewer as shown, StopRequest().installed() as stop:
+    live_view = _live_view(recording.rig, names, recording.true_scene, shown=view)
+    with live_view as live, StopRequest().installed() as stop:
         total = recording.n_frames
         with progress("replay", total if end is None and not start else None) as tell:
             series = replay_recording(
@@ -403,8 +399,8 @@ def replay(
             for number, (exposure, estimates) in enumerate(series, 1):
                 for estimate in estimates:
                     scorers[estimate.estimator].add(exposure, estimate)
-                if shown is not None:
-                    shown.show(exposure, estimates)
+                if live is not None:
+                    live.show(exposure, estimates)
                 tell(number)
         scores = {name: scorer.result() for name, scorer in scorers.items()}
         if as_json:

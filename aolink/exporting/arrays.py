@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import ExportError
-from aolink.exporting.common import Progress, clock_of, no_progress, time_ns, together
+from aolink.exporting.common import Progress, clock_of, facts, needed, no_progress, time_ns, together
 from aolink.exporting.series import Series
 from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 _MOST_BYTES = 8 << 30
 """More is not put into memory at once."""
@@ -215,3 +218,23 @@ def _check_size(series: Series, n_estimators: int) -> None:
             f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {_MOST_BYTES >> 30} are allowed:"
             " take fewer estimators or a part of it (`aolink cut`), or a table (.csv, .parquet), written row by row"
         )
+
+
+def to_xarray(series: Series, estimators: Sequence[str] | None = None, progress: Progress = no_progress) -> xr.Dataset:
+    """What `Series.to_xarray` gives. Raises as `arrays`, and ExportError where xarray is missing."""
+    xarray = needed("xarray", "tables", "a dataset")
+    found = arrays(series, estimators, progress)
+    coordinates = ("time", "frame_id", "estimator")
+    parts = {
+        name: (each.dims, each.values, {"long_name": each.text} | ({"units": each.unit} if each.unit else {}))
+        for name, each in found.items()
+    }
+    step_s = np.arange(found["inputs"].values.shape[1]) * series.rig.timing.fast_step_s
+    parts["rig_toml"] = ((), np.array(series.rig.toml), {"long_name": "the rig file"})
+    parts["step"] = (("step",), step_s, {"long_name": "time since the exposure's first fast step", "units": "s"})
+    dataset: xr.Dataset = xarray.Dataset(
+        {name: each for name, each in parts.items() if name not in (*coordinates, "step")},
+        coords={name: parts[name] for name in (*coordinates, "step") if name in parts},
+        attrs=facts(series),
+    )
+    return dataset

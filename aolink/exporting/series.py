@@ -117,7 +117,7 @@ class Series(ABC):
         ExportError
             There is no exposure, the exposures have different sizes, it would be too large, or xarray is missing.
         """
-        from aolink.exporting.dataset import to_xarray
+        from aolink.exporting.arrays import to_xarray
 
         return to_xarray(self, estimators)
 

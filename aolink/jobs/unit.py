@@ -21,10 +21,9 @@ from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.exposure import Exposure
 from aolink.files import check_target, writing
 from aolink.jobs.tables import COLUMNS, is_table_of, rows_into, table_beside
-from aolink.recording.editing import recorded_estimate
+from aolink.recording.editing import recorded_estimate, side_file
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
-from aolink.recording.side import side_file
 from aolink.rig import parse_rig
 from aolink.rig.edit import with_value
 

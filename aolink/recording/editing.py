@@ -1,4 +1,7 @@
-"""Recordings made from recordings: salvaged, cut, merged. Messages are copied as bytes; sources stay untouched."""
+"""Recordings made from recordings: salvaged, cut, merged, and side files.
+
+Messages are copied as bytes; sources stay untouched.
+"""
 
 from __future__ import annotations
 
@@ -91,6 +94,23 @@ class RecordingCopy:
         if facts := {**(end or {}), **damage}:
             self._file.add_metadata(topics.END_METADATA, facts)
         self._file.finish()
+
+
+def side_file(recording: Recording, path: Path, notes: dict[str, str]) -> RecordingCopy:
+    """A side file that is being written: the same estimates give the same bytes, but for the facts from its end.
+
+    Parameters
+    ----------
+    recording:
+        What is estimated, with the rig that it is estimated with.
+    path:
+        An empty file that is there already, as `aolink.files.writing` gives one.
+    notes:
+        Facts about the estimates.
+    """
+    known = {key: value for key in ("session", "rig") if (value := recording.metadata.get(key)) is not None}
+    facts = {"estimated_from": recording.path.name, topics.SIDE_OF: recording.digest}
+    return RecordingCopy(recording, path, known | facts | notes, attachments={})
 
 
 def recorded_estimate(estimate: Estimate, log_time_ns: int) -> RawMessage:

@@ -33,7 +33,7 @@ class Contents:
     truth: bool
     scenes: list[str]
     """Entities of the scene: as it came, restored, at rest; those that there are."""
-    restored_spots: bool
+    restored_spots: bool = False
     topics: frozenset[str] = frozenset()
     """Those of the devices that have messages."""
 

@@ -103,7 +103,6 @@ class LiveView:
             density_top=self._top or 1.0,
             truth=exposure.truth is not None,
             scenes=self._scenes,
-            restored_spots=False,
         )
         self._stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
 
