@@ -35,8 +35,9 @@ class PacedMirror:
         self._now = self._park
         """What the device holds."""
         self._held: list[tuple[NDArray[np.float64], bool]] = []
-        """Inputs of the steps from ``_told`` on, and whether they were late."""
+        """Inputs of the steps that were not told yet, and whether they were late."""
         self._told = 0
+        """The first step of ``_held``. While the device takes an input, its step is played, and not yet in there."""
         self._changed = threading.Condition()
         """For all of the above."""
         self._device = threading.Lock()
