@@ -43,6 +43,7 @@ class Frame:
     host_start_ns: int = 0
     """Start of the exposure on the host's clock, as estimated; 0 where there is no estimate."""
     clock_sigma_ns: float = float("nan")
+    alignment_sigma_ns: float = 0.0
     exposure_offset_ns: int = 0
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
     plane: int = 0
@@ -348,4 +349,5 @@ class Assembler:
             host_start_ns=frame.host_start_ns,
             host_receive_ns=frame.host_receive_ns,
             clock_sigma_ns=frame.clock_sigma_ns,
+            alignment_sigma_ns=frame.alignment_sigma_ns,
         )

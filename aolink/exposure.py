@@ -90,6 +90,12 @@ class Exposure:
     """When the host had the last chunk, host clock, ns."""
     clock_sigma_ns: float = float("nan")
     """Standard deviation of ``host_start_ns`` by the clock regression, ns; NaN where there is none."""
+    alignment_sigma_ns: float = 0.0
+    """Standard deviation of the exposure's start relative to the mirror's fast steps, ns.
+
+    Zero where the camera counts the steps together with its mirror. Of two clocks it is the error of their comparison,
+    which neighbouring exposures have in common: it does not average out.
+    """
     scene: Picture | None = None
     """The picture of the same exposure, where the rig has a picture sensor. It comes after the spot's frame, so
     that an exposure that is estimated live does not have it yet."""

@@ -62,19 +62,41 @@ def converter_margin(mirror: MirrorDriver) -> NDArray[np.float64]:
     return converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
 
 
-def check_command(
-    first_step: int, u: NDArray[np.float64], input_min: NDArray[np.float64], input_max: NDArray[np.float64]
-) -> None:
-    """Refuse inputs of the wrong shape or beyond the limits before they are sent. Raises DeviceError."""
-    if u.ndim != 2 or u.shape[1] != len(input_min):
-        raise DeviceError(f"a command of shape {u.shape} for a mirror of {len(input_min)} inputs: give (steps, inputs)")
-    inside = (u >= input_min) & (u <= input_max)
-    if not inside.all():  # NaN fails as well
-        step, channel = np.argwhere(~inside)[0]
-        raise DeviceError(
-            f"input {channel} at fast step {first_step + step} is {u[step, channel]:g}, beyond the mirror's limits"
-            f" {input_min[channel]:g} .. {input_max[channel]:g}: it was not sent"
-        )
+class CommandLimits:
+    """The limits of a mirror's inputs and of their change from step to step; what is beyond them is not sent."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._min, self._max, self._slew = rig.mirror.input_min, rig.mirror.input_max, rig.mirror.slew_max_per_s
+        self._most_change = self._slew * rig.timing.fast_step_s * (1 + 1e-9)
+        self._last = rig.mirror.park
+
+    def check(self, first_step: int, u: NDArray[np.float64]) -> None:
+        """Check inputs (n_steps, n_inputs) for the fast steps from ``first_step``, then take them as sent.
+
+        The change to their first step counts from the input that was sent last, at first from the safe input.
+        Raises DeviceError.
+        """
+        if u.ndim != 2 or u.shape[1] != len(self._min):
+            raise DeviceError(
+                f"a command of shape {u.shape} for a mirror of {len(self._min)} inputs: give (steps, inputs)"
+            )
+        inside = (u >= self._min) & (u <= self._max)
+        if not inside.all():  # NaN fails as well
+            step, channel = np.argwhere(~inside)[0]
+            raise DeviceError(
+                f"input {channel} at fast step {first_step + step} is {u[step, channel]:g}, beyond the mirror's limits"
+                f" {self._min[channel]:g} .. {self._max[channel]:g}: it was not sent"
+            )
+        if self._slew:
+            change = np.abs(np.diff(u, axis=0, prepend=self._last[None]))
+            if (change > self._most_change).any():
+                step, channel = np.argwhere(change > self._most_change)[0]
+                raise DeviceError(
+                    f"input {channel} changes by {change[step, channel]:g} to fast step {first_step + step}, more than"
+                    f" mirror.slew_max_per_s = {self._slew:g} allows in a fast step ({self._most_change:g}): it was"
+                    " not sent"
+                )
+        self._last = u[-1]
 
 
 class Gate:
@@ -102,6 +124,8 @@ class Gate:
         self._last_block = 0
         self._sent_end = self._first_step
         mirror = rig.mirror
+        self.limits = CommandLimits(rig)
+        """Of what is sent to the mirror."""
         margin = converter_margin(mirror)
         self._input_min, self._input_max = mirror.input_min - margin, mirror.input_max + margin
         planes = [(rig.sensor.shape, rig.sensor.bit_depth)]
@@ -267,8 +291,9 @@ class Gate:
     def _check_applied(self, device: str, applied: pb.Applied, receive_ns: int) -> bool:
         n_inputs, numbers = self._rig.n_inputs, len(applied.u)
         end, sources = applied.first_step + applied.n_steps, pb.Applied.Source
-        if applied.source not in sources.values() or applied.source == pb.Applied.AWAITED:
-            what = f"one of {[each for each in sources.values() if each != pb.Applied.AWAITED]}"
+        sent = [each for each in sources.values() if each not in (pb.Applied.AWAITED, pb.Applied.LATE)]
+        if applied.source not in sent:
+            what = f"one of {sent}"
             raise lie(device, "Applied.source", applied.source, what)
         known = applied.source != pb.Applied.NOT_REPORTED
         if not applied.n_steps or numbers != known * applied.n_steps * n_inputs:

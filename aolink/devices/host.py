@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
 from aolink.devices.interfaces import Happened
 from aolink.devices.native import NativeCamera, NativeMirror
-from aolink.devices.simple import AdaptedCamera, AdaptedMirror
+from aolink.devices.no_mirror import NoMirror
 from aolink.wire.hub import Hub
 
 _POLL_S = 0.005
@@ -20,7 +21,7 @@ class Host(Hub):
         super().__init__(stop)
         self.native: list[NativeCamera | NativeMirror] = []
         """The devices behind the links."""
-        self.polled: list[AdaptedCamera | AdaptedMirror] = []
+        self.polled: list[AdaptedCamera | AdaptedMirror | NoMirror] = []
         """The devices of simple drivers."""
 
     def events(self, timeout_s: float) -> Iterator[Happened]:

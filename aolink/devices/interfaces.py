@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -47,6 +48,19 @@ Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswere
 """What a device may report. Texts in it can be printed."""
 
 
+class Lacks(StrEnum):
+    """What a device cannot do. A driver lists it as ``lacks``; `aolink devices` shows it, and a recording keeps it."""
+
+    TIME = "tells no time: the arrival of its frames stands for it"
+    COUNT = "does not count its frames: lost ones show by their time only"
+    TRIGGER = "starts when it likes: its exposures begin anywhere in a fast step"
+    QUEUE = "queues no inputs: the host sends each when its fast step begins"
+    ANSWER = "acknowledges nothing: what was sent counts as taken"
+    READ_BACK = "does not say what it holds: what was sent counts as held"
+    WATCHDOG = "has no watchdog: while the host's program runs, the host parks it"
+    STOP = "cannot empty its queue: parking waits for what is queued"
+
+
 class Device(Protocol):
     """What camera and mirror have in common."""
 
@@ -55,6 +69,10 @@ class Device(Protocol):
     description: str
     """Model, serial number and firmware, for the recording."""
     clock: ClockRegression
+
+    @property
+    def lacks(self) -> Sequence[Lacks]:
+        """What the device cannot do, for the recording."""
 
     def query_clock(self, now_ns: int) -> None:
         """Ask the device for its time; the answer is an event."""
@@ -104,8 +122,13 @@ class Mirror(Device, Protocol):
     def in_flight(self) -> int:
         """Blocks sent and not yet answered."""
 
-    latched: bool
-    """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
+    commanded: bool
+    """Whether there is a mirror: where there is none, nothing is commanded, and the rig's safe input counts as held."""
+
+    @property
+    def latched(self) -> bool:
+        """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
+
     outage_s: float
     """How long the mirror had taken no command when it reported that it is latched, s; 0 at the start of a session."""
 
@@ -115,6 +138,9 @@ class Mirror(Device, Protocol):
 
     def since_zero_ns(self, host_ns: int) -> int:
         """Time from the beginning of its fast step 0 to a host time, on the mirror's own clock, ns."""
+
+    def step_sigma_ns(self, host_ns: int) -> float:
+        """Standard deviation of `since_zero_ns`, as far as the inputs' times depend on it, ns."""
 
     def start_step(self, now_ns: int) -> int:
         """The fast step that it is in, or, on virtual time, waits at. Raises DeviceError for an impossible one."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
 from aolink.devices.clock import ClockExchange, ClockRegression, StepClock
-from aolink.devices.gate import Gate, check_command, lie, printable
-from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
+from aolink.devices.gate import Gate, lie, printable
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Lacks
 from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.wire import messages_pb2 as pb
@@ -43,6 +43,7 @@ class _NativeDevice:
 
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
         self.link, self.identity = link, identity
+        self.lacks: tuple[Lacks, ...] = ()
         self.name = link.name
         self.description = f"{identity.model} {identity.serial_number} ({identity.firmware})"
         self._gate = gate
@@ -51,6 +52,10 @@ class _NativeDevice:
         self._hub = hub
         self._query_ids = count(1)
         self._queries: dict[int, int] = {}
+
+    def since_zero_ns(self, host_ns: int) -> int:
+        """Time from the beginning of the device's fast step 0 to a host time, on its own clock, ns."""
+        return self.clock.device_ns(host_ns)[0] - self.steps.step_zero_ns
 
     def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:
         return self.steps.host_ns(device_ns, since_zero_ns, now_ns)
@@ -180,6 +185,8 @@ class NativeMirror(_NativeDevice):
     are asked for again.
     """
 
+    commanded = True
+
     def __init__(self, hub: Hub, link: Link, identity: pb.Identity, gate: Gate) -> None:
         super().__init__(hub, link, identity, gate)
         self.retransmits = 0
@@ -209,8 +216,8 @@ class NativeMirror(_NativeDevice):
     def last_sent_ns(self) -> int:
         return self.link.last_sent_ns
 
-    def since_zero_ns(self, host_ns: int) -> int:
-        return self.clock.device_ns(host_ns)[0] - self.steps.step_zero_ns
+    def step_sigma_ns(self, host_ns: int) -> float:
+        return self.clock.device_ns(host_ns)[1]
 
     def start_step(self, now_ns: int) -> int:
         if self._hub.virtual:
@@ -224,8 +231,7 @@ class NativeMirror(_NativeDevice):
         return len(self._flights)
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
-        limits = self.identity.mirror
-        check_command(first_step, u, np.array(limits.input_min), np.array(limits.input_max))
+        self._gate.limits.check(first_step, u)
         block = pb.CommandBlock(
             block_id=next(self._block_ids),
             first_step=first_step,

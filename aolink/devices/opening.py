@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
-from aolink.devices.drivers import NATIVE, Kind, calling, driver_names, open_driver
+from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
+from aolink.devices.drivers import NATIVE, Kind, driver_names, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import check_against_rig, check_kind, identify
 from aolink.devices.interfaces import Camera, Mirror, Opened
 from aolink.devices.native import NativeCamera, NativeMirror
-from aolink.devices.simple import AdaptedCamera, AdaptedMirror, SimpleCamera, SimpleMirror
+from aolink.devices.no_mirror import NoMirror
+from aolink.devices.paced import PacedMirror
+from aolink.devices.simple import DirectMirror, SimpleCamera, SimpleMirror
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
-from aolink.rig.device_tables import DeviceTable
+from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.port import SerialPort
 
@@ -33,6 +37,7 @@ def open_devices(
     ----------
     camera_port, mirror_port:
         Ports of devices that speak aolink's packets; where None, the rig file's table ``[devices]`` names the driver.
+        Where that names no mirror, the camera is opened alone.
     stop:
         Once it gives True, no device is waited for longer than for one answer.
 
@@ -46,8 +51,14 @@ def open_devices(
     RigError
         The rig file names no driver for a device, or wrong keys for it.
     """
-    tables = {kind: _table(rig, kind, port) for kind, port in zip(_KINDS, (camera_port, mirror_port), strict=True)}
-    if tables["camera"].driver == NATIVE != tables["mirror"].driver:
+    given = {kind: _table(rig, kind, port) for kind, port in zip(_KINDS, (camera_port, mirror_port), strict=True)}
+    tables = {kind: table for kind, table in given.items() if table is not None}
+    if "camera" not in tables:
+        raise RigError(
+            "nothing says what drives the camera: give --camera PORT, or [devices.camera] in the rig file with one of"
+            f" the drivers {', '.join(driver_names('camera'))}"
+        )
+    if "mirror" in tables and tables["camera"].driver == NATIVE != tables["mirror"].driver:
         raise DeviceError(
             f"a native camera counts fast steps together with its own mirror, not with the driver"
             f" {tables['mirror'].driver}: use both native devices, or another driver for the camera"
@@ -59,38 +70,60 @@ def open_devices(
             rig, host, {kind: _port(kind, table) for kind, table in tables.items() if table.driver == NATIVE}, stop
         )
         mirror: Mirror
-        if native_mirror is None:
-            driver = _open_simple("mirror", tables["mirror"], rig, SimpleMirror, stack)
-            mirror = adapted_mirror = AdaptedMirror(rig, driver, host.now_ns)
+        if native_mirror is not None:
+            mirror = native_mirror
+        elif "mirror" in tables:
+            mirror = adapted_mirror = _open_mirror(rig, tables["mirror"], host, stack)
             host.polled.append(adapted_mirror)
         else:
-            mirror = native_mirror
+            mirror = no_mirror = NoMirror(rig, host.now_ns, native_camera.since_zero_ns if native_camera else None)
+            host.polled.append(no_mirror)
+            if rig.drive.kind != "none":
+                warnings.append("no mirror is named (--mirror, [devices.mirror]): the rig file's drive is not played")
         camera: Camera
         if native_camera is None:
-            driver = _open_simple("camera", tables["camera"], rig, SimpleCamera, stack)
-            camera = adapted_camera = AdaptedCamera(rig, driver, mirror, host.now_ns)
+            camera = adapted_camera = _open_camera(rig, tables["camera"], mirror, host, stack)
             host.polled.append(adapted_camera)
         else:
             camera = native_camera
         yield Opened(host, camera, mirror, warnings)
 
 
-def _table(rig: Rig, kind: Kind, port: str | None) -> DeviceTable:
-    """The driver of a device and its keys, from the port or the rig file."""
-    if port is not None:
-        return DeviceTable(driver=NATIVE, options={"port": port})
-    if kind not in rig.devices:
-        raise RigError(
-            f"nothing says what drives the {kind}: give --{kind} PORT, or [devices.{kind}] in the rig file with one of"
-            f" the drivers {', '.join(driver_names(kind))}"
-        )
-    return rig.devices[kind]
+def _table(rig: Rig, kind: Kind, port: str | None) -> DeviceTable | None:
+    """The driver of a device and its keys, from the port or the rig file; None where nothing names it."""
+    return rig.devices.get(kind) if port is None else DeviceTable(driver=NATIVE, options={"port": port})
+
+
+def _open_mirror(rig: Rig, table: DeviceTable, host: Host, stack: ExitStack) -> AdaptedMirror:
+    driver = open_driver("mirror", table, rig)
+    if hasattr(driver, "put"):
+        _check_whole("mirror", table, driver, DirectMirror)
+        driver = PacedMirror(rig, driver)
+    else:
+        _check_whole("mirror", table, driver, SimpleMirror)
+    mirror = AdaptedMirror(rig, driver, table.delay or Delay(), host.now_ns)
+    stack.callback(mirror.close)
+    return mirror
+
+
+def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack: ExitStack) -> AdaptedCamera:
+    driver = open_driver("camera", table, rig)
+    _check_whole("camera", table, driver, SimpleCamera)
+    tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_steps * rig.timing.fast_step_s
+    # Where nothing is known of when a frame arrives, it is some time within the frame period after its exposure.
+    delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))
+    camera = AdaptedCamera(rig, driver, mirror, delay, host.now_ns)
+    stack.callback(camera.close)
+    return camera
 
 
 def _port(kind: Kind, table: DeviceTable) -> str:
     port = table.options.get("port")
-    if not isinstance(port, str) or len(table.options) > 1:
-        raise RigError(f"devices.{kind}: the driver {NATIVE} takes one key, port, a text; found {table.options}")
+    if not isinstance(port, str) or len(table.options) > 1 or table.delay:
+        raise RigError(
+            f"devices.{kind}: the driver {NATIVE} takes one key, port, a text; found {table.options}"
+            f"{' and a delay' if table.delay else ''}"
+        )
     return port
 
 
@@ -107,18 +140,21 @@ def _open_native(
         identities[kind] = identify(host, link, secrets.randbits(48))
         check_kind(link, identities[kind], pb.Identity.CAMERA if kind == "camera" else pb.Identity.MIRROR)
     warnings = check_against_rig(rig, identities)
+    if "camera" in identities and "mirror" not in identities and identities["camera"].virtual_time:
+        raise DeviceError("the camera runs on virtual time, which the mirror's line hands on: give --mirror PORT too")
     gate = Gate(rig, host, identities.values(), asked_ns)
     host.budget_bytes += gate.exposure_bytes * (2 + rig.mirror.queue_steps // rig.timing.frame_period_steps)
-    if identities["mirror"].virtual_time:
+    if "mirror" in identities and identities["mirror"].virtual_time:
         if "camera" not in identities:
             raise DeviceError(
                 "the mirror runs on virtual time, which only the camera of the same simulated rig follows: run the rig"
                 " with --real-time"
             )
         host.go_virtual(gate.check_virtual_time)
-    mirror = NativeMirror(host, links["mirror"], identities["mirror"], gate)
-    host.native.append(mirror)
-    camera = None
+    mirror = camera = None
+    if "mirror" in links:
+        mirror = NativeMirror(host, links["mirror"], identities["mirror"], gate)
+        host.native.append(mirror)
     if "camera" in links:
         camera = NativeCamera(host, links["camera"], identities["camera"], gate)
         host.native.append(camera)
@@ -127,19 +163,13 @@ def _open_native(
     return camera, mirror, warnings
 
 
-def _open_simple(kind: Kind, table: DeviceTable, rig: Rig, protocol: type, stack: ExitStack) -> Any:
-    """A simple driver, which is closed with the others. Raises DeviceError where it has not all of ``protocol``."""
-    driver = open_driver(kind, table, rig)
+def _check_whole(kind: Kind, table: DeviceTable, driver: Any, protocol: type) -> None:
+    """Refuse, and close, a driver that has not all of ``protocol``. Raises DeviceError."""
     asked = [name for name in (*protocol.__annotations__, *vars(protocol)) if not name.startswith("_")]
     if lacking := [name for name in asked if not hasattr(driver, name)]:
+        with suppress(Exception):  # it may lack that as well
+            driver.close()
         raise DeviceError(
             f"the {kind} driver {table.driver} lacks {', '.join(lacking)}: see {protocol.__name__} in"
             " aolink.devices.simple"
         )
-
-    def close() -> None:
-        with calling(kind, "when it was closed"):
-            driver.close()
-
-    stack.callback(close)
-    return driver

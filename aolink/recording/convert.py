@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import ExposureModel
-from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.estimate import AlignmentError, Estimate, Status
 from aolink.exposure import Exposure, Truth
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
@@ -38,6 +38,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
         device_end_ns=frame.device_end_ns,
         host_start_ns=frame.host_start_ns,
         clock_sigma_ns=frame.clock_sigma_ns,
+        alignment_sigma_ns=frame.alignment_sigma_ns,
         host_first_byte_ns=frame.host_first_byte_ns,
         host_receive_ns=frame.host_receive_ns,
         chunks_lost=frame.chunks_lost,
@@ -122,6 +123,7 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
         host_receive_ns=info.host_receive_ns,
         host_start_ns=info.host_start_ns,
         clock_sigma_ns=info.clock_sigma_ns,
+        alignment_sigma_ns=info.alignment_sigma_ns,
         exposure_offset_ns=info.exposure_offset_ns,
     )
 
@@ -158,6 +160,10 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
     )
     for name in ("end_covariance", "coefficient_covariance"):
         _fill(message, name, getattr(estimate, name))
+    if estimate.alignment is not None:
+        message.alignment_steps = estimate.alignment.steps
+        _fill(message, "alignment_coefficients", estimate.alignment.coefficients)
+        _fill(message, "alignment_end_state", estimate.alignment.end_state)
     return message
 
 
@@ -185,6 +191,14 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         spread = _array(message.innovation_variance, axes, m)
     else:
         spread = _array(message.innovation_covariance, axes, m, m)
+    alignment, start_covariance = None, covariance[:, :n, :n].copy()
+    if message.alignment_steps:
+        alignment = AlignmentError(
+            message.alignment_steps,
+            _array(message.alignment_coefficients, axes, c),
+            _array(message.alignment_end_state, axes, n),
+        )
+        start_covariance = alignment.added_to(start_covariance, "coefficients")
     return Estimate(
         estimator=message.estimator,
         frame_id=message.frame_id,
@@ -193,7 +207,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         status=Status(message.status),
         reason=message.reason,
         start_state=coefficients[:, :n].copy(),
-        start_covariance=covariance[:, :n, :n].copy(),
+        start_covariance=start_covariance,
         end_state=_array(message.end_state, axes, n),
         end_covariance=_array(message.end_covariance, axes, n, n),
         coefficients=coefficients,
@@ -203,6 +217,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         innovation=_array(message.innovation, axes, m),
         innovation_covariance=spread,
         nis=_array(message.nis, axes),
+        alignment=alignment,
     )
 
 

@@ -122,6 +122,8 @@ class MirrorDriver:
     """Fast steps that the device can hold."""
     watchdog_s: float
     """The mirror parks itself when no valid packet has come for this time, s."""
+    slew_max_per_s: float = 0.0
+    """Most that an input may change in a second; the host refuses commands that change faster. 0 for no limit."""
     voltage: VoltageLaw | None = None
     """The law of electrostatic actuators: the converter's equal steps are then those of the voltage, not the input."""
 

@@ -166,6 +166,7 @@ def read_mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
         block_steps=block,
         queue_steps=queue,
         watchdog_s=table.number("watchdog_s", 1.0, above=0.0),
+        slew_max_per_s=table.number("slew_max_per_s", 0.0, low=0.0),
         voltage=law,
     )
     table.finish()
@@ -181,6 +182,12 @@ def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
     for name, reach in (("input_min", offset - np.abs(amplitude)), ("input_max", offset + np.abs(amplitude))):
         if (reach < mirror.input_min).any() or (reach > mirror.input_max).any():
             raise RigError(f"drive.amplitude and drive.offset reach beyond mirror.{name}: the mirror would refuse it")
+    fastest = float(np.abs(amplitude).max(initial=0.0)) * 2 * math.pi / period
+    if mirror.slew_max_per_s and kind == "sine" and fastest > mirror.slew_max_per_s:
+        raise RigError(
+            f"the drive changes by up to {fastest:g} in a second, more than mirror.slew_max_per_s ="
+            f" {mirror.slew_max_per_s:g}: the mirror would refuse it"
+        )
     table.finish()
     return Drive(kind=kind, amplitude=amplitude, period_s=period, offset=offset)
 

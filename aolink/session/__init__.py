@@ -86,7 +86,8 @@ def record(
         The rig file's description of the devices; compared with the identity that they report.
     camera_port, mirror_port:
         Anything that pyserial opens: a device path, or an address such as socket://host:port. Where None, the rig
-        file's table ``[devices]`` names the device's driver.
+        file's table ``[devices]`` names the device's driver. Where that names no mirror either, the camera alone is
+        recorded: nothing is commanded, and every exposure has the rig's safe input.
     path:
         The recording; must not exist unless ``overwrite``.
     estimators:
@@ -135,6 +136,8 @@ def record(
             "rig_digest": rig.digest,
             "camera": camera.description,
             "mirror": mirror.description,
+            "camera_lacks": "; ".join(camera.lacks),
+            "mirror_lacks": "; ".join(mirror.lacks),
             "virtual_time": str(clock.virtual),
             "estimators": " ".join(estimators),
             "note": note,

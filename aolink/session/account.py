@@ -67,7 +67,8 @@ class Account:
                 continue
             part = block.steps[max(first - block.first, 0) : end - block.first]
             if applied.block_id == block_id:
-                n_steps = self._count("steps_applied", part, part != _ENDED)
+                name = "steps_late" if applied.source == wire.Applied.LATE else "steps_applied"
+                n_steps = self._count(name, part, part != _ENDED)
                 self._report.steps_clipped += n_steps if applied.source == wire.Applied.CLIPPED else 0
             else:
                 part[part == _OPEN] = _UNKNOWN if applied.source == wire.Applied.NOT_REPORTED else _PASSED

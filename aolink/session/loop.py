@@ -103,8 +103,8 @@ class SessionLoop:
         self._queued_until = 0
         """First fast step for which no command was sent."""
         self._newest_frame = 0
-        self._asked: Camera | Mirror = camera
-        """Device whose clock is queried next."""
+        self._devices: list[Camera | Mirror] = [camera, mirror] if mirror.commanded else [camera]
+        """In the order in which their clocks are queried; the next one first."""
         self._last_query_ns = self._next_statistics_ns = 0
         self._last_frame_ns = 0
         self._end_step: int | None = None
@@ -183,14 +183,15 @@ class SessionLoop:
             deadline_ns = self._time.now_ns() + _ANSWER_NS
             while not self._receive(0.05) and not self._time.virtual and self._time.now_ns() < deadline_ns:
                 pass
-        for device in (self._camera, self._mirror):
+        for device in self._devices:
             if not device.clock.ready:
                 raise DeviceError(f"the {device.name} does not answer clock queries: is it still connected?")
         self._next_statistics_ns = self._time.now_ns() + round(_STATISTICS_PERIOD_S * 1e9)
 
     def _query_next_clock(self, now: int) -> None:
         """Camera and mirror in turn, so that the one's query does not wait for the other's."""
-        self._asked, asked = (self._mirror if self._asked is self._camera else self._camera), self._asked
+        asked = self._devices.pop(0)
+        self._devices.append(asked)
         asked.query_clock(now)
         self._last_query_ns = now
 
@@ -241,7 +242,7 @@ class SessionLoop:
         if time.virtual:
             return 0.0
         due = [self._next_query_ns() - now, self._keep_alive_ns() - now]
-        if self._end_step is None or self._queued_until < self._end_step:
+        if self._mirror.commanded and (self._end_step is None or self._queued_until < self._end_step):
             ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
             due.append((max(ahead, 0) + 1) * self._step_ns)
         if (due_ns := self._mirror.next_due_ns()) is not None:
@@ -267,6 +268,8 @@ class SessionLoop:
         self._queued_until = min(self._queued_until, step)  # what was queued is dropped
 
     def _send_commands(self, device_step: int) -> None:
+        if not self._mirror.commanded:
+            return
         block_steps, end_step = self._rig.mirror.block_steps, self._end_step
         horizon = device_step + lead_steps(self._rig.mirror)
         while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
@@ -509,7 +512,7 @@ class SessionLoop:
     def _record_statistics(self, now: int) -> None:
         report = self.report
         self._count_tries()
-        counts = {device.name: device.statistics() for device in (self._camera, self._mirror)}
+        counts = {device.name: device.statistics() for device in self._devices}
         report.packets_bad_crc = sum(each.get("bad_crc", 0) for each in counts.values())
         report.packets_bad_framing = sum(each.get("bad_framing", 0) for each in counts.values())
         report.packets_bad_payload = sum(each.get("bad_payload", 0) for each in counts.values())

@@ -156,12 +156,14 @@ class Applied(_message.Message):
         WATCHDOG: _ClassVar[Applied.Source]
         NOT_REPORTED: _ClassVar[Applied.Source]
         AWAITED: _ClassVar[Applied.Source]
+        LATE: _ClassVar[Applied.Source]
     COMMAND: Applied.Source
     PARKED: Applied.Source
     CLIPPED: Applied.Source
     WATCHDOG: Applied.Source
     NOT_REPORTED: Applied.Source
     AWAITED: Applied.Source
+    LATE: Applied.Source
     BLOCK_ID_FIELD_NUMBER: _ClassVar[int]
     FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
     N_STEPS_FIELD_NUMBER: _ClassVar[int]

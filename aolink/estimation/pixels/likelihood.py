@@ -110,7 +110,7 @@ def reduction(
     if all_steps:
         seen = quadrature.all_steps(model.n_steps)
     elif model.moved:  # it is the same whenever in a step an exposure starts
-        seen = reduction(exposure_model(model.plant, model.n_steps), sensor, left_out=left_out).resolution
+        seen = reduction(exposure_model(model.plant, model.n_steps), sensor).resolution
     else:
         seen = quadrature.resolution(_paths(model, expand), variance, sensor.profile)
     return Reduction(

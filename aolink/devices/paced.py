@@ -1,0 +1,136 @@
+"""A mirror without a queue, driven at the fast rate by a thread of the host."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.devices.simple import DirectMirror, Held, Lacks
+from aolink.rig import Rig
+
+_LATE = 0.5
+"""A step whose input was taken only after this part of it held the one before for longer: it was late."""
+
+
+class PacedMirror:
+    """A `SimpleMirror` made of a `DirectMirror`: the host queues the inputs, and sends each when its step begins.
+
+    The scheduler and the line decide how exactly that goes. A step for which the device took its input later than
+    half-way counts as late, and is reported to have held the input before. Where steps begin while the device is still
+    busy with an earlier one, the newest is sent, and those between are late.
+    """
+
+    def __init__(self, rig: Rig, driver: DirectMirror) -> None:
+        self.description = driver.description
+        self.lacks = tuple(dict.fromkeys((*getattr(driver, "lacks", ()), Lacks.QUEUE)))
+        self._driver, self._park, self._step_ns = driver, rig.mirror.park, rig.timing.fast_step_ns
+        self._zero_ns = time.monotonic_ns()
+        self._queue: dict[int, NDArray[np.float64]] = {}
+        self._next = 0
+        """The next step to play."""
+        self._now = self._park
+        """What the device holds."""
+        self._held: list[tuple[NDArray[np.float64], bool]] = []
+        """Inputs of the steps that were not told yet, and whether they were late."""
+        self._told = 0
+        """The first step of ``_held``. While the device takes an input, its step is played, and not yet in there."""
+        self._changed = threading.Condition()
+        """For all of the above."""
+        self._device = threading.Lock()
+        """Held while the driver is called; never asked for by who holds ``_changed``."""
+        self._parked = self._closed = False
+        self._failed: Exception | None = None
+        self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
+        self._thread.start()
+
+    def time_ns(self) -> int:
+        return time.monotonic_ns() - self._zero_ns
+
+    def send(self, first_step: int, u: NDArray[np.float64]) -> int:
+        with self._changed:
+            self._raise_failure()
+            self._parked = False
+            late = min(max(self._next - first_step, 0), len(u))
+            self._queue.update(enumerate(u[late:], first_step + late))
+        return late
+
+    def applied(self) -> Iterable[Held]:
+        with self._changed:
+            self._raise_failure()
+            held, self._held = self._held, []
+            first, self._told = self._told, self._told + len(held)
+        if not held:
+            return []
+        return [Held(first, np.array([u for u, _ in held]), np.array([late for _, late in held]))]
+
+    def park(self) -> int:
+        with self._changed:
+            self._parked = True
+            self._queue.clear()
+        with self._device:
+            self._driver.park()
+            with self._changed:
+                self._now = self._park
+                return max(self._next, self.time_ns() // self._step_ns + 1)
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+        self._driver.close()
+
+    def _play(self) -> None:
+        """Put out each step's input when it begins: the safe input where nothing is queued for it."""
+        while True:
+            with self._changed:
+                if (step := self._wait_for_step()) is None:
+                    return
+                u = self._queue.pop(step, self._park)
+                self._next = step + 1
+                if np.array_equal(u, self._now):
+                    self._held.append((self._now, False))
+                    continue
+            try:
+                self._put(step, u)
+            except Exception as error:  # the session is told when it asks next
+                with self._changed:
+                    self._failed = error
+                return
+
+    def _wait_for_step(self) -> int | None:
+        """The step that is on, once the one before was played; None when the mirror is closed.
+
+        Steps that have passed meanwhile held what the device held; they are late where something was queued for them.
+        """
+        while not self._closed:
+            step = self.time_ns() // self._step_ns
+            if step >= self._next:
+                self._held += [(self._now, self._queue.pop(k, None) is not None) for k in range(self._next, step)]
+                return step
+            self._changed.wait((self._next * self._step_ns - self.time_ns()) / 1e9)
+        return None
+
+    def _put(self, step: int, u: NDArray[np.float64]) -> None:
+        with self._device:
+            if self._parked:
+                with self._changed:
+                    self._held.append((self._now, True))
+                return
+            taken = self._driver.put(u)
+            with self._changed:
+                reached = self.time_ns() / self._step_ns - _LATE
+                late = step < reached
+                self._held.append((self._now if late else taken, late))
+                while self._next < reached:  # the device was busy for longer than a step
+                    self._held.append((self._now, self._queue.pop(self._next, None) is not None))
+                    self._next += 1
+                self._now = taken
+
+    def _raise_failure(self) -> None:
+        if self._failed is not None:
+            raise self._failed
