@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile
 from aolink.estimation.frames.moments import least_significance, measure_moments, spot_significance
 from aolink.estimation.frames.spots import measure_spots
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.rig import Rig
 
-FloatArray = NDArray[np.float64]
 Measured = tuple[FrameData | None, str]
 """What was measured of an exposure, or None; and a remark about what could not be used, or an empty text."""
 
