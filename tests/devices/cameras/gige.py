@@ -106,7 +106,7 @@ def expected(pictures: NDArray[np.uint16], frame: SimpleFrame) -> NDArray[np.uin
     return picture if frame.mask is None else picture * frame.mask
 
 
-def lenslet(**keys: object) -> Rig:
+def lenslet(address: str = RELAY, **keys: object) -> Rig:
     """A rig with nothing but a GigE camera of 12 bits: a spot moves by itself, 10 exposures a second of 40 ms."""
     toml = load_rig("single-lenslet").toml
     drive = toml[toml.index("[drive]") : toml.index("[simulation]")]
@@ -116,7 +116,7 @@ def lenslet(**keys: object) -> Rig:
         "[simulation]": "\n".join(
             [
                 '[devices.camera]\ndriver = "aravis"',
-                f'address = "{RELAY}"\nstamp_at = "end"',
+                f'address = "{address}"\nstamp_at = "end"',
                 *(f"{key} = {value}" for key, value in keys.items()),
                 "\n[simulation]",
             ]
