@@ -47,6 +47,8 @@ class Frame:
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
     plane: int = 0
     """Which of the camera's pictures of the exposure this is: 0 the spots, 1 the scene."""
+    slopes: NDArray[np.float64] | None = None
+    """As `Exposure.slopes`."""
 
 
 class FrameReassembly:
@@ -348,4 +350,5 @@ class Assembler:
             host_start_ns=frame.host_start_ns,
             host_receive_ns=frame.host_receive_ns,
             clock_sigma_ns=frame.clock_sigma_ns,
+            slopes=frame.slopes,
         )

@@ -90,6 +90,11 @@ class Exposure:
     """When the host had the last chunk, host clock, ns."""
     clock_sigma_ns: float = float("nan")
     """Standard deviation of ``host_start_ns`` by the clock regression, ns; NaN where there is none."""
+    slopes: NDArray[np.float64] | None = None
+    """Slopes that other software measured, slope units, (all outputs of all axes,), NaN where it measured none.
+
+    No pixel is known then: ``mask`` is False throughout. None where there are pixels.
+    """
     scene: Picture | None = None
     """The picture of the same exposure, where the rig has a picture sensor. It comes after the spot's frame, so
     that an exposure that is estimated live does not have it yet."""

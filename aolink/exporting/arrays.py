@@ -141,7 +141,7 @@ def arrays(
     columns: dict[str, list[Any]] = {name: [] for name in (*EXPOSURE, *TRUTH)}
     by_estimator: dict[str, list[list[Any]]] = {name: [[] for _ in names] for name in ESTIMATE}
     times: list[int] = []
-    leads, scenes = [], []
+    leads, scenes, slopes = [], [], []
     first: Exposure | None = None
     clock = ""
     for exposure, estimates in together(series, names, progress):
@@ -151,6 +151,7 @@ def arrays(
         times.append(time_ns(series, exposure, clock))
         leads.append(exposure.lead_inputs)
         scenes.append(exposure.scene)
+        slopes.append(exposure.slopes)
         for name, row in EXPOSURE.items():
             columns[name].append(row.get(exposure))
         for name, row in TRUTH.items():
@@ -171,6 +172,12 @@ def arrays(
         unit="input unit",
     )  # fmt: skip
     found |= _scenes(scenes)
+    if any(each is not None for each in slopes):
+        none = np.full(series.rig.n_outputs, np.nan)
+        found["slopes"] = Variable(
+            dims=("time", "output"), values=np.array([none if each is None else each for each in slopes]),
+            text="slopes of other software, where there are no pixels", unit=_SLOPE,
+        )  # fmt: skip
     sizes = {
         "axis": series.rig.plant.axes, "state": series.rig.plant.n_states, "output": series.rig.n_outputs,
         "step": found["inputs"].values.shape[1],

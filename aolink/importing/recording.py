@@ -53,7 +53,7 @@ def import_film(
         "aolink_version": version("aolink"),
         "rig": rig.name,
         "rig_digest": rig.digest,
-        "camera": f"imported from {film.name}",
+        "camera": f"{'slopes without pictures, ' if film.slopes else ''}imported from {film.name}",
         "mirror": "none" if film.inputs is None else f"imported from {film.name}",
         "import_settings": str(settings),
     }

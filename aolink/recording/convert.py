@@ -45,6 +45,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
         missing_length=2 * lengths,
         frames_lost_before=frame.frames_lost_before,
         exposure_offset_ns=frame.exposure_offset_ns,
+        slopes=frame.slopes,
     )
     sensor = "scene" if frame.plane else "camera"
     image = RawImage(frame_id=sensor, width=width, height=height, encoding="mono16", step=2 * width)
@@ -123,6 +124,7 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
         host_start_ns=info.host_start_ns,
         clock_sigma_ns=info.clock_sigma_ns,
         exposure_offset_ns=info.exposure_offset_ns,
+        slopes=np.array(info.slopes) if info.slopes else None,
     )
 
 

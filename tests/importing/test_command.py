@@ -108,10 +108,6 @@ def of_words(folder: Path) -> Path:
     return folder / "film.mp4"
 
 
-def of_slopes(folder: Path) -> Path:
-    return others.write_aot(folder / "film.fits", None)
-
-
 def good(folder: Path) -> Path:
     return others.written_npy(folder, FRAMES)
 
@@ -132,7 +128,6 @@ def missing(folder: Path) -> Path:
         (missing, [], 11, "there is no such file or folder"),
         (of_words, [], 11, "film.mp4"),
         (mixed, [], 11, "frame99.png has 6 x 9 pixels of uint8, those before it have 8 x 8 pixels"),
-        (of_slopes, [], 11, "has slopes of SH, but no pictures"),
         (timed, [], 11, "50 frames/s contradict its times, which say 40"),
         (good, ["--rate", "60"], 11, "change its [timing], or give the right --rate"),
         (good, ["--rate", "0"], 11, "--rate 0 must be above 0"),
