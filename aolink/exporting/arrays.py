@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure
 
 _MOST_BYTES = 8 << 30
-"""More is not put into memory at once."""
+"""More is not put into memory at once, nor more than a quarter of what the machine has."""
 _SLOPE = "slope unit"
 
 
@@ -243,8 +244,9 @@ def _check_size(series: Series, n_estimators: int) -> None:
     numbers += 4 * n_estimators * rig.plant.axes * rig.plant.n_states
     pixels = int(np.prod(rig.sensor.shape)) + (int(np.prod(rig.scene.shape)) if rig.scene else 0)
     size = len(series) * (8 * numbers + 3 * pixels)
-    if size > _MOST_BYTES:
+    most = min(_MOST_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4)
+    if size > most:
         raise ExportError(
-            f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {_MOST_BYTES >> 30} are allowed:"
+            f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {most / 2**30:.1f} are allowed here:"
             " take fewer estimators or a part of it (`aolink cut`), or a table (.csv, .parquet), written row by row"
         )

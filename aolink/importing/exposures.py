@@ -149,10 +149,12 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
         notes.append(f"nothing says the frame rate: that of the rig file is assumed, {own:.6g} frames/s")
     elif abs(rate / own - 1) > _CLOSE:
         each = f"{K} frames" if K > 1 else "a frame"
+        whole = round(rate / own)
+        summed = f"give --sum {whole} as the rig file has it, " if K == 1 < whole == timing.exposure_steps else ""
         raise ImportingError(
             f"{film.name} has {rate:.6g} frames/s, and the rig file {rig.name} wants {each} every"
-            f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: change its [timing], or give"
-            " the right --rate"
+            f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: {summed}change its"
+            " [timing], or give the right --rate"
         )
     if K > 1 and (timing.exposure_steps, timing.frame_period_steps) != (K, K):
         raise ImportingError(
@@ -220,6 +222,11 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     for group in grouped(film, settings.frames_per_exposure, periods):
         each = [light.of(frame) for frame in group.frames]
         mean = np.mean([one for one, _ in each], axis=0)
+        if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
+            raise ImportingError(
+                f"{film.name} has floating-point values up to {mean.max():.6g}, where 1.0 would be full scale: say with"
+                " --scale how many counts a value of one is"
+            )
         usable = ~np.any([bad for _, bad in each], axis=0)
         pixels, mask = counts_of(offset + scale * mean, usable, rig, account)
         account.frames += len(each)
