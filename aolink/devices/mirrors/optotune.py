@@ -78,7 +78,8 @@ class OptotuneMirror:
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
         steps = 10**_DECIMALS
-        xy = np.trunc(np.tan(self._unit_rad * u) / _LIMIT * steps) / steps  # towards zero, so never beyond the circle
+        # Towards zero, so never beyond the circle.
+        xy: NDArray[np.float64] = np.trunc(np.tan(self._unit_rad * u) / _LIMIT * steps) / steps
         request = ";".join(f"{each:.{_DECIMALS}f}" for each in xy)
         if (answer := self._ask(f"XY={request}")) != "OK":
             raise DeviceError(
