@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, stderr, stdout
-from aolink.cli.terminal import progress_bar
+from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, progress, stdout
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ def import_(
             help="A film: .npy, .npz, TIFF, FITS cube, video, MCAP, ROS bag, AOT telemetry, or a folder of pictures.",
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    output: OutputOption,
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What camera and plant the film shows.")],
     rate: RateOption = None,
     exposure: Annotated[
@@ -119,10 +118,10 @@ def import_(
     )  # fmt: skip
     loaded = load_rig(rig)
     film = open_film(source, topic)
-    with progress_bar(stderr, film.count // frames) as tell:
+    with progress("import", film.count // frames) as tell:
         account = import_film(
             film, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
-            progress=lambda done: tell("import", done),
+            progress=tell,
         )  # fmt: skip
     if as_json:
         print(json.dumps({"out": str(output), **vars(account)}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -19,6 +19,7 @@ from aolink.cli.common import (
     EstimatorOption,
     FileArgument,
     JsonOption,
+    OutputOption,
     OverwriteOption,
     RigArgument,
     app,
@@ -27,8 +28,10 @@ from aolink.cli.common import (
     load_checked,
     open_recording,
     program,
+    progress,
     stderr,
     stdout,
+    warn,
 )
 from aolink.cli.films import (
     AtOption,
@@ -46,14 +49,16 @@ from aolink.files import check_target, writing
 from aolink.signals import Interrupted, StopRequest, stop_after
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Sequence
 
-    from aolink.estimation import Estimate
-    from aolink.exposure import Exposure
+    import numpy as np
+    from numpy.typing import NDArray
+
     from aolink.importing.exposures import Settings
     from aolink.recording.reader import Recording
     from aolink.rig import Rig
     from aolink.session import Report
+    from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
 
@@ -152,22 +157,22 @@ def _write_first_rig(path: Path, source: Path, topic: str | None, settings: Sett
 
     check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
     film = open_film(source, topic)
-    with progress_bar(stderr, film.count) as tell:
-        text = first_rig(film, settings, path.stem, lambda done: tell("follow", done))
+    with progress("follow", film.count) as tell:
+        text = first_rig(film, settings, path.stem, tell)
     with writing(path, overwrite=overwrite, error=RigError) as partial:
         partial.write_text(text, encoding="utf-8")
     stdout.print(f"{path}: written from {film.name}; read it, then: {program()} rig {path} --check", markup=False)
 
 
 def _print_scan(loaded: Rig, as_json: bool) -> None:
-    from aolink.cli import tables
+    from aolink.cli.tables.rigs import exposure_scan as scan_table
     from aolink.estimation.exposure_scan import best, exposure_scan
 
     errors = exposure_scan(loaded)
     if as_json:
         print(json.dumps([vars(each) for each in errors]))
         return
-    stdout.print(tables.exposure_scan(loaded, errors))
+    stdout.print(scan_table(loaded, errors))
     steps = best(errors).exposure_steps
     stdout.print(f"least error of the path: timing.exposure_steps = {steps}, {steps * loaded.timing.fast_step_s:g} s")
 
@@ -236,7 +241,7 @@ def record(
     rig: Annotated[
         str, typer.Option(metavar="RIG.toml", help="A rig file, or the name of a rig that comes with aolink.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    output: OutputOption,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -294,16 +299,16 @@ def record(
     get_ready(loaded, estimator or [])
     report = session.Report()
 
-    def progress(done: int) -> None:
+    def told(done: int) -> None:
         skipped = report.exposures_skipped.items()
-        tell("exposures", done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
+        tell(done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
 
-    with _live_view(loaded, estimator or [], shown=view) as watch:
-        with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
+    with _live_view(loaded, estimator or [], shown=view) as live:
+        with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
-                calibration=calibration or "", watch=watch, overwrite=overwrite, options=options, stop=stop,
-                progress=progress, report=report,
+                calibration=calibration or "", watch=live.show if live else None, overwrite=overwrite,
+                options=options, stop=stop, progress=told, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
     stop.raise_if_asked()
@@ -312,10 +317,10 @@ def record(
 
 
 def _print_session(report: Report, output: Path, as_json: bool) -> None:
-    from aolink.cli import tables
+    from aolink.cli.tables import sessions as tables
 
     for warning in report.warnings:
-        stderr.print(f"aolink: warning: {escape(warning)}")
+        warn(warning)
     if as_json:
         print(json.dumps(tables.session_as_json(report), allow_nan=False), flush=True)
     else:
@@ -326,18 +331,15 @@ def _print_session(report: Report, output: Path, as_json: bool) -> None:
         stdout.print(text, markup=False)
 
 
-@contextmanager
 def _live_view(
-    rig: Rig, estimators: Sequence[str], *, shown: bool
-) -> Iterator[Callable[[Exposure, Sequence[Estimate]], None] | None]:
-    """A function that shows a session's exposures, or None."""
+    rig: Rig, estimators: Sequence[str], true_scene: NDArray[np.uint16] | None = None, *, shown: bool
+) -> AbstractContextManager[LiveView | None]:
+    """What shows exposures in the viewer, or None."""
     if not shown:
-        yield None
-        return
+        return nullcontext()
     from aolink import viewing
 
-    with viewing.live_viewer(rig, estimators) as live:
-        yield live.show
+    return viewing.live_viewer(rig, estimators, true_scene)
 
 
 @app.command(
@@ -382,27 +384,24 @@ def replay(
         return
     if camera or mirror or output:
         raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
-    from contextlib import nullcontext
-
-    from aolink import viewing
-    from aolink.cli import tables
+    from aolink.cli.tables import scores as tables
     from aolink.estimation import Scorer
     from aolink.session.replay import replay as replay_recording
 
     scorers = {name: Scorer() for name in names}
-    viewer = viewing.live_viewer(recording.rig, names, recording.true_scene) if view else nullcontext()
-    with viewer as shown, StopRequest().installed() as stop:
+    live_view = _live_view(recording.rig, names, recording.true_scene, shown=view)
+    with live_view as live, StopRequest().installed() as stop:
         total = recording.n_frames
-        with progress_bar(stderr, total if end is None and not start else None) as tell:
+        with progress("replay", total if end is None and not start else None) as tell:
             series = replay_recording(
                 recording, names, rate=rate, start_s=start, end_s=math.inf if end is None else end, stop=stop
             )
             for number, (exposure, estimates) in enumerate(series, 1):
                 for estimate in estimates:
                     scorers[estimate.estimator].add(exposure, estimate)
-                if shown is not None:
-                    shown.show(exposure, estimates)
-                tell("replay", number)
+                if live is not None:
+                    live.show(exposure, estimates)
+                tell(number)
         scores = {name: scorer.result() for name, scorer in scorers.items()}
         if as_json:
             print(json.dumps(tables.scores_as_json(scores), allow_nan=False), flush=True)
@@ -428,27 +427,28 @@ def _replay_to_rig(
     as_json: bool,
 ) -> None:
     from aolink import session
-    from aolink.cli import tables
+    from aolink.cli.tables import recordings as tables
+    from aolink.cli.tables import sessions
     from aolink.recording.compare import compare
     from aolink.recording.reader import Recording
     from aolink.recording.topics import TOPICS
     from aolink.session.replay import RecordedCommands
 
     commands = RecordedCommands(recording)
-    with StopRequest().installed() as stop, progress_bar(stderr, commands.exposures) as tell:
+    with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
         report = session.record(
             recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
             inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
-            progress=lambda done: tell("exposures", done),
+            progress=tell,
         )  # fmt: skip
     for warning in report.warnings:
-        stderr.print(f"aolink: warning: {escape(warning)}")
+        warn(warning)
     only = [row.name for row in TOPICS if row.repeatable]
     found = compare(recording, Recording(output), only=only, relative_to_start=True)
     if as_json:
         print(json.dumps(tables.comparison_as_json(found, same_rig=True), allow_nan=False))
     else:
-        stdout.print(tables.session(report))
+        stdout.print(sessions.session(report))
         stdout.print(tables.comparison(found))
         stdout.print(f"{output}: {report.exposures} exposures, {report.ended}", markup=False)
     stop.raise_if_asked()
@@ -483,7 +483,7 @@ def calibrate(
     from shutil import rmtree
     from tempfile import mkdtemp
 
-    from aolink.cli import tables
+    from aolink.cli.tables import rigs as tables
     from aolink.jobs import calibrate
     from aolink.rig import load_rig
 
@@ -528,9 +528,10 @@ def demo(
     real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
 ) -> None:
     """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
-    from aolink.cli import tables
+    from aolink.cli.tables import scores, sessions
     from aolink.jobs.demo import new_folder, possible_estimators, run_demo
     from aolink.recording.reader import Recording
+    from aolink.recording.reestimate import scored
 
     loaded = load_checked(rig)
     folder = new_folder(out)
@@ -546,10 +547,9 @@ def demo(
         raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None
     if not stop():
         recording = Recording(result.recording)
-        estimates = {name: recording.estimates(name) for name in recording.estimators}
-        stdout.print(tables.scores(tables.score_all(recording, estimates)))
-    stdout.print(tables.session(result.report))
-    for line in tables.demo_summary(result, program()):
+        stdout.print(scores.scores(scored(recording, recording.estimators)))
+    stdout.print(sessions.session(result.report))
+    for line in sessions.demo_summary(result, program()):
         stdout.print(line, markup=False)
     stop.raise_if_asked()
     if result.differences:

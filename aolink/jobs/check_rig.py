@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +51,20 @@ _WINDOWS = 64
 """Exposures along the drive's path whose blur is checked."""
 
 
-@dataclass(frozen=True, kw_only=True)
+Severity = Literal["error", "warning", "info"]
+
+
+@dataclass(frozen=True)
 class Finding:
     """Something that `check_rig` has to say."""
 
-    severity: Literal["error", "warning", "info"]
+    severity: Severity
     key: str
     """The rig file's key that it is about."""
     message: str
+
+
+_error, _warning, _info = (partial(Finding, severity) for severity in get_args(Severity))
 
 
 def check_rig(rig: Rig) -> list[Finding]:
@@ -71,20 +78,7 @@ def check_rig(rig: Rig) -> list[Finding]:
             ]  # fmt: skip
     except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
         return [_error("rig", f"it has numbers that are too large or too small to compute with ({error})")]
-    order = ("error", "warning", "info")
-    return sorted(findings, key=lambda f: order.index(f.severity))
-
-
-def _error(key: str, message: str) -> Finding:
-    return Finding(severity="error", key=key, message=message)
-
-
-def _warning(key: str, message: str) -> Finding:
-    return Finding(severity="warning", key=key, message=message)
-
-
-def _info(key: str, message: str) -> Finding:
-    return Finding(severity="info", key=key, message=message)
+    return sorted(findings, key=lambda finding: get_args(Severity).index(finding.severity))
 
 
 def _check_timing(rig: Rig) -> Iterator[Finding]:

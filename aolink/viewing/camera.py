@@ -15,12 +15,13 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from aolink.colours import Colour, estimator_colour
 from aolink.estimation.frames.spots import profiles
 from aolink.exposure import Exposure
 from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
-from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH, Colour, estimator_colour
+from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH
 from aolink.viewing.timebase import Timebase
 
 FloatArray = NDArray[np.float64]
