@@ -48,6 +48,8 @@ class Frame:
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
     plane: int = 0
     """Which of the camera's pictures of the exposure this is: 0 the spots, 1 the scene."""
+    slopes: NDArray[np.float64] | None = None
+    """As `Exposure.slopes`."""
 
 
 class FrameReassembly:
@@ -345,6 +347,6 @@ class Assembler:
 
 _OF_FRAME = (
     "frame_id", "first_step", "pixels", "mask", "chunks_lost", "device_start_ns", "device_end_ns", "host_start_ns",
-    "host_receive_ns", "clock_sigma_ns", "alignment_sigma_ns",
+    "host_receive_ns", "clock_sigma_ns", "alignment_sigma_ns", "slopes",
 )  # fmt: skip
 """What an exposure has from its frame as it is."""

@@ -94,7 +94,12 @@ def import_(
     ] = False,
     gamma: GammaOption = 1.0,
     scale: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="Counts for a pixel value of one. Default: by the type.")
+        float | None,
+        typer.Option(
+            metavar="COUNTS",
+            help="Counts for a pixel value of one. Without it 8 bits, or floats up to 1.0, are the full range of the"
+            " camera and 16 bits are counts; floats above 1.0 need it. Of slopes: slope units for one of the file's.",
+        ),
     ] = None,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,

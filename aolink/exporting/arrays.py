@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _MOST_BYTES = 8 << 30
-"""More is not put into memory at once."""
+"""More is not put into memory at once, nor more than a quarter of what the machine has."""
 _SLOPE = "slope unit"
 
 
@@ -118,7 +119,7 @@ def arrays(
     columns: dict[str, list[Any]] = {name: [] for name in (*EXPOSURE, *TRUTH)}
     by_estimator: dict[str, list[list[Any]]] = {name: [[] for _ in names] for name in ESTIMATE}
     times: list[int] = []
-    leads, scenes = [], []
+    leads, scenes, slopes = [], [], []
     first: Exposure | None = None
     clock = ""
     for exposure, estimates in together(series, names, progress):
@@ -128,6 +129,7 @@ def arrays(
         times.append(time_ns(series, exposure, clock))
         leads.append(exposure.lead_inputs)
         scenes.append(exposure.scene)
+        slopes.append(exposure.slopes)
         for name, row in EXPOSURE.items():
             columns[name].append(row.of(name, exposure))
         for name, row in TRUTH.items():
@@ -148,6 +150,12 @@ def arrays(
         unit="input unit",
     )  # fmt: skip
     found |= _scenes(scenes)
+    if any(each is not None for each in slopes):
+        none = np.full(series.rig.n_outputs, np.nan)
+        found["slopes"] = Variable(
+            dims=("time", "output"), values=np.array([none if each is None else each for each in slopes]),
+            text="slopes of other software, where there are no pixels", unit=_SLOPE,
+        )  # fmt: skip
     sizes = {
         "axis": series.rig.plant.axes, "state": series.rig.plant.n_states, "output": series.rig.n_outputs,
         "step": found["inputs"].values.shape[1],
@@ -213,9 +221,10 @@ def _check_size(series: Series, n_estimators: int) -> None:
     numbers += 4 * n_estimators * rig.plant.axes * rig.plant.n_states
     pixels = int(np.prod(rig.sensor.shape)) + (int(np.prod(rig.scene.shape)) if rig.scene else 0)
     size = len(series) * (8 * numbers + 3 * pixels)
-    if size > _MOST_BYTES:
+    most = min(_MOST_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4)
+    if size > most:
         raise ExportError(
-            f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {_MOST_BYTES >> 30} are allowed:"
+            f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {most / 2**30:.1f} are allowed here:"
             " take fewer estimators or a part of it (`aolink cut`), or a table (.csv, .parquet), written row by row"
         )
 

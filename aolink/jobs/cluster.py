@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 _CONNECT_S = 5.0
-_POLL_S = 0.1
+_POLL_S = 0.02
 """How often the user's wish to stop is looked for."""
 
 

@@ -40,7 +40,7 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
     height, width = frame.pixels.shape
     offsets, lengths = _runs(~frame.mask.ravel())
     facts = {name: getattr(frame, name) for name in _OF_FRAME}
-    info = pb.ExposureInfo(missing_offset=2 * offsets, missing_length=2 * lengths, **facts)
+    info = pb.ExposureInfo(missing_offset=2 * offsets, missing_length=2 * lengths, slopes=frame.slopes, **facts)
     sensor = "scene" if frame.plane else "camera"
     image = RawImage(frame_id=sensor, width=width, height=height, encoding="mono16", step=2 * width)
     image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
@@ -98,7 +98,8 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
             mask[offset // 2 : (offset + length + 1) // 2] = False
         mask = mask.reshape(shape)
     pixels = np.frombuffer(data, _COUNTS).astype(np.uint16, copy=False).reshape(shape)
-    return Frame(pixels=pixels, mask=mask, **{name: getattr(info, name) for name in _OF_FRAME})
+    slopes = np.array(info.slopes) if info.slopes else None
+    return Frame(pixels=pixels, mask=mask, slopes=slopes, **{name: getattr(info, name) for name in _OF_FRAME})
 
 
 @lru_cache(maxsize=8)

@@ -258,7 +258,10 @@ def _log_centroids(
     stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure],
     profiles: FloatArray, shown: range,
 ) -> None:  # fmt: skip
-    x = [(centroid(sensor, p) - sensor.field[0]) / sensor.pixel_width for p in profiles]
+    slopes = [
+        centroid(sensor, p) if e.slopes is None else e.slopes[0] for e, p in zip(exposures, profiles, strict=True)
+    ]
+    x = [(slope - sensor.field[0]) / sensor.pixel_width for slope in slopes]
     points = [[(x[k], row + 0.5) for k, row in _visible(exposures, j)] for j in shown]
     path = "camera/history/centroid"
     stream.log(path, rr.Points2D.from_fields(colors=(235, 235, 235), radii=rr.Radius.ui_points(2.5)), static=True)

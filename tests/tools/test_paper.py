@@ -33,6 +33,7 @@ SECTIONS = (
     "How near to the limit",
     "Not worse than o1, anywhere",
     "Blur that nobody here made",
+    "Films whose motion we know",
 )
 NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
 
