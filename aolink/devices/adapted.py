@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.devices.arrival import Arrivals
 from aolink.devices.clock import ClockExchange, ClockRegression
-from aolink.devices.drivers import calling, lacks_of
+from aolink.devices.drivers import calling
 from aolink.devices.gate import CommandLimits, converter_margin, printable
-from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Mirror
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Mirror, lacks_of
 from aolink.devices.simple import Held, SimpleCamera, SimpleFrame, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 
 from serial.tools import list_ports as serial_ports
 
-from aolink.devices.drivers import KINDS, NATIVE, Kind, driver_names, lacks_of, load_driver
+from aolink.devices.drivers import KINDS, NATIVE, Kind, driver_names, load_driver
 from aolink.devices.identity import identify
+from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub

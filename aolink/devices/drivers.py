@@ -8,7 +8,6 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint
 from typing import Any, Literal, get_args
 
-from aolink.devices.interfaces import Lacks
 from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import installed, loaded
 from aolink.rig import Rig
@@ -49,12 +48,6 @@ def check_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Callable[..., Any]
     except TypeError as error:
         raise RigError(f"devices.{kind}: the driver {table.driver} cannot take these keys: {error}") from None
     return make
-
-
-def lacks_of(driver: Any) -> list[Lacks]:
-    """What a driver, or its class, says that its devices lack; a direct mirror lacks a queue."""
-    own = [Lacks(each) for each in getattr(driver, "lacks", ())]
-    return list(dict.fromkeys([*own, Lacks.QUEUE] if hasattr(driver, "put") else own))
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.drivers import lacks_of
+from aolink.devices.interfaces import lacks_of
 from aolink.devices.simple import DirectMirror, Held
 from aolink.rig import Rig
 

@@ -11,7 +11,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.drivers import KINDS, NATIVE, check_driver, lacks_of
+from aolink.devices.drivers import KINDS, NATIVE, check_driver
+from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.estimation.frames.moments import least_significance, spot_significance
 from aolink.optics.camera import effective_noise_density, shot_gain
