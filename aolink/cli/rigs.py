@@ -596,3 +596,40 @@ def _write_interaction(loaded: Rig, paths: Sequence[Path], output: Path, *, over
         f" slope units (rms)\nthe rig file's plant is off by {100 * found.difference:.3g} % of the matrix, noise"
         f" explains {100 * found.noise:.3g} %{off}"
     )
+
+
+@app.command(epilog="Example: aolink demo --rig section-vi-lively --out /tmp")
+def demo(
+    rig: Annotated[str, typer.Option(help="Rig file or name.")] = "section-vi",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder in which to make a new, dated one.")] = Path(),
+    exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
+    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
+) -> None:
+    """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
+    from aolink.cli.tables import scores, sessions
+    from aolink.jobs.demo import new_folder, possible_estimators, run_demo
+    from aolink.recording.reader import Recording
+    from aolink.recording.reestimate import scored
+
+    loaded = load_checked(rig)
+    folder = new_folder(out)
+    get_ready(loaded, possible_estimators(loaded))
+    stop = StopRequest()
+    try:
+        with progress_bar(stderr, exposures) as tell:
+            result = run_demo(
+                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stoppable=stop.installed,
+                progress=tell,
+            )  # fmt: skip
+    except Interrupted as interrupted:
+        raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None
+    if not stop():
+        recording = Recording(result.recording)
+        stdout.print(scores.scores(scored(recording, recording.estimators)))
+    stdout.print(sessions.session(result.report))
+    for line in sessions.demo_summary(result, program()):
+        stdout.print(line, markup=False)
+    stop.raise_if_asked()
+    if result.differences:
+        raise typer.Exit(1)
