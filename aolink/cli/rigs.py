@@ -488,8 +488,8 @@ def calibrate(
     from aolink.rig import load_rig
 
     loaded = load_rig(rig)
-    if (files and (camera or mirror)) or not (files or _are_driven(loaded, camera, mirror)):
-        raise typer.BadParameter("give recordings, or --camera and --mirror, or [devices] in the rig file")
+    if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
+        raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
     check_target(output, overwrite=overwrite, sources=files or [])
     folder = keep or Path(mkdtemp(prefix="aolink-"))
     try:

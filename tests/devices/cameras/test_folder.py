@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +12,11 @@ import pytest
 from aolink.devices.cameras.folder import FolderCamera
 from aolink.errors import DeviceError
 from aolink.recording.reader import Recording
+from aolink.rig import load_rig
 from aolink.session import record
 from tests.devices.cameras.bench import EXPOSURE_STEPS, pictures, recorded, rig_of, save, shown_in
 
+Run = Callable[..., subprocess.CompletedProcess[str]]
 SHAPE = (1, 40)
 
 
@@ -56,6 +60,18 @@ def test_a_picture_of_another_size_ends_the_session(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match=r"003.png has 2 x 40 pixels .*, those before it have 1 x 40 .*are saved in"):
         record(rig, None, None, tmp_path / "a.mcap", exposures=8)
     assert shown_in(list(Recording(tmp_path / "a.mcap").exposures()), pictures(3))[:2] == [0, 1]
+
+
+def test_a_camera_alone_can_be_calibrated(aolink: Run, tmp_path: Path) -> None:
+    """In the dark, as far as that goes: here the other lights are left out."""
+    noise = np.random.default_rng(1).normal(20_000, 50, (30, *SHAPE))
+    np.save(tmp_path / "dark.npy", noise.round().astype(np.uint16))
+    (tmp_path / "my.toml").write_text(rig_of('driver = "folder"\npath = "dark.npy"', tmp_path).toml)
+    done = aolink("calibrate", "--rig", "my.toml", "--frames", "30", "-o", "out.toml", input="\ns\ns\n")
+    assert done.returncode == 0, done.stderr
+    measured = load_rig(str(tmp_path / "out.toml")).sensor
+    assert measured.black_level == pytest.approx(20_000, abs=10)
+    assert measured.noise_density == pytest.approx((50 / 2000) ** 2 * measured.pixel_size, rel=0.2)
 
 
 @pytest.mark.parametrize(
