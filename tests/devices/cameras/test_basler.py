@@ -13,7 +13,7 @@ from aolink.devices.cameras.basler import BaslerCamera, discover, unwrapped
 from aolink.errors import DeviceError
 from aolink.recording.reader import Recording
 from aolink.session import record
-from tests.devices.cameras.bench import EXPOSURE_STEPS, pictures, recorded, rig_of, save, shown_in
+from tests.devices.cameras.bench import counted, pictures, recorded, rig_of, save
 
 pytest.importorskip("pypylon")
 
@@ -37,12 +37,9 @@ def test_a_session_records_the_counts_that_the_camera_gives(tmp_path: Path) -> N
     shown = pictures(12)
     rig = rig_of(table(save(tmp_path / "frames", shown)), tmp_path)
     report, recording, found = recorded(rig, tmp_path / "a.mcap", 8, ["o3"])
-    assert (report.ended, report.frames_received, report.frames_lost) == ("complete", 8, 0)
-    order = shown_in(found, shown)
-    assert order == [(order[0] + k) % 12 for k in range(8)]
-    assert [each.frame_id for each in found] == list(range(1, 9))
-    starts = [each.first_step + each.start_offset for each in found]
-    assert np.median(np.diff(starts)) == pytest.approx(EXPOSURE_STEPS, abs=4)
+    assert (report.ended, report.frames_lost) == ("complete", 0)
+    assert len(found) >= 8  # more where several arrive at once
+    counted(found, shown)
     assert all(each.alignment_sigma_ns >= 2e6 for each in found)  # what the table says of the delay, at least
     assert recording.metadata["camera"] == f"Basler Emulation, serial number {SERIAL}, firmware 1.1, exposure 0.04 s"
     assert "tells no time" in recording.metadata["camera_lacks"]
@@ -56,9 +53,8 @@ def test_frames_that_could_not_be_grabbed_are_counted_as_lost(tmp_path: Path) ->
     for number in (2, 5, 6):
         (tmp_path / "frames" / f"{number:03}.png").write_text("no picture")
     report, _, found = recorded(rig_of(table(tmp_path / "frames"), tmp_path), tmp_path / "a.mcap", 10)
-    order, ids = shown_in(found, shown), [each.frame_id for each in found]
-    assert not {2, 5, 6} & {*order}
-    assert [(order[0] + number - ids[0]) % 8 for number in ids] == order
+    assert not {2, 5, 6} & {*counted(found, shown)}
+    ids = [each.frame_id for each in found]
     assert report.frames_lost == ids[-1] - ids[0] + 1 - len(ids) > 0
 
 
@@ -67,8 +63,7 @@ def test_a_picture_of_another_size_ends_the_session_with_what_there_is(tmp_path:
     rig = rig_of(table(save(tmp_path / "frames", shown)), tmp_path)
     with pytest.raises(DeviceError, match=r"the camera gives \(1, 24\) pixels .*\(1, 40\).* are saved in"):
         record(rig, None, None, tmp_path / "a.mcap", exposures=60)
-    order = shown_in(list(Recording(tmp_path / "a.mcap").exposures()), shown)
-    assert order == list(range(30 - len(order), 30))
+    assert counted(list(Recording(tmp_path / "a.mcap").exposures()), shown)[-1] == 29
 
 
 def test_the_rate_of_a_triggered_camera_is_that_of_its_trigger(tmp_path: Path) -> None:

@@ -49,9 +49,10 @@ def table(source: object) -> str:
 def test_a_session_records_a_film_as_it_plays(film: Path, tmp_path: Path) -> None:
     rig = rig_of(table(film.name), tmp_path, **BITS_8)
     report, recording, found = recorded(rig, tmp_path / "a.mcap", 8, ["o3"])
-    assert (report.ended, report.frames_received) == ("complete", 8)
+    assert report.ended == "complete"
+    assert len(found) >= 8  # more where several arrive at once
     order = shown_in(found, pictures(20, 8))
-    assert order == list(range(order[0], order[0] + 8))
+    assert order == list(range(order[0], order[0] + len(order)))
     assert all(each.alignment_sigma_ns >= 2e6 for each in found)  # what the table says of the delay, at least
     assert recording.metadata["camera"].endswith("film.avi, exposure 0.04 s as the rig file says")
     assert "tells no time" in recording.metadata["camera_lacks"]
