@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
-from aolink.devices.cameras.pictures import FrameThread, checked_corner, sensor_counts
+from aolink.devices.cameras.pictures import FrameThread, as_counts, checked_corner, sensor_part
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError, ImportingError
 from aolink.importing.readers import open_film
@@ -98,4 +98,5 @@ class FolderCamera:
         )
 
     def _counts(self, picture: NDArray[Any]) -> NDArray[Any]:
-        return sensor_counts(picture, self._rig.sensor.shape, self._corner, self._film.name)
+        name = self._film.name
+        return as_counts(sensor_part(picture, self._rig.sensor.shape, self._corner, name), name)

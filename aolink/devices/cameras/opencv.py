@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from aolink.devices.cameras.pictures import FrameThread, check_within, checked_corner, sensor_counts
+from aolink.devices.cameras.pictures import FrameThread, as_counts, check_within, checked_corner, sensor_part
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
@@ -142,7 +142,8 @@ class OpenCVCamera:
                         if self._is_file
                         else f"{self._name} gives no more frames: is it still connected?"
                     )
-                counts = sensor_counts(grey(picture, self._name), self._rig.sensor.shape, self._corner, self._name)
+                part = sensor_part(picture, self._rig.sensor.shape, self._corner, self._name)
+                counts = as_counts(grey(part, self._name), self._name)
                 yield SimpleFrame(pixels=counts, exposure_ns=self._exposure_ns, arrived_ns=arrived_ns)
         finally:
             self._capture.release()

@@ -91,19 +91,20 @@ def check_within(size: tuple[int, int], shape: tuple[int, int], corner: tuple[in
         )
 
 
-def sensor_counts(
+def sensor_part(
     picture: NDArray[Any], shape: tuple[int, int], corner: tuple[int, int] | None, name: str
-) -> NDArray[np.uint16]:
-    """The part of a grey picture that is the rig file's sensor, rounded to counts, (rows, columns).
+) -> NDArray[Any]:
+    """The part of a picture, (rows, columns) or (rows, columns, colours), that is the sensor.
 
-    Raises
-    ------
-    DeviceError
-        The sensor is not within the picture, or a value is none that a pixel of 16 bits can have.
+    Parameters and errors are those of `check_within`.
     """
     check_within((picture.shape[0], picture.shape[1]), shape, corner, name)
     row, column = corner or (0, 0)
-    part = picture[row : row + shape[0], column : column + shape[1]]
+    return picture[row : row + shape[0], column : column + shape[1]]
+
+
+def as_counts(part: NDArray[Any], name: str) -> NDArray[np.uint16]:
+    """Grey values rounded to counts. Raises DeviceError for those that no pixel of 16 bits can have."""
     counts = np.rint(part) if part.dtype.kind == "f" else part
     if not (counts.min() >= 0 and counts.max() <= 0xFFFF):  # so that NaN is refused as well
         raise DeviceError(f"{name} gives values from {part.min()} to {part.max()}, expected counts from 0 to 65535")
