@@ -1,0 +1,96 @@
+"""A line on a real pseudo terminal: answers that come in pieces, late, without an end, or not at all."""
+
+from __future__ import annotations
+
+import os
+import pty
+import threading
+import tty
+from collections.abc import Iterator
+
+import pytest
+
+from aolink.devices.mirrors.line import Line
+from aolink.errors import DeviceError, PortError
+
+SHORT_S = 0.05
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[int, int]]:
+    """The device's end of a line, and the host's."""
+    device, host = pty.openpty()
+    tty.setraw(host)
+    yield device, host
+    os.close(host)
+    os.close(device)
+
+
+@pytest.fixture
+def device(ends: tuple[int, int]) -> int:
+    return ends[0]
+
+
+@pytest.fixture
+def line(ends: tuple[int, int]) -> Iterator[Line]:
+    line = Line("the test's device", os.ttyname(ends[1]), 115_200)
+    yield line
+    line.close()
+
+
+def answering(device: int, *pieces: bytes) -> threading.Thread:
+    """Send the pieces when a request has come."""
+
+    def serve() -> None:
+        os.read(device, 100)
+        for piece in pieces:
+            os.write(device, piece)
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    return thread
+
+
+def test_an_answer_that_comes_in_pieces_is_one_answer(device: int, line: Line) -> None:
+    thread = answering(device, b"4", b"2\r", b"\nmore")
+    assert line.ask(b"what?\r\n", end=b"\r\n") == b"42"
+    assert line.read_exactly(4) == b"more"
+    thread.join()
+
+
+def test_what_came_before_the_request_is_no_answer_to_it(device: int, line: Line) -> None:
+    os.write(device, b"stale\n")
+    thread = answering(device, b"fresh\n")
+    assert line.ask(b"?\n") == b"fresh"
+    thread.join()
+
+
+@pytest.mark.parametrize(("came", "said"), [(b"", "nothing came"), (b"\xfe\x00", r"only '\\xfe\\x00' came")])
+def test_a_device_that_does_not_answer(device: int, line: Line, came: bytes, said: str) -> None:
+    thread = answering(device, came)
+    with pytest.raises(
+        DeviceError, match=rf"the test's device at {line.url} does not answer 'A\?\\n' .* {said}: .*115"
+    ):
+        line.ask(b"A?\n", timeout_s=SHORT_S)
+    thread.join()
+    with pytest.raises(DeviceError, match="does not answer"):
+        line.read_exactly(3, timeout_s=SHORT_S)
+
+
+def test_draining_gives_what_was_there_until_the_line_is_quiet(device: int, line: Line) -> None:
+    os.write(device, b"abc")
+    assert line.drain(quiet_s=SHORT_S) == b"abc"
+    assert line.drain() == b""
+
+
+def test_a_device_that_never_ends_its_answer_is_not_kept_in_memory(device: int, line: Line) -> None:
+    thread = answering(device, *[b"x" * 1000] * 70)
+    with pytest.raises(DeviceError, match="bytes without an end came"):
+        line.ask(b"?\n", timeout_s=30)
+    line.drain(quiet_s=SHORT_S)
+    thread.join()
+
+
+def test_a_line_belongs_to_one_program(line: Line) -> None:
+    with pytest.raises(PortError, match="in use by another program"):
+        Line("another", line.url, 9600)
