@@ -220,11 +220,9 @@ def unwrapped(before: int | None, block_id: int) -> int:
 
 
 def discover() -> list[tuple[str, str]]:
-    """Serial number, model and address of each camera that pylon sees, none of them opened; none without pypylon."""
-    try:
+    """Serial number and model of each camera that pylon sees, none of them opened. Raises DeviceError."""
+    with needs_extra("basler", DeviceError):
         from pypylon import pylon
-    except ImportError:
-        return []
     found = pylon.TlFactory.GetInstance().EnumerateDevices()
     return sorted((info.GetSerialNumber(), info.GetFriendlyName()) for info in found)
 
