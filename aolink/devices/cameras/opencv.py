@@ -48,9 +48,10 @@ class OpenCVCamera:
             import cv2
         self._rig, self._corner, timing = rig, checked_corner(corner), rig.timing
         beside = rig.folder / str(source)
-        self._name = f"camera {source}" if isinstance(source, int) else str(source)
+        opened = int(source) if str(source).isdecimal() else str(beside) if beside.exists() else source
+        self._name = f"camera {source}" if isinstance(opened, int) else str(source)
         said = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it better
-        self._capture: Any = cv2.VideoCapture(str(beside) if isinstance(source, str) and beside.exists() else source)
+        self._capture: Any = cv2.VideoCapture(opened)
         cv2.utils.logging.setLogLevel(said)
         if not self._capture.isOpened():
             raise DeviceError(f"OpenCV cannot open {self._name}: is it connected, not in use, and may you read it?")

@@ -113,6 +113,7 @@ def test_a_camera_on_the_network_that_goes_away_ends_the_session(stream: str, tm
     ("source", "changes", "what"),
     [
         (987, {}, r"OpenCV cannot open camera 987: is it connected, not in use, and may you read it\?"),
+        ("987", {}, r"OpenCV cannot open camera 987"),
         ("none.avi", {}, r"OpenCV cannot open none.avi"),
         ("text.avi", {}, r"OpenCV cannot open text.avi"),
         ("film.avi", {"pixels": (40, 80)}, r"film.avi gives \(48, 64\) pixels, the rig file's sensor has \(1, 80\)"),
