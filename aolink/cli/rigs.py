@@ -46,7 +46,7 @@ from aolink.cli.films import (
 from aolink.cli.terminal import ask, input_ended, progress_bar
 from aolink.errors import AolinkError, CalibrationError, EstimatorError, RigError
 from aolink.files import check_target, writing
-from aolink.signals import StopRequest, stop_after
+from aolink.signals import Interrupted, StopRequest, stop_after
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -232,7 +232,9 @@ class AdaptedCamera(_Adapted):
         """Start of a frame's exposure on the camera's clock, and its standard deviation without the clock's, ns."""
         if raw.start_ns is not None:
             return raw.start_ns, 0.0
-        arrived_ns, sd_ns = self._arrivals.add(frame_id, self._arrival_of(raw))
+        # Ids begin anew with each frame from before the session: the camera's own count goes on.
+        count = frame_id if raw.number is None else raw.number
+        arrived_ns, sd_ns = self._arrivals.add(count, self._arrival_of(raw))
         return arrived_ns - self._delay_ns - raw.exposure_ns, math.hypot(sd_ns, self._delay_sd_ns)
 
     def _arrival_of(self, raw: SimpleFrame) -> int:

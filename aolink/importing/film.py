@@ -59,11 +59,11 @@ def grey(picture: Frame, what: object) -> Frame:
         It is neither.
     """
     if picture.ndim == 3 and picture.shape[2] in (3, 4):
-        colours = picture[..., :3]
-        mean = np.asarray(colours.mean(axis=2, dtype=np.float64))
-        if colours.dtype.kind in "iu":
-            most = np.iinfo(colours.dtype.name).max
-            mean[(colours == most).any(axis=2)] = most
+        red, green, blue = (picture[..., k] for k in range(3))  # far faster than along the last axis
+        mean = np.asarray(np.add(np.add(red, green, dtype=np.float64), blue) / 3)
+        if picture.dtype.kind in "iu":
+            most = np.iinfo(picture.dtype.name).max
+            mean[(red == most) | (green == most) | (blue == most)] = most
         return mean
     if picture.ndim != 2 or picture.dtype.kind not in "biuf":
         raise ImportingError(f"{what} holds {picture.dtype} of shape {picture.shape}, expected a picture")

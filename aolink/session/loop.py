@@ -312,7 +312,8 @@ class SessionLoop:
         self._latencies.close(self._time.now_ns())
         self.close_account()
         if exposures and self.report.ended == "complete":
-            self.report.frames_lost = exposures - self.report.frames_received
+            # A camera that goes on after a lost frame makes up for it; the gap is a lost frame all the same.
+            self.report.frames_lost = max(self.report.frames_lost, exposures - self.report.frames_received)
             if self._rig.scene:
                 self.report.scenes_lost = exposures - self.report.scenes_received
         self._record_statistics(now)

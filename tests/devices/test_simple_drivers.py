@@ -217,6 +217,16 @@ def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench:
     assert all(f.last_step + 1 - f.first_step == RIG.timing.exposure_steps for f in frames)
 
 
+def test_arrivals_before_a_session_are_apart_from_its_own(camera: AdaptedCamera, bench: CameraBench) -> None:
+    """Of a camera that counts its frames and tells no time, which runs before the session does."""
+    ends_ns = [100 * STEP_NS + (k + 1) * PERIOD_NS for k in range(-6, 2)]
+    bench.taken = [
+        frame(0, start_ns=None, arrived_ns=CAMERA_ZERO_NS + end_ns, number=9 + k) for k, end_ns in enumerate(ends_ns)
+    ]
+    frames = [event for event in camera.poll() if isinstance(event, Frame)]
+    assert [(f.frame_id, f.first_step, f.frames_lost_before) for f in frames] == [(1, 100, 0), (2, 300, 0)]
+
+
 @pytest.mark.parametrize(
     ("wrong", "what"),
     [

@@ -1,1 +1,1 @@
-"""Drivers of cameras, one module each; `aolink.devices.simple` has their interface."""
+"""Drivers of cameras of other makers, each a module, found by name like a driver of another package."""

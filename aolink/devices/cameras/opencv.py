@@ -1,0 +1,156 @@
+"""A webcam, a stream or a video file through OpenCV, as a camera for a first try."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from aolink.devices.cameras.pictures import FrameThread, as_counts, check_within, checked_corner, sensor_part
+from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.errors import DeviceError
+from aolink.extensions import needs_extra
+from aolink.importing.film import grey
+from aolink.rig import Rig
+
+_RATE_MARGIN = 0.05
+"""How far the camera's frame rate may be from the rig file's."""
+_V4L2_MANUAL, _V4L2_UNIT_S = 1, 1e-4
+"""Video4Linux's word for exposures that the program sets, and its unit of their length."""
+_DEVICES = Path("/sys/class/video4linux")
+
+
+class OpenCVCamera:
+    """Whatever ``cv2.VideoCapture`` opens, 8 bits a colour, its colours averaged.
+
+    It tells no time and does not count, so frames have the time of their arrival. A thread reads it and notes that
+    time. Light is not proportional to counts unless the camera's gamma and white balance are off.
+
+    Parameters
+    ----------
+    source:
+        Index of a webcam, or an address or a file that OpenCV opens; a file is played at its own rate.
+    corner:
+        Row and column of the pictures at which the sensor begins; None where the sensor is the whole picture.
+
+    Raises
+    ------
+    DeviceError
+        OpenCV is not installed or cannot open the source, or size or rate of its pictures are not the rig file's.
+    """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.TIME, Lacks.COUNT, Lacks.TRIGGER)
+
+    def __init__(self, rig: Rig, *, source: int | str = 0, corner: Sequence[int] | None = None) -> None:
+        with needs_extra("opencv", DeviceError):
+            import cv2
+        self._rig, self._corner, timing = rig, checked_corner(corner), rig.timing
+        beside = rig.folder / str(source)
+        opened = int(source) if str(source).isdecimal() else str(beside) if beside.exists() else source
+        self._name = f"camera {source}" if isinstance(opened, int) else str(source)
+        said = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it better
+        self._capture: Any = cv2.VideoCapture(opened)
+        cv2.utils.logging.setLogLevel(said)
+        if not self._capture.isOpened():
+            raise DeviceError(f"OpenCV cannot open {self._name}: is it connected, not in use, and may you read it?")
+        self._is_file = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0
+        self._rate = 1 / (timing.frame_period_steps * timing.fast_step_s)
+        self._exposure_ns = timing.exposure_steps * timing.fast_step_ns
+        believed = self._is_file or not self._set_exposure(cv2)
+        if not self._is_file:
+            if corner is None:
+                self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, rig.sensor.shape[0])
+                self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, rig.sensor.shape[1])
+            self._capture.set(cv2.CAP_PROP_FPS, self._rate)
+        try:
+            self._check(cv2)
+        except DeviceError:
+            self._capture.release()
+            raise
+        exposure = f"exposure {self._exposure_ns / 1e9:g} s{' as the rig file says' if believed else ''}"
+        self.description = f"OpenCV {cv2.__version__} {self._capture.getBackendName()} {self._name}, {exposure}"
+        self._thread: FrameThread | None = None
+
+    def time_ns(self) -> None:
+        """OpenCV gives no time of the camera's."""
+
+    def start(self, start_ns: int, exposures: int) -> None:
+        """Read frames until stopped: a file's from ``start_ns`` on, others as they come, before it as well."""
+        self._thread = FrameThread(lambda stopped: self._read(start_ns, stopped))
+
+    def frames(self) -> list[SimpleFrame]:
+        """The frames that have arrived since the last call. Raises DeviceError where the camera gives no more."""
+        return self._thread.take() if self._thread else []
+
+    def stop(self) -> None:
+        """Read no more."""
+        if self._thread:
+            self._thread.stop()
+
+    def close(self) -> None:
+        """Release the camera, once the frame that is under way has come."""
+        if self._thread is None:
+            self._capture.release()
+        else:
+            self._thread.stop()
+            self._thread.join()
+
+    def _set_exposure(self, cv2: Any) -> bool:
+        """Set the exposure time where its unit is known, and read it back; whether that was possible."""
+        if self._capture.getBackendName() != "V4L2":
+            return False
+        units = round(self._exposure_ns / 1e9 / _V4L2_UNIT_S)
+        if not (
+            self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _V4L2_MANUAL)
+            and self._capture.set(cv2.CAP_PROP_EXPOSURE, units)
+            and (found := self._capture.get(cv2.CAP_PROP_EXPOSURE)) > 0
+        ):
+            return False
+        self._exposure_ns = round(found * _V4L2_UNIT_S * 1e9)
+        return True
+
+    def _check(self, cv2: Any) -> None:
+        """Compare size and rate with the rig file's. Raises DeviceError."""
+        size = tuple(int(self._capture.get(p)) for p in (cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FRAME_WIDTH))
+        check_within((size[0], size[1]), self._rig.sensor.shape, self._corner, self._name)
+        if not (self._is_file or self._capture.getBackendName() == "V4L2"):
+            return  # of a stream OpenCV guesses the rate
+        rate = self._capture.get(cv2.CAP_PROP_FPS)
+        if rate > 0 and abs(rate / self._rate - 1) > _RATE_MARGIN:
+            raise DeviceError(
+                f"{self._name} gives {rate:.4g} frames a second, the rig file says {self._rate:.4g}: correct"
+                " timing.frame_period_steps or timing.fast_step_s"
+            )
+        self._rate = rate if rate > 0 else self._rate
+
+    def _read(self, begin_ns: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
+        """Frames as they come, a file's when they are due. The capture belongs to the thread that reads it."""
+        number = 0
+        try:
+            while not stopped.is_set():
+                number += 1
+                due_ns = begin_ns + round(number / self._rate * 1e9) if self._is_file else 0
+                if stopped.wait(max(due_ns - time.monotonic_ns(), 0) / 1e9):
+                    return
+                grabbed = self._capture.grab()
+                arrived_ns = time.monotonic_ns()
+                whole, picture = self._capture.retrieve()
+                if not (grabbed and whole):
+                    raise DeviceError(
+                        f"{self._name} has ended after {number - 1} frames: ask for fewer exposures"
+                        if self._is_file
+                        else f"{self._name} gives no more frames: is it still connected?"
+                    )
+                part = sensor_part(picture, self._rig.sensor.shape, self._corner, self._name)
+                counts = as_counts(grey(part, self._name), self._name)
+                yield SimpleFrame(pixels=counts, exposure_ns=self._exposure_ns, arrived_ns=arrived_ns)
+        finally:
+            self._capture.release()
+
+
+def discover() -> list[tuple[str, str]]:
+    """Index and name of each video device of this machine, none of them opened; Linux only."""
+    found = ((each.name.removeprefix("video"), each / "name") for each in _DEVICES.glob("video*"))
+    return sorted((index, name.read_text().strip()) for index, name in found if index.isdecimal() and name.is_file())
