@@ -35,7 +35,9 @@ class PacedMirror:
         self._now = self._park
         """What the device holds."""
         self._held: list[tuple[NDArray[np.float64], bool]] = []
-        """Inputs of the steps before ``_next`` that were not told yet, and whether they were late."""
+        """Inputs of the steps that were not told yet, and whether they were late."""
+        self._told = 0
+        """The first step of ``_held``. While the device takes an input, its step is played, and not yet in there."""
         self._changed = threading.Condition()
         """For all of the above."""
         self._device = threading.Lock()
@@ -60,7 +62,8 @@ class PacedMirror:
         with self._changed:
             self._raise_failure()
             held, self._held = self._held, []
-            first = self._next - len(held)
+            first = self._told
+            self._told += len(held)
         if not held:
             return []
         return [Held(first, np.array([u for u, _ in held]), np.array([late for _, late in held]))]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 
+from serial.tools import list_ports
+
 from aolink.errors import DeviceError
 from aolink.wire.port import SerialPort, wait_readable
 
@@ -108,15 +110,25 @@ class Line:
         elif (left_s := deadline - time.monotonic()) > 0:
             wait_readable([self._port], left_s)
         else:
-            raise self._no_answer(f"only {_shown(bytes(self._read))}" if self._read else "nothing")
+            raise self._no_answer(f"only {shown(bytes(self._read))}" if self._read else "nothing")
 
     def _no_answer(self, came: str) -> DeviceError:
         return DeviceError(
-            f"{self._device} at {self.url} does not answer {_shown(self._asked)} as it should, {came} came: is it"
+            f"{self._device} at {self.url} does not answer {shown(self._asked)} as it should, {came} came: is it"
             f" switched on, is this its port, does its line run at {self._baud_rate} baud, and does no other program"
             " use it?"
         )
 
 
-def _shown(data: bytes) -> str:
+def usb_ports(vendor: int, product: int | None = None) -> list[tuple[str, str]]:
+    """Serial ports of this machine with a USB vendor's devices: (path, description). None of them is opened."""
+    return sorted(
+        (port.device, port.description or "")
+        for port in list_ports.comports()
+        if port.vid == vendor and product in (None, port.pid)
+    )
+
+
+def shown(data: bytes) -> str:
+    """Bytes as an error shows them: printable, and not too many."""
     return repr(data[:_SHOWN])[1:] + ("..." if len(data) > _SHOWN else "")

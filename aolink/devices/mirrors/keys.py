@@ -1,0 +1,45 @@
+"""The drivers' own keys in ``[devices.mirror]``, checked as the rig file's other keys are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import RigError
+
+
+def per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]:
+    """A number for each input, (n_inputs,); one number stands for all. Raises RigError."""
+    values = value if isinstance(value, list) else [value] * n_inputs
+    numbers = [each for each in values if isinstance(each, int | float) and not isinstance(each, bool)]
+    array = np.array(numbers, dtype=np.float64)
+    if len(values) != n_inputs or len(numbers) != n_inputs or not np.isfinite(array).all():
+        raise RigError(
+            f"devices.mirror.{name}: expected a finite number, or a list of {n_inputs} for the rig's inputs,"
+            f" found {value!r}"
+        )
+    return array
+
+
+def scale_per_input(name: str, value: Any, n_inputs: int) -> NDArray[np.float64]:
+    """The same for a factor, which must not be zero."""
+    scale = per_input(name, value, n_inputs)
+    if not scale.all():
+        raise RigError(f"devices.mirror.{name}: expected a number that is not zero, found {value!r}")
+    return scale
+
+
+def text(name: str, value: Any) -> str:
+    """A text. Raises RigError."""
+    if not isinstance(value, str):
+        raise RigError(f"devices.mirror.{name}: expected a text, found {value!r}")
+    return value
+
+
+def speed(name: str, value: Any) -> int:
+    """The speed of a serial line, bits per second. Raises RigError."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 50 <= value <= 10_000_000:
+        raise RigError(f"devices.mirror.{name}: expected a whole number of bits per second, found {value!r}")
+    return value

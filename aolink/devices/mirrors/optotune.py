@@ -1,0 +1,141 @@
+"""Optotune's mirrors MR-15-30 and MR-10-30 on the driver MR-E-3 or MR-E-2, in its Simple mode.
+
+The commands are those of the "MR-E-3 Development Kit Operation Manual", section 7: each is answered, with OK, NO, OL,
+OU (beyond the lower or upper limit), ERROR or a value. There is no command that stops, and none that reads back the
+position. The maker's binary Pro mode has no queue either: it repeats a stored pattern, and does not say where it is.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from contextlib import ExitStack, suppress
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.devices.mirrors.keys import scale_per_input, text
+from aolink.devices.mirrors.line import Line, shown, usb_ports
+from aolink.devices.simple import Lacks
+from aolink.errors import DeviceError
+from aolink.rig import Rig
+
+_BAUD_RATE = 256_000
+_USB_ID = 0x0483, 0xA31E
+_LIMIT_DEG = 50.0
+_LIMIT = math.tan(math.radians(_LIMIT_DEG))
+"""Tangent of the optical angle at the edge of the unit circle."""
+_DECIMALS = 6
+"""Of a coordinate: a step of a millionth of the range, below what the mirror repeats."""
+_LEAVE_PRO_MODE = bytes.fromhex("7e 00 06 02 0000 0000 7e") + b"\r\n"
+"""A frame of the Pro mode, where the maker's programs leave the driver: go to the Simple mode. A driver that is there
+already takes it for a command that it does not know."""
+_FIRST_ANSWER_S = 0.3
+_QUIET_S = 0.05
+"""A line on which nothing has come for so long has no late answers on it."""
+_TROUBLE = {
+    0: "no mirror is connected to it",
+    1: "the mirror's electronics are too hot",
+    2: "the mirror is too hot",
+    3: "the mirror's memory cannot be read",
+}
+"""Bits of its status with which it moves nothing, or not as commanded."""
+_REFUSED = {
+    "NO": "it does not take commands in its present state; Optotune Cockpit shows what is wrong",
+    "OL": "it went to its lower limit instead; make the rig's limits smaller",
+    "OU": "it went to its upper limit instead; make the rig's limits smaller",
+}
+
+
+class OptotuneMirror:
+    """A `DirectMirror` of two inputs, which are optical angles along x and y in units of ``unit_rad``.
+
+    Parameters
+    ----------
+    port:
+        Path of its USB serial port.
+    unit_rad:
+        Optical angle for an input of one, rad: one number, or one for x and one for y; a negative one reverses an axis.
+    """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG)
+
+    def __init__(self, rig: Rig, *, port: str, unit_rad: float | list[float] = 1.0) -> None:
+        if rig.n_inputs != 2:
+            raise DeviceError(f"the Optotune mirror has 2 inputs, x and y; the rig file has {rig.n_inputs}")
+        self._unit_rad, self._park = scale_per_input("unit_rad", unit_rad, 2), rig.mirror.park
+        self._check_reach(rig)
+        with ExitStack() as opened:
+            self._line = Line("the Optotune mirror driver", text("port", port), _BAUD_RATE)
+            opened.callback(self._line.close)
+            self._start()
+            model, serial_number, firmware = (self._ask(what) for what in ("GETID", "GETSN", "GETVERSION"))
+            self.description = f"Optotune {model}, serial number {serial_number}, firmware {firmware}"
+            self._check_status()
+            self.park()
+            opened.pop_all()
+
+    def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        xy = np.round(np.tan(self._unit_rad * u) / _LIMIT, _DECIMALS)
+        request = ";".join(f"{each:.{_DECIMALS}f}" for each in xy)
+        if (answer := self._ask(f"XY={request}")) != "OK":
+            raise DeviceError(
+                f"the Optotune mirror driver answers XY={request} with {answer!r}, not with OK:"
+                f" {_REFUSED.get(answer, 'give the port of a mirror driver, MR-E-3 or MR-E-2')}"
+            )
+        return np.arctan(xy * _LIMIT) / self._unit_rad
+
+    def park(self) -> None:
+        self._line.drain(_QUIET_S)
+        self.put(self._park)
+
+    def close(self) -> None:
+        self._line.close()
+
+    def _check_reach(self, rig: Rig) -> None:
+        """Refuse a rig file whose limits go beyond the unit circle: the driver would move such inputs to its edge."""
+        rad = self._unit_rad * np.array([rig.mirror.input_min, rig.mirror.input_max])
+        radius = max(math.hypot(*np.tan(corner)) for corner in itertools.product(*rad.T)) / _LIMIT
+        if np.abs(rad).max() >= math.pi / 2 or radius > 1 + 1e-9:
+            furthest = np.degrees(np.abs(rad).max(axis=0))
+            raise DeviceError(
+                f"the corners of mirror.input_min .. input_max are optical angles of {furthest[0]:.4g} and"
+                f" {furthest[1]:.4g} degrees along x and y, beyond the circle of {_LIMIT_DEG:g} degrees that the"
+                " Optotune mirror reaches: make the limits or devices.mirror.unit_rad smaller"
+            )
+
+    def _start(self) -> None:
+        """Bring the driver to its Simple mode. Raises DeviceError."""
+        with suppress(DeviceError):
+            if self._ask("START", _FIRST_ANSWER_S) == "OK":
+                return
+        self._line.tell(_LEAVE_PRO_MODE)
+        self._line.drain(_QUIET_S)
+        if (answer := self._ask("START")) != "OK":
+            raise DeviceError(
+                f"what is at {self._line.url} answers START with {answer!r}, an Optotune mirror driver with OK:"
+                " `aolink devices` lists the ports of this machine"
+            )
+
+    def _check_status(self) -> None:
+        answer = self._ask("STATUS")
+        try:
+            status = int(answer, 16)
+        except ValueError:
+            raise DeviceError(
+                f"the Optotune mirror driver answers STATUS with {answer!r}, not with a hexadecimal number"
+            ) from None
+        if trouble := [what for bit, what in _TROUBLE.items() if status >> bit & 1]:
+            raise DeviceError(f"the Optotune mirror driver says that {' and '.join(trouble)} (STATUS {answer})")
+
+    def _ask(self, request: str, timeout_s: float = 1.0) -> str:
+        answer = self._line.ask(f"{request}\r\n".encode(), b"\r\n", timeout_s)
+        if not answer.isascii():
+            raise DeviceError(f"the Optotune mirror driver answers {request} with {shown(answer)}: is the cable good?")
+        return answer.decode().strip()
+
+
+def discover() -> list[tuple[str, str]]:
+    """Ports with a driver of these mirrors: (path, description)."""
+    return usb_ports(*_USB_ID)

@@ -1,0 +1,277 @@
+"""Tip/tilt platforms on a controller of Physik Instrumente (PI) that speaks the General Command Set, version 2.
+
+GCS answers questions only. A command that fails leaves an error number, which ``ERR?`` tells and clears, so each
+``MOV`` is sent together with an ``ERR?``. Its answer is read when the next input is to be sent, at the latest: the
+line's round trip takes place during the fast step, and an error is known one step later. No more than one answer is
+ever awaited, so a controller that is slower than the fast rate makes steps late, and fills no buffer with old inputs.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.devices.mirrors.keys import per_input, scale_per_input, speed, text
+from aolink.devices.mirrors.line import Line, usb_ports
+from aolink.devices.simple import Lacks
+from aolink.errors import DeviceError, RigError
+from aolink.rig import Rig
+
+_USB_VENDOR = 0x1A72
+_ERRORS = {
+    1: "it does not understand the parameters",
+    2: "it does not know the command",
+    5: "an axis has its servo off, or is not referenced",
+    7: "it is beyond the axis's limits",
+    10: "it was stopped",
+    15: "there is no such axis",
+    17: "it is out of range",
+    23: "there is no such axis",
+    34: "the stage does not allow it",
+    53: "another motion is going on",
+    63: "it is still starting",
+    73: "its wave generator is running",
+}
+"""What the commonest error numbers mean."""
+_UNKNOWN_COMMAND = 2
+_SETTLING_S = 5.0
+"""How long the stage may take to its safe position when it is opened."""
+_POLL_S = 0.02
+_MOST_LINES = 100
+"""Lines of an answer, or left of earlier answers, after which it is none."""
+_QUIET_S = 0.05
+"""A line on which nothing has come for so long has no late answers on it."""
+_DECIMALS = 6
+"""Of a position: below what the stages resolve, in micrometres, microradians and milliradians."""
+
+
+class PiMirror:
+    """A `DirectMirror` with one axis of a controller for each input, at ``offset + scale * input``.
+
+    Parameters
+    ----------
+    port:
+        A serial port, or ``socket://HOST:50000`` for a controller in the network.
+    axes:
+        The controller's axes for the inputs, in their order. Nothing else is moved, and no other servo switched on: on
+        some stages that does harm (the third axis of an S-335).
+    scale, offset:
+        Position for an input of one, less the position for zero, and the latter; in the controller's units. One number,
+        or a list of one for each input.
+    baud_rate:
+        Of a serial port.
+    """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG)
+
+    def __init__(
+        self,
+        rig: Rig,
+        *,
+        port: str,
+        axes: list[str | int],
+        scale: float | list[float] = 1.0,
+        offset: float | list[float] = 0.0,
+        baud_rate: int = 115_200,
+    ) -> None:
+        self._axes = _checked_axes(axes, rig.n_inputs)
+        self._scale = scale_per_input("scale", scale, rig.n_inputs)
+        self._offset = per_input("offset", offset, rig.n_inputs)
+        self._park = rig.mirror.park
+        self._unanswered = ""
+        """The command whose ERR? has not been answered."""
+        with ExitStack() as opened:
+            self._line = Line("the PI controller", text("port", port), speed("baud_rate", baud_rate))
+            opened.callback(self._line.close)
+            self._identity = self._identify()
+            self._check_axes()
+            self._check_limits(rig)
+            self._switch_on()
+            self.park()
+            self._settle()
+            opened.pop_all()
+
+    def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        self._take_answer()
+        positions = np.round(self._offset + self._scale * u, _DECIMALS)
+        self._send(self._move_to(positions))
+        return (positions - self._offset) / self._scale
+
+    def park(self) -> None:
+        """Stop whatever moves, also what the controller plays by itself, and go to the safe input."""
+        # Answers to what was asked before may still come: those after the identity belong to what follows it. All is
+        # sent before the first of them is awaited, for a controller that hears and does not answer.
+        self._unanswered = ""
+        self._line.tell(b"STP\n*IDN?\nERR?\n")
+        self._send(self._move_to(self._offset + self._scale * self._park))
+        for _ in range(_MOST_LINES):
+            if self._next_line().strip() == self._identity:
+                break
+        self._next_line()  # the error number that says that it was stopped
+        self._take_answer()
+
+    def close(self) -> None:
+        self._line.close()
+
+    def _take_answer(self) -> None:
+        """Wait for the answer to the latest command, where there is one. Raises DeviceError where that failed."""
+        if command := self._unanswered:
+            self._unanswered = ""
+            self._check(command, self._error_number(command, self._next_line()))
+
+    def _command(self, command: str) -> None:
+        """Send a command and wait until it is taken. Raises DeviceError where it is not."""
+        self._send(command)
+        self._take_answer()
+
+    def _send(self, command: str) -> None:
+        self._unanswered = command
+        self._line.tell(f"{command}\nERR?\n".encode())
+
+    def _identify(self) -> str:
+        """Raises DeviceError for what is no controller of PI with GCS 2."""
+        self._line.drain(_QUIET_S)
+        identity = self._answer("*IDN?")
+        if "physik instrumente" not in identity.lower():
+            raise DeviceError(
+                f"what is at {self._line.url} says that it is {identity!r}, not a controller of Physik Instrumente:"
+                " `aolink devices` lists the ports of this machine"
+            )
+        self._answer("ERR?")  # what others have left
+        version = self._answer("CSV?")
+        try:
+            number = float(version)
+        except ValueError:
+            raise self._strange("CSV?", version) from None
+        if not 2 <= number < 3:
+            raise DeviceError(f"the PI controller speaks version {version} of its command set, this driver version 2")
+        _, *rest = (part.strip() for part in identity.split(","))
+        model, serial_number, firmware, *_ = [*rest, "?", "?", "?"]
+        self.description = (
+            f"PI {model}, serial number {serial_number}, firmware {firmware}, axes {' '.join(self._axes)}"
+        )
+        return identity
+
+    def _check_axes(self) -> None:
+        self._line.tell(b"SAI?\n")
+        found = [line.strip() for line in self._lines()]
+        if missing := [axis for axis in self._axes if axis not in found]:
+            raise DeviceError(
+                f"the PI controller has the axes {', '.join(found)}, not {', '.join(missing)}: correct"
+                " devices.mirror.axes"
+            )
+
+    def _check_limits(self, rig: Rig) -> None:
+        """The rig's limits must lie within the controller's, where it tells them."""
+        ends = self._offset + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        lowest, highest = self._numbers("TMN?"), self._numbers("TMX?")
+        if lowest is None or highest is None:
+            return
+        for axis, *reach, first, last in zip(self._axes, low, high, lowest, highest, strict=True):
+            if reach[0] < first - 10**-_DECIMALS or reach[1] > last + 10**-_DECIMALS:
+                raise DeviceError(
+                    f"mirror.input_min .. input_max are positions from {reach[0]:g} to {reach[1]:g} of the PI axis"
+                    f" {axis}, which goes from {first:g} to {last:g}: make the limits or devices.mirror.scale smaller,"
+                    " or correct devices.mirror.offset"
+                )
+
+    def _switch_on(self) -> None:
+        """Close the controller's own loop. Raises DeviceError where it stays open."""
+        if (servos := self._numbers("SVO?")) is None or not servos.all():
+            self._command(" ".join(["SVO", *(f"{axis} 1" for axis in self._axes)]))
+            if (servos := self._numbers("SVO?")) is not None and not servos.all():
+                raise DeviceError(
+                    f"the servo of the PI axes {' '.join(self._axes)} does not switch on: are stage and high voltage"
+                    " connected?"
+                )
+
+    def _settle(self) -> None:
+        """Wait until the safe position is reached. Raises DeviceError where it is not."""
+        deadline = time.monotonic() + _SETTLING_S
+        while (there := self._numbers("ONT?")) is not None and not there.all():
+            if time.monotonic() > deadline:
+                positions = self._numbers("POS?")
+                raise DeviceError(
+                    f"the PI axes {' '.join(self._axes)} do not reach their safe position"
+                    f" {self._offset + self._scale * self._park} in {_SETTLING_S:g} s, they are at {positions}: are"
+                    " they zeroed (ATZ) or referenced, and do the stage's parameters fit?"
+                )
+            time.sleep(_POLL_S)
+
+    def _numbers(self, question: str) -> NDArray[np.float64] | None:
+        """A number for each axis, (n_inputs,); None where the controller does not know the question."""
+        asked = " ".join([question, *self._axes])
+        self._line.tell(f"{asked}\nERR?\n".encode())
+        lines = self._lines()
+        if "=" not in lines[0]:  # the answer to ERR? alone
+            if (number := self._error_number(asked, lines[0])) != _UNKNOWN_COMMAND:
+                self._check(asked, number)
+                raise self._strange(asked, lines[0])
+            return None
+        self._check(asked, self._error_number(asked, self._next_line()))
+        try:
+            answers = {axis.strip(): float(number) for axis, _, number in (line.partition("=") for line in lines)}
+            numbers = np.array([answers[axis] for axis in self._axes])
+        except (ValueError, KeyError):
+            raise self._strange(asked, " ".join(lines)) from None
+        if not np.isfinite(numbers).all():
+            raise self._strange(asked, " ".join(lines))
+        return numbers
+
+    def _move_to(self, positions: NDArray[np.float64]) -> str:
+        pairs = zip(self._axes, positions, strict=True)
+        return " ".join(["MOV", *(f"{axis} {position:.{_DECIMALS}f}" for axis, position in pairs)])
+
+    def _answer(self, question: str) -> str:
+        self._line.tell(f"{question}\n".encode())
+        return self._next_line().strip()
+
+    def _lines(self) -> list[str]:
+        """An answer of several lines: each but the last ends with a space."""
+        lines = [self._next_line()]
+        while lines[-1].endswith(" ") and len(lines) < _MOST_LINES:
+            lines.append(self._next_line())
+        return lines
+
+    def _next_line(self) -> str:
+        return self._line.read_until(b"\n").decode("latin-1")
+
+    def _error_number(self, command: str, answer: str) -> int:
+        try:
+            return int(answer)
+        except ValueError:
+            raise self._strange(f"{command} and ERR?", answer) from None
+
+    def _check(self, command: str, number: int) -> None:
+        if number:
+            raise DeviceError(
+                f"the PI controller refuses {command} with its error {number}"
+                f" ({_ERRORS.get(number, 'see the manual of its commands')})"
+            )
+
+    def _strange(self, command: str, answer: str) -> DeviceError:
+        return DeviceError(
+            f"the PI controller answers {command} with {answer!r}, which is no answer of GCS 2: does its line run at"
+            " devices.mirror.baud_rate, and is the cable good?"
+        )
+
+
+def discover() -> list[tuple[str, str]]:
+    """Ports with a controller of PI: (path, description)."""
+    return usb_ports(_USB_VENDOR)
+
+
+def _checked_axes(axes: Any, n_inputs: int) -> list[str]:
+    """Names of the axes. Raises RigError."""
+    names = [str(axis) for axis in axes] if isinstance(axes, list) else []
+    if len(names) != n_inputs or len({*names}) != n_inputs or not all(name.isalnum() for name in names):
+        raise RigError(
+            f"devices.mirror.axes: expected a list of {n_inputs} different axes of the controller, one for each input"
+            f' of the rig, such as ["1", "2"]; found {axes!r}'
+        )
+    return names

@@ -1,0 +1,61 @@
+"""A small rig in real time: a driver of aolink, a simulated mirror on a pseudo terminal, a camera that sees it."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from aolink.extensions import installed
+from aolink.rig import Rig, load_rig, parse_rig
+from tests.devices.simulators import spot_camera
+
+FAST_STEP_S = 0.01
+_CHANGES = (
+    ("fast_step_s = 0.0005", f"fast_step_s = {FAST_STEP_S}"),
+    ("exposure_steps = 100 ", "exposure_steps = 10 "),
+    ("resonance_hz = 150.0", "resonance_hz = 8.0"),
+    ("process_noise = 3e-4", "process_noise = 1e-6"),
+    ("dac_bits = 16", "dac_bits = 16\nwatchdog_s = 30.0"),
+    ("block_steps = 50", "block_steps = 10"),
+    ("period_s = 2.0", "period_s = 1.0"),
+)
+
+
+def rig_with(devices: str) -> Rig:
+    """A mirror of two inputs with 10 fast steps of 10 ms in an exposure, and with these tables of its devices."""
+    text, disturbed = load_rig("tip-tilt").toml.split("[disturbance]")
+    for old, new in _CHANGES:
+        assert old in text
+        text = text.replace(old, new)
+    return parse_rig(f"{text}\n[simulation]{disturbed.split('[simulation]')[1]}\n{devices}")
+
+
+def install(monkeypatch: pytest.MonkeyPatch, folder: Path, **drivers: str) -> None:
+    """A package with the camera of the tests, and with these drivers of mirrors."""
+    info = folder / "bench-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: bench\nVersion: 1.0\n")
+    points = "".join(f"{name} = {target}\n" for name, target in drivers.items())
+    (info / "entry_points.txt").write_text(
+        f"[aolink.cameras]\nspot = tests.devices.simulators.spot_camera:SpotCamera\n[aolink.mirrors]\n{points}"
+    )
+    monkeypatch.syspath_prepend(folder)
+    installed.cache_clear()
+    monkeypatch.setattr(spot_camera.mirror, "held", None)
+
+
+def watch(
+    held: list[tuple[int, tuple[float, ...]]], inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> None:
+    """Let the camera see a simulated mirror by its list of what it held since when."""
+
+    def at(time_ns: int) -> NDArray[np.float64]:
+        now = bisect.bisect_right(held, time_ns, key=lambda each: each[0])
+        return inputs(np.array(held[max(now - 1, 0)][1]))
+
+    spot_camera.mirror.held = at

@@ -1,0 +1,192 @@
+"""Optotune's driver on a pseudo terminal: the bytes, the limits, a session, and what goes wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aolink import estimate
+from aolink.devices.mirrors.optotune import OptotuneMirror
+from aolink.devices.paced import PacedMirror
+from aolink.errors import AolinkError, DeviceError, PortError, RigError
+from aolink.extensions import installed
+from aolink.recording.reader import Recording
+from aolink.rig import Rig, load_rig
+from aolink.session import Report, record
+from tests.devices.mirrors import bench
+from tests.devices.simulators.optotune import OptotuneSimulator
+from tests.devices.simulators.serial_device import Faults
+
+RIG = load_rig("tip-tilt")
+UNIT_RAD = 0.5
+TAN_50 = math.tan(math.radians(50))
+
+
+def opened(simulator: OptotuneSimulator, rig: Rig = RIG, **keys: Any) -> OptotuneMirror:
+    return OptotuneMirror(rig, port=simulator.port, **{"unit_rad": UNIT_RAD, **keys})
+
+
+def test_an_input_is_an_optical_angle_on_the_unit_circle() -> None:
+    with OptotuneSimulator() as simulator:
+        mirror = opened(simulator, unit_rad=[0.5, -0.25])
+        assert simulator.now() == (0, 0)  # at its safe input, wherever it was
+        taken = mirror.put(np.array([0.8, 0.4]))
+        assert simulator.requests[-1] == b"XY=0.354766;-0.084191"
+        assert simulator.now() == pytest.approx((math.tan(0.4) / TAN_50, -math.tan(0.1) / TAN_50), abs=1e-6)
+        np.testing.assert_allclose(taken, [0.8, 0.4], atol=1e-5)
+        assert not np.array_equal(taken, [0.8, 0.4])  # but what its six decimals say
+        mirror.park()
+        mirror.close()
+        assert simulator.now() == (0, 0)
+    assert mirror.description == "Optotune MR-E-3, serial number ABCD0001, firmware 1.6.742180"
+
+
+@pytest.mark.parametrize("unit_rad", [1.0, [0.2, 0.9], 0.75, 4.0])
+def test_limits_beyond_the_unit_circle_are_refused_before_the_port_is_opened(unit_rad: Any) -> None:
+    """A corner at 43 degrees along both axes is beyond a circle of 50."""
+    with pytest.raises(DeviceError, match=r"optical angles of .* degrees along x and y, beyond the circle of 50 deg"):
+        OptotuneMirror(RIG, port="/dev/no-such-port", unit_rad=unit_rad)
+
+
+@pytest.mark.parametrize(
+    ("keys", "what"),
+    [
+        ({"unit_rad": [0.1]}, r"devices.mirror.unit_rad: expected a finite number, or a list of 2 .* found \[0.1\]"),
+        ({"unit_rad": "0.1"}, "devices.mirror.unit_rad: expected a finite number"),
+        ({"unit_rad": 0}, "devices.mirror.unit_rad: expected a number that is not zero"),
+        ({"port": 3, "unit_rad": 0.1}, "devices.mirror.port: expected a text, found 3"),
+    ],
+)
+def test_wrong_keys(keys: dict[str, Any], what: str) -> None:
+    with pytest.raises(RigError, match=what):
+        OptotuneMirror(RIG, **{"port": "/dev/no-such-port", **keys})
+
+
+def test_it_has_two_inputs() -> None:
+    with pytest.raises(DeviceError, match="has 2 inputs, x and y; the rig file has 1"):
+        OptotuneMirror(load_rig("section-vi"), port="/dev/no-such-port")
+
+
+def test_a_driver_that_was_left_in_its_pro_mode_is_brought_back() -> None:
+    with OptotuneSimulator(pro_mode=True) as simulator:
+        opened(simulator).close()
+        assert simulator.now() == (0, 0)
+
+
+@pytest.mark.parametrize("faults", [Faults(split=True), Faults(late_s=0.02)])
+def test_answers_in_pieces_and_late_ones_are_whole(faults: Faults) -> None:
+    with OptotuneSimulator(faults) as simulator:
+        mirror = opened(simulator)
+        for x in (0.1, 0.2, 0.3):
+            np.testing.assert_allclose(mirror.put(np.array([x, 0.0])), [x, 0], atol=1e-5)
+        mirror.close()
+        assert len(simulator.held) == 5
+
+
+@pytest.mark.parametrize(
+    ("answers", "what"),
+    [
+        ({"START": "NO"}, "answers START with 'NO', an Optotune mirror driver with OK"),
+        ({"STATUS": "fine"}, "answers STATUS with 'fine', not with a hexadecimal number"),
+        ({"STATUS": "0x00000001"}, r"says that no mirror is connected to it \(STATUS 0x00000001\)"),
+        ({"STATUS": "00000006"}, "says that the mirror's electronics are too hot and the mirror is too hot"),
+        ({"XY": "ERROR"}, r"answers XY=0.000000;0.000000 with 'ERROR', not with OK: give the port of a mirror driver"),
+        ({"XY": "NO"}, "it does not take commands in its present state"),
+        ({"XY": "OU"}, "it went to its upper limit instead"),
+    ],
+)
+def test_a_driver_that_is_not_ready_or_another_one(answers: dict[str, str], what: str) -> None:
+    with OptotuneSimulator(answers=answers) as simulator:
+        with pytest.raises(DeviceError, match=what):
+            opened(simulator)
+        with pytest.raises(DeviceError, match=what):  # the port was given back
+            opened(simulator)
+
+
+def test_a_driver_at_another_speed_or_switched_off() -> None:
+    class Slower(OptotuneSimulator):
+        baud_rate = 115_200
+
+    what = r"the Optotune mirror driver at /dev/.* does not answer 'START\\r\\n' as it should, .* at 256000 baud"
+    for simulator in (Slower(), OptotuneSimulator(Faults(silent_from=0))):
+        with simulator, pytest.raises(DeviceError, match=what):
+            opened(simulator)
+
+
+def test_an_answer_that_was_garbled() -> None:
+    with OptotuneSimulator(Faults(garbled=frozenset({6}))) as simulator:
+        mirror = opened(simulator)
+        with pytest.raises(DeviceError, match=r"answers XY=0.1.* with .*: is the cable good\?"):
+            mirror.put(np.array([0.3, 0.0]))
+        mirror.park()
+        assert simulator.now() == (0, 0)
+        mirror.close()
+
+
+@pytest.fixture
+def session(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """Records ten exposures with a simulator."""
+    bench.install(monkeypatch, tmp_path, optotune="aolink.devices.mirrors.optotune:OptotuneMirror")
+
+    def run(simulator: OptotuneSimulator, report: Report | None = None) -> Report:
+        bench.watch(simulator.held, lambda xy: np.arctan(xy * TAN_50) / UNIT_RAD)
+        devices = f'driver = "optotune"\nport = "{simulator.port}"\nunit_rad = {UNIT_RAD}'
+        rig = bench.rig_with(f'[devices.camera]\ndriver = "spot"\n[devices.mirror]\n{devices}\n')
+        return record(rig, None, None, tmp_path / "a.mcap", exposures=10, report=report)
+
+    yield run
+    installed.cache_clear()
+
+
+Session = Callable[..., Report]
+
+
+def test_a_session_is_recorded_and_estimated(session: Session, tmp_path: Path) -> None:
+    with OptotuneSimulator() as simulator:
+        report = session(simulator)
+        assert simulator.now() == (0, 0)
+    assert (report.ended, report.frames_received) == ("complete", 10)
+    ends = (report.steps_applied, report.steps_late, report.steps_superseded, report.steps_not_reported)
+    assert (sum(ends), report.steps_clipped) == (report.steps_commanded, 0)
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.metadata["mirror"].startswith("Optotune MR-E-3")
+    exposures = list(recording)
+    assert max(np.abs(each.inputs).max() for each in exposures) > 0.2
+    for exposure, found in zip(exposures, estimate(tmp_path / "a.mcap", "o1"), strict=True):
+        assert exposure.truth is not None
+        assert np.abs(found.path - exposure.truth.path).max() < 0.02
+
+
+def test_a_driver_that_is_unplugged_ends_the_session_with_what_was_recorded(session: Session, tmp_path: Path) -> None:
+    report = Report()
+    with (
+        OptotuneSimulator(Faults(unplugged_at=50)) as simulator,
+        pytest.raises(AolinkError, match=r"lost /dev/.*: .*; is the device still there"),
+    ):
+        session(simulator, report)
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.complete
+    assert len(list(recording)) >= report.exposures > 0
+
+
+def test_the_driver_is_a_mirror_without_a_queue() -> None:
+    """Which the host drives at the fast rate, and parks."""
+    with OptotuneSimulator() as simulator:
+        mirror = PacedMirror(RIG, opened(simulator))
+        assert mirror.send(0, np.full((10_000, 2), 0.3)) < 10_000
+        while len(simulator.held) < 3:
+            pass
+        mirror.park()
+        mirror.close()
+        assert simulator.now() == (0, 0)
+        assert simulator.held[-2][1] == pytest.approx(2 * (math.tan(0.15) / TAN_50,), abs=1e-6)
+
+
+def test_a_port_that_is_not_there() -> None:
+    with pytest.raises(PortError, match="there is no port /dev/no-such-port"):
+        OptotuneMirror(RIG, port="/dev/no-such-port", unit_rad=0.1)

@@ -1,0 +1,121 @@
+"""A device at the far end of a real pseudo terminal, served by a thread, which can misbehave in all the usual ways."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import select
+import struct
+import threading
+import time
+import tty
+from dataclasses import dataclass
+from typing import Self
+
+_TCGETS2 = 0x802C542A
+"""Linux: the settings of a terminal with its speed as a number."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """What goes wrong on the line; answers and requests are counted from zero."""
+
+    late_s: float = 0.0
+    """Time that the device takes for each answer."""
+    split: bool = False
+    """Answers come byte by byte."""
+    garbled: frozenset[int] = frozenset()
+    """Answers with the highest bit of each byte set, up to the end."""
+    silent_from: float = float("inf")
+    """First request that is not answered any more."""
+    unplugged_at: float = float("inf")
+    """Request with which the device vanishes."""
+
+
+NO_FAULTS = Faults()
+
+
+class SerialDevice:
+    """Base of the simulated devices: each gives its answer to a request, and how a request ends.
+
+    ``port`` is the path for the driver, ``start`` what the device holds when it is switched on. At another speed than
+    ``baud_rate`` it understands nothing, and what it sends cannot be understood.
+    """
+
+    baud_rate = 115_200
+    end = b"\n"
+
+    def __init__(self, faults: Faults, *start: float) -> None:
+        self.requests: list[bytes] = []
+        self.held: list[tuple[int, tuple[float, ...]]] = []
+        """Since when, by `time.monotonic_ns`, it has held what."""
+        self.hold(*start)
+        self._faults, self._answers = faults, 0
+        self._device, self._host = pty.openpty()
+        tty.setraw(self._host)
+        self.port = os.ttyname(self._host)
+        self._woken, self._wake = os.pipe()
+        self._thread = threading.Thread(target=self._serve, name=f"simulated {type(self).__name__}", daemon=True)
+        self._thread.start()
+
+    def answer(self, request: bytes) -> bytes:
+        """What the device sends for a request, which comes without its end; nothing for most commands."""
+        raise NotImplementedError
+
+    def hold(self, *values: float) -> None:
+        """Hold something else from now on."""
+        self.held.append((time.monotonic_ns(), values))
+
+    def now(self) -> tuple[float, ...]:
+        """What it holds."""
+        return self.held[-1][1]
+
+    def requests_in(self, waiting: bytes) -> tuple[list[bytes], bytes]:
+        """Whole requests at the beginning of what came, and the rest."""
+        *whole, rest = waiting.split(self.end)
+        return whole, rest
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._wake)
+        self._thread.join()
+
+    def _serve(self) -> None:
+        waiting = b""
+        try:
+            while True:
+                ready, _, _ = select.select([self._device, self._woken], [], [])
+                if self._woken in ready:
+                    return
+                data = os.read(self._device, 4096)
+                if self._speed() != self.baud_rate:
+                    os.write(self._device, bytes(byte ^ 0xA5 for byte in data[::2]))
+                    continue
+                requests, waiting = self.requests_in(waiting + data)
+                for request in requests:
+                    if len(self.requests) >= self._faults.unplugged_at:
+                        return
+                    self.requests.append(request)
+                    answer = self.answer(request)
+                    if answer and len(self.requests) <= self._faults.silent_from:
+                        self._send(answer)
+        finally:
+            for descriptor in (self._device, self._host, self._woken):
+                os.close(descriptor)
+
+    def _send(self, answer: bytes) -> None:
+        if self._faults.late_s:
+            time.sleep(self._faults.late_s)
+        if self._answers in self._faults.garbled:
+            text = answer.removesuffix(self.end)
+            answer = bytes(byte | 0x80 for byte in text) + answer[len(text) :]
+        self._answers += 1
+        for piece in [answer[k : k + 1] for k in range(len(answer))] if self._faults.split else [answer]:
+            os.write(self._device, piece)
+
+    def _speed(self) -> int:
+        settings = fcntl.ioctl(self._device, _TCGETS2, bytes(44))
+        return int(struct.unpack("=4IB19B2I", settings)[-1])
