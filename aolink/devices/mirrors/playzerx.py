@@ -16,8 +16,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.gate import converter_margin
-from aolink.devices.mirrors.line import Line
+from aolink.devices.mirrors.keys import text
+from aolink.devices.mirrors.line import Line, shown
+from aolink.devices.mirrors.resolution import check_resolution
 from aolink.devices.mirrors.sample_clock import SampleClock
 from aolink.devices.simple import Held, Lacks
 from aolink.errors import AolinkError, DeviceError
@@ -37,6 +38,9 @@ _GOLDEN = 0.618034
 """The pauses between two counts follow this ratio, so that they fall into all phases of a sample."""
 _WARM_UP = 30
 """Counts before the first step is told: enough to know the phase of the samples."""
+_SLOW_NS = 3_000_000
+_TRIES = 3
+"""A machine that is held up right at the beginning is given another chance."""
 _QUIET_S = 0.05
 _INFO_S = 0.3
 """How long older firmware is waited for to say its data format."""
@@ -86,8 +90,8 @@ def remaining(answer: bytes) -> int:
     left = int.from_bytes(answer[3:], "little")
     if answer[:3] != b"pl-" or left > max(_CAPACITY.values()):
         raise DeviceError(
-            f"the PlayzerX answers {answer!r} when it is asked how many samples remain, expected 'pl-' and a number of"
-            " three bytes: its line loses bytes, or its firmware is another one"
+            f"the PlayzerX answers {shown(answer)} when it is asked how many samples remain, expected 'pl-' and a number"
+            " of three bytes: its line loses bytes, or its firmware is another one"
         )
     return left
 
@@ -128,7 +132,7 @@ class PlayzerX:
         self._ahead = round(ahead_s * rate)
         _check(rig, laser, self._ahead)
         self._park = codes_of(rig.mirror.park[None])
-        self._line = Line("the PlayzerX", port, BAUD_RATE)
+        self._line = Line("the PlayzerX", text("port", port), BAUD_RATE)
         try:
             self.description, data_format = self._identify()
             self._laser = [laser] * _COLOURS[data_format]
@@ -151,10 +155,12 @@ class PlayzerX:
             """The step that the mirror was in at the latest count."""
             self._batch = 0
             """The first step of what was handed over last."""
+            self._doubtful = False
+            """Whether the latest count was behind, but took too long to say by how much: it is asked again at once."""
             self._changed = threading.Lock()
             self._closing = threading.Event()
             self._failed: Exception | None = None
-            self._line.tell(USB_INPUT + CLEAR + sample_rate(rate))
+            self._line.tell(USB_INPUT + sample_rate(rate))
             self._begin()
             for _ in range(_WARM_UP):
                 self._serve()
@@ -214,7 +220,9 @@ class PlayzerX:
         self._line.drain(_QUIET_S)
         for request, expected in ((PING, b"pl-ok"), (INFO, b"pl-info")):
             if (answer := self._line.ask(request)) != expected:
-                raise DeviceError(f"{self._line.url} answers {answer[:48]!r}, expected {expected!r}: it is no PlayzerX")
+                raise DeviceError(
+                    f"{self._line.url} answers {shown(answer)}, expected {shown(expected)}: it is no PlayzerX"
+                )
         name, firmware = (self._line.read_until().decode("ascii", "replace").strip() for _ in range(2))
         data_format = "XYM"
         with suppress(DeviceError):
@@ -225,15 +233,18 @@ class PlayzerX:
 
     def _begin(self) -> None:
         """Queue the first samples. Raises DeviceError where the device does not take them."""
-        self._hand_over(self._ahead)
-        asked_ns = time.monotonic_ns()
-        left = self._count()
-        if not 0 < left <= self._handed:
-            raise DeviceError(
-                f"the PlayzerX says that {left} of {self._handed} samples remain as soon as it is sent them: it does"
-                " not take them, or this machine was held up for longer than they last (devices.mirror.ahead_s)"
-            )
-        self._take_count(self._handed - left, asked_ns, time.monotonic_ns())
+        for _ in range(_TRIES):
+            self._steps, self._next, self._handed = [], 0, 0
+            self._line.tell(CLEAR)
+            self._hand_over(self._ahead)
+            asked_ns = time.monotonic_ns()
+            if left := self._count():
+                self._take_count(self._handed - left, asked_ns, time.monotonic_ns())
+                return
+        raise DeviceError(
+            f"the PlayzerX says that none of {self._handed} samples remain as soon as it is sent them: it does not take"
+            " them, or this machine was held up for longer than they last (devices.mirror.ahead_s)"
+        )
 
     def _run(self) -> None:
         try:
@@ -247,12 +258,14 @@ class PlayzerX:
         """Count the samples, and fill the queue."""
         asked_ns = time.monotonic_ns()
         left = self._count()
+        answered_ns = time.monotonic_ns()
         with self._changed:
             if left:
-                self._take_count(self._handed - left, asked_ns, time.monotonic_ns())
+                self._take_count(self._handed - left, asked_ns, answered_ns)
             else:  # until now, the last sample was held
                 self._delay(self._next, self._step_at(asked_ns) + 1 - self._next)
-        self._hand_over(self._step_at(time.monotonic_ns()) + 1 + self._ahead - self._next)
+        if not self._doubtful:
+            self._hand_over(self._step_at(time.monotonic_ns()) + 1 + self._ahead - self._next)
 
     def _count(self) -> int:
         """Samples in the queue. The question follows all samples on the line, so that they are counted."""
@@ -263,8 +276,11 @@ class PlayzerX:
     def _take_count(self, taken: int, asked_ns: int, answered_ns: int) -> None:
         """``taken`` of the samples handed over were taken from the queue, and the last of them is being held."""
         slip = self._clock.add(taken + self._offset, asked_ns, answered_ns)
-        if slip > 0 and self._taken < self._batch < taken + self._offset:
-            # Behind, but within what was handed over last: it came when the queue had run dry.
+        if slip > 0 and self._taken < self._batch <= taken + self._offset:
+            self._doubtful = not self._doubtful and answered_ns - asked_ns > _SLOW_NS
+            if self._doubtful:
+                return
+            # Behind, but everything before what was handed over last was taken: that came when the queue had run dry.
             now = self._step_at((asked_ns + answered_ns) // 2)
             self._delay(self._batch, max(now + 1 - (taken + self._offset), 1))
         elif slip:
@@ -272,6 +288,7 @@ class PlayzerX:
                 f"the PlayzerX's count of samples is off by {slip:.1f}: its line loses bytes, or it does not play"
                 f" {1e9 / self._step_ns:g} samples a second as it was told to"
             )
+        self._doubtful = False
         self._taken = max(self._taken, taken - 1 + self._offset)
 
     def _step_at(self, host_ns: int) -> int:
@@ -316,22 +333,18 @@ def _checked_rate(rig: Rig) -> int:
 
 def _check(rig: Rig, laser: int, ahead: int) -> None:
     """Raises DeviceError where the rig file or a key asks for what the device cannot do."""
-    mirror, step = rig.mirror, 1 / _HALF
+    mirror = rig.mirror
     if rig.n_inputs > 2 or (mirror.input_min < -1).any() or (mirror.input_max > 1).any():
         raise DeviceError(
             f"the PlayzerX has two axes, each from -1 to 1: the rig file's mirror has {rig.n_inputs} input(s) from"
             f" {mirror.input_min.min():g} to {mirror.input_max.max():g}"
         )
-    if (converter_margin(mirror) < step).any():
-        bits = int(np.log2((mirror.input_max - mirror.input_min).min() / step + 1))
-        raise DeviceError(
-            f"mirror.dac_bits = {mirror.dac_bits} is finer than the PlayzerX's steps of {step:.3g}: set it to {bits}"
-        )
+    check_resolution(mirror, 1 / _HALF, "the PlayzerX")
     if laser not in range(256):
         raise DeviceError(f"devices.mirror.laser = {laser}: expected a whole number from 0 to 255")
     if ahead < 1:
         raise DeviceError("devices.mirror.ahead_s is shorter than a fast step: nothing would be queued")
-    if (least := ahead + 5 * mirror.block_steps) > mirror.queue_steps:
+    if (least := ahead + 6 * mirror.block_steps) > mirror.queue_steps:
         raise DeviceError(
             f"mirror.queue_steps = {mirror.queue_steps} leaves too little time for commands: {ahead} steps are queued"
             f" on the PlayzerX (devices.mirror.ahead_s) and commands come in blocks of {mirror.block_steps}; set it to"

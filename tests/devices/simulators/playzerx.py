@@ -26,7 +26,7 @@ class Sample(NamedTuple):
 
 def read_commands(data: bytes) -> tuple[list[bytes], bytes]:
     """The whole commands in ``data``, and the rest; what is no command is skipped."""
-    commands = []
+    commands: list[bytes] = []
     while (at := data.find(b"pl")) >= 0 and len(data) >= at + 4:
         end = at + data[at + 3]
         if len(data) < end:
@@ -84,7 +84,7 @@ class PlayzerX(SerialDevice):
         """What is put out now."""
         self.zero_ns = 0
         """Host time at which the first sample since the queue was cleared was put out."""
-        self.held: list[Sample] = []
+        self.put_out: list[Sample] = []
         """What was put out in each sample period since then."""
         self.overflowed = False
         self._set_rate(POWER_ON_RATE)
@@ -104,7 +104,7 @@ class PlayzerX(SerialDevice):
         with self.lock:
             self._pass_time()
             period = int((host_ns - self.zero_ns) // self._period_ns) if self.zero_ns else -1
-            x, y, _ = self.held[min(period, len(self.held) - 1)] if period >= 0 else Sample(*ORIGIN, ())
+            x, y, _ = self.put_out[min(period, len(self.put_out) - 1)] if period >= 0 else Sample(*ORIGIN, ())
         return np.array([x, y]) / 2047.5 - 1
 
     def _pass_time(self) -> None:
@@ -115,7 +115,7 @@ class PlayzerX(SerialDevice):
                 self.output = self._queue.pop(0)
                 self.zero_ns = self.zero_ns or int(self._tick_ns)
             if self.zero_ns and self.output:
-                self.held.append(self.output)
+                self.put_out.append(self.output)
             self._tick_ns += self._period_ns
 
     def _execute(self, code: str, request: bytes) -> bytes:
@@ -126,7 +126,7 @@ class PlayzerX(SerialDevice):
                     self.overflowed |= len(self._queue) >= self._capacity
                     self._queue.append(read_sample(request))
             case "c", 5:
-                self._queue, self.held, self.zero_ns, self._arrived = [], [], 0, 0
+                self._queue, self.put_out, self.zero_ns, self._arrived = [], [], 0, 0
                 self.output = Sample(*ORIGIN, (0,) * self._colours)
             case "r", 8:
                 self._set_rate(min(max(int.from_bytes(request[4:7], "little"), self._slowest), 50_000))
