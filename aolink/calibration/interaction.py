@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,8 +65,16 @@ def poke_inputs(rig: Rig, amplitude: FloatArray | float, rest_exposures: int = 1
     return np.repeat(pokes, (rest_exposures + 1) * rig.timing.frame_period_steps, axis=0)
 
 
-def measure_interaction(rig: Rig, exposures: Iterable[Exposure]) -> Interaction:
+def measure_interaction(
+    rig: Rig, exposures: Iterable[Exposure], slopes_of: Callable[[Exposure], FloatArray] | None = None
+) -> Interaction:
     """Least squares of slopes on inputs, over the exposures whose input had rested since the exposure before began.
+
+    Parameters
+    ----------
+    slopes_of:
+        Slopes of an exposure in the place of its spots' centroids, (n_outputs,), such as those of the rig file's plant.
+        It is called for every exposure, in order.
 
     Raises
     ------
@@ -77,11 +85,12 @@ def measure_interaction(rig: Rig, exposures: Iterable[Exposure]) -> Interaction:
         raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
     inputs, slopes, before = [], [], None
     for exposure in exposures:
+        seen = slopes_of(exposure) if slopes_of else None
         u = np.concatenate([exposure.lead_inputs, exposure.inputs])
         still = before is not None and (u == before[0]).all() and (before == before[0]).all()
         if still and exposure.complete:
             inputs.append(u[0])
-            slopes.append(spot_slopes(rig.sensor, exposure.pixels))
+            slopes.append(spot_slopes(rig.sensor, exposure.pixels) if seen is None else seen)
         before = exposure.inputs
     if not inputs:
         raise CalibrationError("in no exposure had the input rested since the one before: hold each poke longer")

@@ -39,24 +39,30 @@ class Arrivals:
         """Take a frame; gives when it would have arrived with the usual delay, and the standard deviation, ns."""
         self._seen.append((frame, arrived_ns))
         offset_ns = np.array([at - arrived_ns - (k - frame) * self._period_ns for k, at in self._seen], dtype=float)
-        late, sd = self._line(np.array([k - frame for k, _ in self._seen], dtype=float), offset_ns)
-        if abs(late) > self._period_ns / 2:  # another rhythm: the camera was stopped, or its rate changed
-            self._seen = deque([(frame, arrived_ns)], maxlen=_WINDOW)
-            return arrived_ns, self._period_ns / 2
+        frames = np.array([k - frame for k, _ in self._seen], dtype=float)
+        late, sd, residual = self._line(frames, offset_ns)
+        if len(frames) > _LEAST and (np.abs(residual[-_LEAST:]) > self._period_ns / 2).all():
+            # Another rhythm: the camera was stopped, or its rate has changed.
+            self._seen = deque(list(self._seen)[-_LEAST:], maxlen=_WINDOW)
+            late, sd, _ = self._line(frames[-_LEAST:], offset_ns[-_LEAST:])
         return arrived_ns + round(late), sd
 
-    def _line(self, frames: NDArray[np.float64], offset_ns: NDArray[np.float64]) -> tuple[float, float]:
-        """Offset of the newest frame by a straight line through all but the late ones, and its standard deviation."""
+    def _line(
+        self, frames: NDArray[np.float64], offset_ns: NDArray[np.float64]
+    ) -> tuple[float, float, NDArray[np.float64]]:
+        """Offset of the newest frame by a straight line through all but the late ones, its standard deviation, and how
+        far each frame is from the line."""
         if len(frames) < _LEAST:
-            return 0.0, self._period_ns / 2
+            return 0.0, self._period_ns / 2, np.zeros(len(frames))
         usable = np.ones(len(frames), dtype=bool)
         for _ in range(2):
             slope, at_newest = np.polyfit(frames[usable], offset_ns[usable], 1)
             residual = offset_ns - at_newest - slope * frames
             usable = residual <= _OUTLIER * max(float(np.median(np.abs(residual))), 1.0)
             if np.count_nonzero(usable) < _LEAST:
-                return 0.0, self._period_ns / 2
+                return 0.0, self._period_ns / 2, residual
         some = frames[usable]
         spread = float(((some - some.mean()) ** 2).sum())
         variance = float((residual[usable] ** 2).sum()) / max(len(some) - 2, 1)
-        return float(at_newest), float(np.sqrt(variance * (1 / len(some) + some.mean() ** 2 / max(spread, 1.0))))
+        sd = float(np.sqrt(variance * (1 / len(some) + some.mean() ** 2 / max(spread, 1.0))))
+        return float(at_newest), sd, residual

@@ -1,13 +1,17 @@
-"""The serial ports of this machine, and the devices behind them."""
+"""The serial ports of this machine, the drivers, and the devices that they find."""
 
 from __future__ import annotations
 
 import secrets
-from dataclasses import dataclass
+import sys
+from dataclasses import dataclass, field
 
 from serial.tools import list_ports as serial_ports
 
+from aolink.devices.drivers import NATIVE, Kind, driver_names, load_driver
 from aolink.devices.identity import identify
+from aolink.devices.simple import Lacks
+from aolink.errors import AolinkError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.port import SerialPort
@@ -33,6 +37,44 @@ class Found:
             f"{self.kind} {self.model}, serial number {self.serial_number}, firmware {self.firmware},"
             f" protocol {self.protocol_version}, {self.geometry}, {time}"
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverFound:
+    """A driver, what its devices cannot do, and which of them are there."""
+
+    kind: Kind
+    name: str
+    lacks: list[str] = field(default_factory=list)
+    devices: list[tuple[str, str]] = field(default_factory=list)
+    """Address and description of each device found: the address is a key of the rig file's ``[devices]``."""
+    problem: str = ""
+    """Why it cannot be used, or cannot look for devices; empty where it can."""
+
+
+def find_drivers() -> list[DriverFound]:
+    """The installed drivers of cameras and mirrors, each with the devices that it finds on this machine.
+
+    A driver looks for its devices if its module has a function ``discover()``. None is opened.
+    """
+    kinds: tuple[Kind, ...] = ("camera", "mirror")
+    return [_find(kind, name) for kind in kinds for name in driver_names(kind)]
+
+
+def _find(kind: Kind, name: str) -> DriverFound:
+    if name == NATIVE:
+        return DriverFound(kind=kind, name=name)
+    try:
+        driver = load_driver(kind, name)
+    except AolinkError as error:
+        return DriverFound(kind=kind, name=name, problem=str(error))
+    lacks = [str(Lacks(each)) for each in getattr(driver, "lacks", ())]
+    discover = getattr(sys.modules.get(getattr(driver, "__module__", "")), "discover", None)
+    try:
+        devices = [(str(address), str(text)) for address, text in discover()] if discover else []
+    except Exception as error:  # a library of the maker's that is missing or broken
+        return DriverFound(kind=kind, name=name, lacks=lacks, problem=f"it cannot look for devices: {error}")
+    return DriverFound(kind=kind, name=name, lacks=lacks, devices=devices)
 
 
 def list_ports() -> list[tuple[str, str]]:

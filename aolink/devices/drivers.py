@@ -33,7 +33,7 @@ def open_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Any:
     RigError
         The driver does not take the keys that the table has.
     """
-    make = _load(kind, table.driver)
+    make = load_driver(kind, table.driver)
     try:
         with suppress(ValueError):  # one that is not written in Python may have no signature
             inspect.signature(make).bind(rig, **table.options)
@@ -54,7 +54,8 @@ def calling(kind: str, when: str) -> Iterator[None]:
         raise DeviceError(f"the driver of the {kind} failed {when}: {error!r}") from error
 
 
-def _load(kind: Kind, name: str) -> Callable[..., Any]:
+def load_driver(kind: Kind, name: str) -> Callable[..., Any]:
+    """The class of a driver. Raises DeviceError where there is none of this name, or it cannot be loaded."""
     point = _others(kind).get(name)
     if point is None:
         raise DeviceError(

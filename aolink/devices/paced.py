@@ -62,8 +62,7 @@ class PacedMirror:
         with self._changed:
             self._raise_failure()
             held, self._held = self._held, []
-            first = self._told
-            self._told += len(held)
+            first, self._told = self._told, self._told + len(held)
         if not held:
             return []
         return [Held(first, np.array([u for u, _ in held]), np.array([late for _, late in held]))]
@@ -124,8 +123,12 @@ class PacedMirror:
                 return
             taken = self._driver.put(u)
             with self._changed:
-                late = self.time_ns() > (step + _LATE) * self._step_ns
+                reached = self.time_ns() / self._step_ns - _LATE
+                late = step < reached
                 self._held.append((self._now if late else taken, late))
+                while self._next < reached:  # the device was busy for longer than a step
+                    self._held.append((self._now, self._queue.pop(self._next, None) is not None))
+                    self._next += 1
                 self._now = taken
 
     def _raise_failure(self) -> None:

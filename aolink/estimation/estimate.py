@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Sequence
-from dataclasses import field, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,26 @@ class Status(enum.IntEnum):
     """The estimator takes no measurements (`open-loop`)."""
 
 
+@dataclass(frozen=True, eq=False)
+class AlignmentError:
+    """What one standard deviation of an exposure's alignment with the mirror's steps does to an estimate.
+
+    The error is one of the clocks' comparison: neighbouring exposures, and all axes, have it in common.
+    """
+
+    steps: float
+    """The standard deviation, fast steps; positive for an exposure that starts later than it is said to."""
+    coefficients: FloatArray
+    """Change of the coefficients, (axes, n_coefficients)."""
+    end_state: FloatArray
+    """Change of the end state, (axes, n_states)."""
+
+    def added_to(self, covariance: FloatArray, name: Literal["coefficients", "end_state"]) -> FloatArray:
+        """A covariance (axes, n, n) of the first n of these numbers, with this error in it."""
+        change = getattr(self, name)[:, : covariance.shape[-1]]
+        return np.asarray(covariance + change[:, :, None] * change[:, None, :])
+
+
 @plain_data
 class Estimate:
     """Start state, end state and path of one exposure, with their covariances.
@@ -62,7 +83,8 @@ class Estimate:
     coefficients: FloatArray
     """Coefficients of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
     coefficient_covariance: FloatArray
-    """(axes, n_coefficients, n_coefficients)"""
+    """(axes, n_coefficients, n_coefficients); without the error of the exposure's alignment, which is in the other two
+    and in the path's."""
     inputs: FloatArray
     """Inputs during the exposure; their response is part of the path, (n_steps, n_inputs)."""
     model: ExposureModel = field(compare=False, repr=False)
@@ -76,6 +98,8 @@ class Estimate:
 
     Chi-square with n_measurements degrees of freedom where model and covariances are right.
     """
+    alignment: AlignmentError | None = field(default=None, compare=False)
+    """Where camera and mirror count by different clocks."""
 
     @property
     def path(self) -> FloatArray:
@@ -108,9 +132,24 @@ class Estimate:
         np.fill_diagonal(covariance, self.path_sd[list(chosen)].ravel() ** 2)
         return np.asarray(covariance)
 
+    def alignment_path(self) -> FloatArray:
+        """Change of the path by one standard deviation of the alignment's error, (n_outputs, n_steps).
+
+        A later exposure sees what later inputs do: the path changes by its coefficients and by the response to the
+        inputs' own change.
+        """
+        if self.alignment is None:
+            return np.zeros_like(self.path)
+        rate = np.gradient(self.inputs, axis=0) if len(self.inputs) > 1 else np.zeros_like(self.inputs)
+        change, _ = path_from_coefficients(
+            self.model, self.alignment.coefficients, self.coefficient_covariance, self.alignment.steps * rate
+        )
+        return change
+
     @cached_property
     def _unfolded(self) -> tuple[FloatArray, FloatArray]:
-        return path_from_coefficients(self.model, self.coefficients, self.coefficient_covariance, self.inputs)
+        path, sd = path_from_coefficients(self.model, self.coefficients, self.coefficient_covariance, self.inputs)
+        return (path, sd) if self.alignment is None else (path, np.hypot(sd, self.alignment_path()))
 
 
 COMPARED = (*(each.name for each in fields(Estimate) if each.compare), "path", "path_sd")
@@ -148,6 +187,9 @@ def motion(
     axes, count = estimate.coefficient_covariance.shape[:2]
     weights = mix.reshape(len(mix), axes, -1)
     each = [np.zeros((len(mix) * path.shape[1], 0))]
+    if estimate.alignment is not None:
+        change = mix @ estimate.alignment_path()
+        each.append(np.concatenate([change, change[:, -1:]], axis=1)[:, : path.shape[1]].reshape(-1, 1))
     for axis in range(axes):
         if weights[:, axis].any():
             rows = model.mixed_rows(weights[:, axis], count)

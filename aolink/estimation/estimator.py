@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.estimation.alignment import Shifted, considered, matters, shift_for
 from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.frames.measure import Measured, Measurements
@@ -36,6 +38,7 @@ class Estimator:
         does not look for modes."""
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
+        self._considering: _Considering | None = None
 
     def step(self, exposure: Exposure) -> Estimate:
         """The estimate of an exposure, from its frame and all earlier ones."""
@@ -44,6 +47,18 @@ class Estimator:
 
     def steps(self, batch: Batch) -> Iterator[Estimate]:
         """The estimates of a batch of exposures, one after the other, the same bits as by `step`."""
+        if self._considering is None:
+            for k, exposure in enumerate(batch.exposures):
+                if matters(exposure, self.rig.timing.fast_step_ns):
+                    if k:
+                        yield from self._steps(Batch(self.rig, batch.exposures[:k]))
+                        batch = Batch(self.rig, batch.exposures[k:])
+                    self._considering = _Considering(self, exposure)
+                    break
+        made = self._steps(batch)
+        yield from made if self._considering is None else self._considering.estimates(batch, made)
+
+    def _steps(self, batch: Batch) -> Iterator[Estimate]:
         measured = Measurements(self.rig, batch.exposures, self.filter.needs)
         k = 0
         while k < len(batch.exposures):
@@ -148,6 +163,29 @@ class Estimator:
         self._next_step = exposure.first_step + exposure.n_steps
         self._last_input = exposure.inputs[-1]
         return reasons
+
+
+class _Considering:
+    """Two copies of an estimator with inputs of other fast steps, from the first exposure on that needs them."""
+
+    def __init__(self, estimator: Estimator, first: Exposure) -> None:
+        rig = self._rig = estimator.rig
+        self._shift = shift_for(first, rig.timing.fast_step_ns)
+        shared = {id(part): part for part in (rig, rig.plant, rig.sensor)}
+        self._copies = [
+            (copy.deepcopy(estimator, dict(shared)), Shifted(steps)) for steps in (self._shift, -self._shift)
+        ]
+        for each, shifted in self._copies:
+            if each._next_step is not None:
+                each._next_step += shifted.steps
+
+    def estimates(self, batch: Batch, made: Iterator[Estimate]) -> Iterator[Estimate]:
+        """The estimates of a batch, with the error of the alignment."""
+        later, earlier = (
+            each.steps(Batch(self._rig, [shifted(exposure) for exposure in batch.exposures]))
+            for each, shifted in self._copies
+        )
+        return considered(batch.exposures, made, later, earlier, self._shift, self._rig.timing.fast_step_ns)
 
 
 # From good to bad; an estimate has the worst status of its axes.

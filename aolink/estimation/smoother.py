@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
-from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.estimate import AlignmentError, Estimate, Status
 from aolink.estimation.model.base import by_axis
 from aolink.exposure import Exposure
 from aolink.numerics import batched
@@ -70,27 +70,42 @@ def _corrected(
     """An estimate of the filter, corrected by ``later``, the smoothed estimate of the next exposure."""
     model = estimate.model
     z, P = estimate.coefficients, estimate.coefficient_covariance
-    end, P_end = estimate.end_state, estimate.end_covariance
+    end, P_end, alignment = estimate.end_state, estimate.end_covariance, estimate.alignment
+    if alignment is not None:  # it is no noise, and later frames have it too: it stands aside
+        P_end = P_end - alignment.added_to(np.zeros_like(P_end), "end_state")
     E = model.transition if z.shape[1] == plant.n_states else model.end_rows
     transition, noise, kick = _gap(plant, exposure, next_exposure)
     predicted = batched.matvec(transition, end) + kick
     spread = batched.symmetric(batched.congruence(transition, P_end) + noise)
-    innovation, change = later.start_state - predicted, later.start_covariance - spread
+    n = plant.n_states
+    innovation, change = later.start_state - predicted, later.coefficient_covariance[:, :n, :n] - spread
     # A state that is known for certain has no inverse, and needs none.
     inverse: FloatArray = np.linalg.pinv(spread, hermitian=True).astype(np.float64)
 
-    def corrected(mean: FloatArray, covariance: FloatArray, with_next: FloatArray) -> tuple[FloatArray, FloatArray]:
-        gain = batched.matmul(with_next, inverse)
+    def corrected(
+        mean: FloatArray, covariance: FloatArray, gain: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
         after = batched.symmetric(covariance + batched.congruence(gain, change))
         return mean + batched.matvec(gain, innovation), _without_negative(after)
 
     to_next = batched.transpose(transition @ E)
-    z, P = corrected(z, P, batched.matmul(P, np.broadcast_to(to_next, (len(P), *to_next.shape))))
-    end, P_end = corrected(end, P_end, batched.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)))
-    n = plant.n_states
+    gain = batched.matmul(batched.matmul(P, np.broadcast_to(to_next, (len(P), *to_next.shape))), inverse)
+    end_gain = batched.matmul(batched.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)), inverse)
+    z, P = corrected(z, P, gain)
+    end, P_end = corrected(end, P_end, end_gain)
+    P_start = P[:, :n, :n]
+    if alignment is not None and later.alignment is not None:
+        moved = later.alignment.coefficients[:, :n] - batched.matvec(transition, alignment.end_state)
+        alignment = AlignmentError(
+            alignment.steps,
+            alignment.coefficients + batched.matvec(gain, moved),
+            alignment.end_state + batched.matvec(end_gain, moved),
+        )
+    if alignment is not None:
+        P_start, P_end = alignment.added_to(P_start, "coefficients"), alignment.added_to(P_end, "end_state")
     return replace(
-        estimate, start_state=z[:, :n], start_covariance=P[:, :n, :n], end_state=end, end_covariance=P_end,
-        coefficients=z, coefficient_covariance=P,
+        estimate, start_state=z[:, :n], start_covariance=P_start, end_state=end, end_covariance=P_end, coefficients=z,
+        coefficient_covariance=P, alignment=alignment,
     )  # fmt: skip
 
 

@@ -10,12 +10,16 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
+from aolink.calibration.interaction import Interaction, measure_interaction, poke_inputs
 from aolink.calibration.measure import LEAST_FRAMES, line_sensor
 from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, CalibrationError, RigError
+from aolink.estimation import make_estimator
 from aolink.files import check_target
+from aolink.optics.sensor import SpotSensor
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
@@ -153,6 +157,62 @@ def record_frames(
             )  # fmt: skip
         paths.append(path)
     return paths
+
+
+@dataclass(frozen=True, kw_only=True)
+class Poked:
+    """An interaction matrix as it was measured, and as the rig file's plant has it for the same inputs."""
+
+    measured: Interaction
+    modelled: Interaction
+
+    @property
+    def difference(self) -> float:
+        """Rms of what the plant leaves unexplained of the measured matrix, as a share of its rms."""
+        apart = self.measured.matrix - self.modelled.matrix
+        return float(np.linalg.norm(apart) / max(np.linalg.norm(self.measured.matrix), 1e-300))
+
+
+def record_pokes(
+    rig: Rig, camera: str | None, mirror: str | None, path: Path, *, share: float, repeats: int, overwrite: bool,
+    stop: Callable[[], bool], progress: Callable[[int], None],
+) -> None:  # fmt: skip
+    """Record a session in which each input is pushed and pulled by ``share`` of its range, ``repeats`` times.
+
+    Raises
+    ------
+    CalibrationError
+        The sensor has no spots, or the pokes go beyond the mirror's limits.
+    AolinkError
+        As `aolink.session.record`.
+    """
+    if not isinstance(rig.sensor, SpotSensor):
+        raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
+    pokes = np.tile(poke_inputs(rig, share * (rig.mirror.input_max - rig.mirror.input_min)), (repeats, 1))
+
+    def inputs(first_step: int, n_steps: int) -> NDArray[np.float64]:
+        rows = pokes[first_step : first_step + n_steps]
+        return np.concatenate([rows, np.tile(rig.mirror.park, (n_steps - len(rows), 1))])
+
+    record(
+        rig, camera, mirror, path, exposures=len(pokes) // rig.timing.frame_period_steps, inputs=inputs,
+        note="pokes for an interaction matrix", overwrite=overwrite, stop=stop, progress=progress,
+    )  # fmt: skip
+
+
+def interaction(rig: Rig, path: Path) -> Poked:
+    """The interaction matrix of a recording with pokes, and what the rig file's plant makes of the same inputs.
+
+    Raises RecordingError and CalibrationError.
+    """
+    recording = Recording(path)
+    plant = make_estimator(rig, "open-loop")
+    return Poked(
+        measured=measure_interaction(rig, recording.exposures()),
+        modelled=measure_interaction(
+            rig, recording.exposures(), lambda exposure: plant.step(exposure).path.mean(axis=1)
+        ),
+    )  # fmt: skip
 
 
 def rig_text(path_or_name: str, rig: Rig) -> str:

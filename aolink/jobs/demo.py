@@ -23,7 +23,7 @@ from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import Rig
 from aolink.session import Report, record
 
-_RIG_START_S = 20.0
+_RIG_START_S = 60.0
 _RIG_END_S = 5.0
 
 

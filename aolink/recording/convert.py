@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import ExposureModel
-from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.estimate import AlignmentError, Estimate, Status
 from aolink.exposure import Exposure, Truth
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
@@ -160,6 +160,10 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
     )
     for name in ("end_covariance", "coefficient_covariance"):
         _fill(message, name, getattr(estimate, name))
+    if estimate.alignment is not None:
+        message.alignment_steps = estimate.alignment.steps
+        _fill(message, "alignment_coefficients", estimate.alignment.coefficients)
+        _fill(message, "alignment_end_state", estimate.alignment.end_state)
     return message
 
 
@@ -187,6 +191,14 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         spread = _array(message.innovation_variance, axes, m)
     else:
         spread = _array(message.innovation_covariance, axes, m, m)
+    alignment, start_covariance = None, covariance[:, :n, :n].copy()
+    if message.alignment_steps:
+        alignment = AlignmentError(
+            message.alignment_steps,
+            _array(message.alignment_coefficients, axes, c),
+            _array(message.alignment_end_state, axes, n),
+        )
+        start_covariance = alignment.added_to(start_covariance, "coefficients")
     return Estimate(
         estimator=message.estimator,
         frame_id=message.frame_id,
@@ -195,7 +207,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         status=Status(message.status),
         reason=message.reason,
         start_state=coefficients[:, :n].copy(),
-        start_covariance=covariance[:, :n, :n].copy(),
+        start_covariance=start_covariance,
         end_state=_array(message.end_state, axes, n),
         end_covariance=_array(message.end_covariance, axes, n, n),
         coefficients=coefficients,
@@ -205,6 +217,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         innovation=_array(message.innovation, axes, m),
         innovation_covariance=spread,
         nis=_array(message.nis, axes),
+        alignment=alignment,
     )
 
 

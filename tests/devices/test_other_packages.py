@@ -110,6 +110,41 @@ def test_a_camera_of_another_package_beside_a_native_mirror(
         assert "a native camera counts fast steps together with its own mirror" in refused.stderr
 
 
+def test_a_camera_alone_is_recorded(aolink: Run, installed: dict[str, str], tmp_path: Path) -> None:
+    """Nothing is commanded; every exposure has the safe input, and is estimated as any other."""
+    rig = rig_file(tmp_path, mirror="")
+    arguments = ("record", "--rig", rig, "--estimator", "o1", "--exposures", "4", "-o", "a.mcap")
+    done = aolink(*arguments, "--json", env=installed)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["ended"], report["frames_received"], report["steps_commanded"]) == ("complete", 4, 0)
+    assert "the rig file's drive is not played" in " ".join(done.stderr.split())
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.metadata["mirror"] == "none"
+    assert topics.COMMAND not in recording.counts
+    exposures = list(recording.exposures())
+    assert [len(exposure.inputs) for exposure in exposures] == [200] * 4
+    assert all(not exposure.inputs.any() and not exposure.inputs_assumed for exposure in exposures)
+    assert len(list(estimate_exposures(tmp_path / "a.mcap", "o1"))) == 4
+    info = aolink("info", "a.mcap")
+    assert info.returncode == 0, info.stderr
+
+
+def test_a_native_camera_alone_is_recorded(aolink: Run, tmp_path: Path) -> None:
+    """It counts the fast steps itself."""
+    with simulated_rig("section-vi", "--real-time") as (camera, _):
+        arguments = ("record", "--rig", "section-vi", "--camera", camera, "--exposures", "3", "-o", "a.mcap")
+        done = aolink(*arguments, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["frames_received"] == 3
+    exposures = list(Recording(tmp_path / "a.mcap").exposures())
+    assert [len(exposure.inputs) for exposure in exposures] == [200] * 3
+    with simulated_rig("section-vi") as (camera, _):
+        refused = aolink(*arguments[:4], camera, *arguments[5:], "--overwrite")
+    assert refused.returncode == 4
+    assert "runs on virtual time" in refused.stderr
+
+
 FAILING = """
 from aolink_example.devices import Camera as Example
 

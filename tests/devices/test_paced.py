@@ -1,49 +1,128 @@
-"""A mirror without a queue, driven by the host: each step is reported with what the device held in it."""
+"""A mirror without a queue: each step's input goes out when the step begins, and what was late is said."""
 
 from __future__ import annotations
 
 import threading
+import time
+from dataclasses import replace
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from aolink.devices.paced import PacedMirror
-from aolink.rig import load_rig
+from aolink.devices.simple import Held, Lacks
+from aolink.errors import DeviceError
+from aolink.rig import Rig, load_rig
 
-RIG = load_rig("section-vi")
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    """A rig with fast steps that a busy machine can keep up with: 20 ms."""
+    section = load_rig("section-vi")
+    return replace(section, timing=replace(section.timing, fast_step_s=0.02, exposure_steps=4, frame_period_steps=4))
 
 
-class Slow:
-    """A device that takes an input only when it is told that it may."""
+class Device:
+    """What it was given, and when."""
 
-    description = "slow"
+    description = "bench"
+    lacks = (Lacks.READ_BACK,)
 
     def __init__(self) -> None:
-        self.asked, self.may = threading.Event(), threading.Event()
+        self.given: list[float] = []
+        self.busy = threading.Event()
+        self.free = threading.Event()
+        self.free.set()
+        self.refusal: Exception | None = None
+        self.parked = self.closed = 0
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        self.asked.set()
-        self.may.wait()
-        return u
+        self.busy.set()
+        self.free.wait(30.0)
+        if self.refusal:
+            raise self.refusal
+        self.given.append(float(u[0]))
+        return np.round(u, 3)
 
     def park(self) -> None:
-        pass
+        self.parked += 1
 
     def close(self) -> None:
-        pass
+        self.closed += 1
 
 
-def test_reports_taken_while_the_device_is_busy_are_of_the_steps_before() -> None:
-    paced = PacedMirror(RIG, device := Slow())
-    paced.send(5, np.full((100_000, 1), 0.01))
-    device.asked.wait()
-    steps: list[int] = []
-    inputs: list[float] = []
-    while 0.01 not in inputs:
-        for held in paced.applied():
-            steps += range(held.first_step, held.first_step + len(held.u))
-            inputs += held.u[:, 0].tolist()
-        device.may.set()
-    paced.close()
-    assert steps == list(range(len(steps)))
-    assert {*inputs[:5]} == {RIG.mirror.park[0]}
+def reports(mirror: PacedMirror, end: int) -> list[tuple[float, bool]]:
+    """What the mirror held in each step before ``end``, and whether it was late."""
+    told: list[tuple[float, bool]] = []
+    while len(told) < end:
+        for held in mirror.applied():
+            assert isinstance(held, Held)
+            assert held.first_step == len(told)
+            assert held.late is not None
+            told += zip(held.u[:, 0].tolist(), held.late.tolist(), strict=True)
+        time.sleep(0.002)
+    return told
+
+
+def test_each_step_gets_its_input_or_is_late(rig: Rig) -> None:
+    mirror = PacedMirror(rig, device := Device())
+    assert mirror.lacks == (Lacks.READ_BACK, Lacks.QUEUE)
+    wanted = np.linspace(0.0101, 0.0211, 12)
+    first = mirror.time_ns() // rig.timing.fast_step_ns + 4
+    assert mirror.send(first, wanted[:, None]) == 0
+    told = reports(mirror, first + 14)
+    mirror.close()
+    rest = float(rig.mirror.park[0])
+    before = rest
+    for (held, late), u in zip(told[first : first + 12], wanted, strict=True):
+        assert held == (before if late else round(u, 3))
+        before = held if not late else round(u, 3) if round(u, 3) in np.round(device.given, 3) else before
+    assert not any(late for _, late in told[:first])
+    assert told[first + 13][0] == rest  # nothing is queued: the safe input
+    assert set(np.round(device.given, 6)) <= {*np.round(wanted, 6), rest}
+    assert device.closed == 1
+
+
+def test_a_device_that_is_busy_goes_on_with_the_newest_step(rig: Rig) -> None:
+    mirror = PacedMirror(rig, device := Device())
+    first = mirror.time_ns() // rig.timing.fast_step_ns + 3
+    device.free.clear()
+    mirror.send(first, np.linspace(0.001, 0.03, 30)[:, None])
+    assert device.busy.wait(30.0)
+    while mirror.time_ns() // rig.timing.fast_step_ns < first + 8:
+        time.sleep(0.005)
+    device.free.set()
+    told = reports(mirror, first + 12)
+    mirror.close()
+    assert all(late for _, late in told[first : first + 6])  # it held the safe input all the time
+    assert {held for held, _ in told[first : first + 6]} == {float(rig.mirror.park[0])}
+    assert not {0.002, 0.003, 0.004, 0.005} & set(np.round(device.given, 3).tolist())  # what is over is not sent
+
+
+def test_parking_empties_the_queue(rig: Rig) -> None:
+    mirror = PacedMirror(rig, device := Device())
+    first = mirror.time_ns() // rig.timing.fast_step_ns + 3
+    mirror.send(first, np.full((50, 1), 0.01))
+    reports(mirror, first + 1)
+    step = mirror.park()
+    assert device.parked == 1
+    given = len(device.given)
+    list(mirror.applied())
+    time.sleep(0.1)
+    rest = list(mirror.applied())
+    mirror.close()
+    assert len(device.given) <= given + 1
+    late = [held for report in rest for held in report.u[step + 2 - report.first_step :, 0]]
+    assert set(late) <= {float(rig.mirror.park[0])}
+
+
+def test_what_the_device_raises_reaches_the_session(rig: Rig) -> None:
+    mirror = PacedMirror(rig, device := Device())
+    device.refusal = DeviceError("the mirror answers OL: overload")
+    mirror.send(mirror.time_ns() // rig.timing.fast_step_ns + 2, np.full((4, 1), 0.01))
+    with pytest.raises(DeviceError, match="overload"):
+        reports(mirror, 10**6)
+    mirror.park()
+    mirror.close()
+    assert (device.parked, device.closed) == (1, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
 from aolink.devices.interfaces import CommandAnswered, Event
-from aolink.devices.simple import SimpleFrame
+from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.rig import load_rig
 from aolink.rig.device_tables import Delay
@@ -245,3 +246,83 @@ def test_a_step_that_has_gone_by_is_too_late_to_start_at(camera: AdaptedCamera) 
 def test_a_second_picture_is_not_to_be_had_of_a_simple_driver(bench: CameraBench) -> None:
     with pytest.raises(DeviceError, match="no second picture"):
         AdaptedCamera(load_rig("moving-scene"), bench, mirror_of(Bench()), Delay(), bench.now_ns)
+
+
+def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog() -> None:
+    """It takes no command until it is re-armed, and the steps between are reported as those of the watchdog."""
+    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
+    parked = threading.Event()
+    bench = Bench()
+    bench.park = lambda: parked.set() or 20  # type: ignore[method-assign, func-returns-value]
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
+    mirror.poll()
+    assert parked.wait(30.0)
+    while not mirror.latched:
+        pass
+    assert mirror.outage_s > 0.05
+    mirror.send_block(30, np.full((5, 1), 0.01), 0, 0)
+    (answered,) = mirror.poll()
+    assert isinstance(answered, CommandAnswered)
+    assert answered.ack.code == pb.LATCHED
+    bench.host_ns += 40 * STEP_NS
+    assert mirror.rearm() == 41
+    mirror.send_block(41, np.full((4, 1), 0.01), 0, 0)
+    bench.reports = [(10, np.concatenate([held(10), np.tile(rig.mirror.park, (21, 1)), held(4)]))]
+    assert ends(mirror) == [(1, 10, 10, 0), (0, 20, 21, pb.Applied.WATCHDOG), (3, 41, 4, 0)]
+    mirror.close()
+
+
+def test_a_command_that_changes_too_fast_is_refused() -> None:
+    rig = replace(RIG, mirror=replace(RIG.mirror, slew_max_per_s=0.001 / RIG.timing.fast_step_s))
+    mirror = AdaptedMirror(rig, bench := Bench(), Delay(), bench.now_ns)
+    mirror.send_block(0, np.array([[0.001], [0.002]]), 0, 0)
+    with pytest.raises(DeviceError, match=r"input 0 changes by 0.0015 to fast step 3, more than mirror.slew_max_per_s"):
+        mirror.send_block(2, np.array([[0.003], [0.0045]]), 0, 0)
+    mirror.send_block(2, np.array([[0.003], [0.004]]), 0, 0)
+
+
+class CameraWithoutTime(CameraBench):
+    lacks = (Lacks.TIME, Lacks.COUNT)
+
+    def time_ns(self) -> int | None:  # type: ignore[override]
+        return None
+
+
+def test_arrival_stands_for_the_time_that_a_camera_does_not_tell() -> None:
+    bench, mirror_bench = CameraWithoutTime(), Bench()
+    mirror = mirror_of(mirror_bench)
+    monotonic_ns = lambda: bench.host_ns - EPOCH_NS + 5_000  # noqa: E731
+    camera = AdaptedCamera(RIG, bench, mirror, Delay(mean_s=0.01, sd_s=0.002), bench.now_ns, monotonic_ns)
+    camera.query_clock(bench.host_ns)
+    camera.poll()
+    assert camera.start(0, 0)
+    pixels = np.zeros(RIG.sensor.shape, np.uint16)
+    frames = []
+    for k in (1, 2, 3, 5, 6, 7, 8):
+        bench.host_ns = EPOCH_NS + k * PERIOD_NS + EXPOSURE_NS + 10_000_000
+        bench.taken = [SimpleFrame(pixels=pixels, exposure_ns=EXPOSURE_NS, arrived_ns=monotonic_ns())]
+        (frame,) = camera.poll()
+        assert isinstance(frame, Frame)
+        frames.append(frame)
+    assert [frame.frame_id for frame in frames] == [1, 2, 3, 5, 6, 7, 8]
+    assert sum(frame.frames_lost_before for frame in frames) == 1
+    assert frames[-1].first_step == 8 * RIG.timing.frame_period_steps
+    assert frames[-1].alignment_sigma_ns == pytest.approx(2e6, rel=0.05)  # what is not known of the delay stays
+    assert camera.lacks == [Lacks.TIME, Lacks.COUNT]
+
+
+def test_a_camera_that_repeats_a_number_is_refused(camera: AdaptedCamera, bench: CameraBench) -> None:
+    pixels = np.zeros(RIG.sensor.shape, np.uint16)
+    camera.start(0, 0)
+    for number in (7, 8, 10):
+        bench.host_ns += PERIOD_NS
+        start_ns = bench.time_ns() - EXPOSURE_NS
+        bench.taken = [SimpleFrame(pixels=pixels, exposure_ns=EXPOSURE_NS, start_ns=start_ns, number=number)]
+        (frame,) = camera.poll()
+    assert isinstance(frame, Frame)
+    assert (frame.frame_id, frame.frames_lost_before) == (4, 1)
+    bench.taken = [SimpleFrame(pixels=pixels, exposure_ns=EXPOSURE_NS, start_ns=bench.time_ns(), number=10)]
+    with pytest.raises(DeviceError, match="the camera numbers a frame 10 after number 10"):
+        camera.poll()
