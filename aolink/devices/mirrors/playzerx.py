@@ -39,6 +39,7 @@ _GOLDEN = 0.618034
 _WARM_UP = 30
 """Counts before the first step is told: enough to know the phase of the samples."""
 _SLOW_NS = 3_000_000
+"""An answer that takes longer says that something was held up, but not on which side."""
 _TRIES = 3
 """A machine that is held up right at the beginning is given another chance."""
 _QUIET_S = 0.05
@@ -156,7 +157,7 @@ class PlayzerX:
             self._batch = 0
             """The first step of what was handed over last."""
             self._doubtful = False
-            """Whether the latest count was behind, but took too long to say by how much: it is asked again at once."""
+            """Whether the latest answer took too long to say what was held up: then it is asked again first."""
             self._changed = threading.Lock()
             self._closing = threading.Event()
             self._failed: Exception | None = None
@@ -259,13 +260,16 @@ class PlayzerX:
         asked_ns = time.monotonic_ns()
         left = self._count()
         answered_ns = time.monotonic_ns()
+        self._doubtful = not self._doubtful and answered_ns - asked_ns > _SLOW_NS
+        if self._doubtful:
+            return
         with self._changed:
             if left:
                 self._take_count(self._handed - left, asked_ns, answered_ns)
             else:  # until now, the last sample was held
-                self._delay(self._next, self._step_at(asked_ns) + 1 - self._next)
-        if not self._doubtful:
-            self._hand_over(self._step_at(time.monotonic_ns()) + 1 + self._ahead - self._next)
+                self._delay(self._next, self._step_at(answered_ns) + 1 - self._next)
+                self._clock.doubt(self._step_ns + answered_ns - asked_ns)
+        self._hand_over(self._step_at(time.monotonic_ns()) + 1 + self._ahead - self._next)
 
     def _count(self) -> int:
         """Samples in the queue. The question follows all samples on the line, so that they are counted."""
@@ -277,18 +281,15 @@ class PlayzerX:
         """``taken`` of the samples handed over were taken from the queue, and the last of them is being held."""
         slip = self._clock.add(taken + self._offset, asked_ns, answered_ns)
         if slip > 0 and self._taken < self._batch <= taken + self._offset:
-            self._doubtful = not self._doubtful and answered_ns - asked_ns > _SLOW_NS
-            if self._doubtful:
-                return
             # Behind, but everything before what was handed over last was taken: that came when the queue had run dry.
             now = self._step_at((asked_ns + answered_ns) // 2)
             self._delay(self._batch, max(now + 1 - (taken + self._offset), 1))
+            self._clock.doubt(self._step_ns + answered_ns - asked_ns)
         elif slip:
             raise DeviceError(
                 f"the PlayzerX's count of samples is off by {slip:.1f}: its line loses bytes, or it does not play"
                 f" {1e9 / self._step_ns:g} samples a second as it was told to"
             )
-        self._doubtful = False
         self._taken = max(self._taken, taken - 1 + self._offset)
 
     def _step_at(self, host_ns: int) -> int:
@@ -302,7 +303,6 @@ class PlayzerX:
             late = [self._commands.pop(k, None) is not None for k in range(self._next, self._next + n_steps)]
             self._steps[at:at] = [(before, each) for each in late]
             self._next, self._offset = self._next + n_steps, self._offset + n_steps
-            self._clock.doubt()
 
     def _hand_over(self, n_samples: int) -> None:
         """Queue samples on the device: the safe input for the steps without a command."""

@@ -58,10 +58,10 @@ class SampleClock:
         self._follow((low + high) / 2, elapsed_ns)
         return 0.0
 
-    def doubt(self) -> None:
-        """The device has stood still meanwhile: what is known of its samples may be wrong by one."""
+    def doubt(self, by_ns: int) -> None:
+        """The device has stood still meanwhile: what is known of its samples may be wrong by so much."""
         assert self._zero is not None, "add a count first"
-        self._zero = self._zero[0] - self._period_ns, self._zero[1] + self._period_ns
+        self._zero = self._zero[0] - by_ns, self._zero[1] + by_ns
 
     def time_ns(self, host_ns: int) -> int:
         """Time since sample 0 began, on the device's clock, at a host time of now, ns."""

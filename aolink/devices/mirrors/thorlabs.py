@@ -28,6 +28,8 @@ _CHANNEL = 1
 """Cubes and bays have one channel each, which has this number."""
 _FULL_SCALE = 32_767
 _OPEN_LOOP, _CLOSED_LOOP = 1, 2
+_CUBE_VOLTS = {1: 75.0, 2: 100.0, 3: 150.0}
+"""What the voltage limit of a cube means."""
 _ALIGNER_VOLTS = 10.0
 _ALIGNER_OPEN_LOOP = 2
 _ALIGNER_OUTPUTS = 0x0D
@@ -58,6 +60,7 @@ class AptUnit:
             from thorlabs_apt_protocol.parsing import id_to_func
         self._codec, self._parsers = thorlabs_apt_protocol, id_to_func
         self._line, self._address = line, address
+        self.is_cube = address == _CUBE
 
     def tell(self, name: str, *values: int) -> None:
         """Send the message of this name in the codec."""
@@ -150,6 +153,8 @@ class ThorlabsPiezo:
         Numbers of the bays of a unit that has bays, one for each input.
     closed_loop:
         Whether the units follow their strain gauges.
+    travel_um:
+        The actuators' travel in closed loop, where the units are cubes: they do not know it.
     unit, zero:
         Volts (micrometres in closed loop) for an input of one, and those at an input of zero; numbers, or lists of one
         for each input.
@@ -159,11 +164,15 @@ class ThorlabsPiezo:
 
     def __init__(
         self, rig: Rig, *, port: str | list[str], bays: list[int] | None = None, closed_loop: bool = False,
-        unit: float | list[float] = 1.0, zero: float | list[float] = 0.0,
+        travel_um: float | None = None, unit: float | list[float] = 1.0, zero: float | list[float] = 0.0,
     ) -> None:  # fmt: skip
         places = _places(port, bays, rig.n_inputs)
+        if closed_loop and not bays and not (isinstance(travel_um, int | float) and travel_um > 0):
+            raise RigError(
+                f"devices.mirror.travel_um: in closed loop cubes need the travel of their actuators, found {travel_um}"
+            )
         self._scale, self._zero = (scale_per_input("unit", unit, rig.n_inputs), per_input("zero", zero, rig.n_inputs))
-        self._closed_loop, self._park = closed_loop, rig.mirror.park
+        self._closed_loop, self._travel_um, self._park = closed_loop, travel_um, rig.mirror.park
         with ExitStack() as opened:
             self._lines: dict[str, Line] = {}
             for path, _ in places:
@@ -219,8 +228,13 @@ class ThorlabsPiezo:
                 f"the Thorlabs unit stays in control mode {found}, asked for {mode}"
                 f" ({'closed' if self._closed_loop else 'open'} loop): is its strain gauge connected?"
             )
-        if self._closed_loop:
+        if self._closed_loop and apt.is_cube:
+            most = float(self._travel_um or 0.0)
+        elif self._closed_loop:
             most = apt.ask("pz_req_maxtravel", "pz_get_maxtravel", _CHANNEL)["travel"] / 10  # it counts 100 nm
+        elif apt.is_cube:
+            limit = apt.ask("pz_req_tpz_iosettings", "pz_get_tpz_iosettings", _CHANNEL)["voltage_limit"]
+            most = _CUBE_VOLTS.get(limit, 0.0)
         else:
             most = apt.ask("pz_req_outputmaxvolts", "pz_get_outputmaxvolts", _CHANNEL)["voltage"] / 10
         if most <= 0:

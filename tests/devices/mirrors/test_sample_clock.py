@@ -67,6 +67,6 @@ def test_a_device_that_stood_still_is_followed_again() -> None:
     device = Device(1, 20e-6, 100_000)
     assert not any(device.count() for _ in range(100))
     device.lost = 1
-    device.clock.doubt()
+    device.clock.doubt(PERIOD_NS)
     assert not any(device.count() for _ in range(2000))
     assert abs(device.clock.time_ns(device.now_ns) - device.true_ns - PERIOD_NS) < 0.15 * PERIOD_NS

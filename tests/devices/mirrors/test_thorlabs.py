@@ -64,7 +64,7 @@ def test_bays_are_inputs_of_one_line_and_other_messages_between_do_no_harm() -> 
 
 def test_in_closed_loop_inputs_are_micrometres() -> None:
     with Piezo() as x, Piezo() as y:
-        mirror = opened(x, y, closed_loop=True, unit=8.0, zero=10.0)
+        mirror = opened(x, y, closed_loop=True, travel_um=20.0, unit=8.0, zero=10.0)
         np.testing.assert_allclose(mirror.put(np.array([0.75, -1.0])), [0.75, -1.0], atol=1e-4)
         assert (x.now()[0], y.now()[0]) == pytest.approx((16, 2), abs=1e-3)
         mirror.close()
@@ -83,6 +83,7 @@ def test_the_aligner_has_two_outputs() -> None:
 @pytest.mark.parametrize(
     ("keys", "what"),
     [
+        ({"bays": None, "port": ["a", "b"], "closed_loop": True}, "travel_um: in closed loop cubes need the travel of"),
         ({"unit": 40.0}, "are -5 to 75 V by devices.mirror.unit and zero, the Thorlabs unit goes from 0 to 75 V"),
         ({"closed_loop": True}, "are 5 to 65 um by devices.mirror.unit and zero, .* from 0 to 20 um"),
         (

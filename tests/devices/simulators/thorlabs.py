@@ -106,11 +106,14 @@ class Piezo(AptDevice):
                 return self._message(0x0645, address, struct.pack("<Hh", 1, self._codes[address]))
             case 0x0647:
                 return self._message(0x0648, address, struct.pack("<HH", 1, self._codes[address] + 3))  # of its sensor
-            case 0x0650:
+            case 0x07D5 if address == 0x50:
+                limit = {75.0: 1, 100.0: 2, 150.0: 3}[self._volts]
+                return self._message(0x07D6, address, struct.pack("<HHHHH", 1, limit, 1, 0, 0))
+            case 0x0650 if address != 0x50:
                 return self._message(0x0651, address, struct.pack("<HH", 1, round(self._travel_um * 10)))
             case 0x0652:
                 self.sources[address] = _words(request)[1]
-            case 0x0681:
+            case 0x0681 if address != 0x50:
                 return self._message(0x0682, address, struct.pack("<HHH", 1, round(self._volts * 10), 0))
             case 0x0210:
                 self.enabled[address] = request[3] == 1 and not self._interlocked
