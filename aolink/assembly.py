@@ -48,6 +48,8 @@ class Frame:
     """From the beginning of the first fast step to the start of the exposure; less than a fast step."""
     plane: int = 0
     """Which of the camera's pictures of the exposure this is: 0 the spots, 1 the scene."""
+    slopes: NDArray[np.float64] | None = None
+    """As `Exposure.slopes`."""
 
 
 class FrameReassembly:
@@ -334,20 +336,17 @@ class Assembler:
         inputs, assumed = self._history.take(frame.first_step, frame.last_step + 1)
         self._end = frame.last_step + 1
         return Exposure(
-            frame_id=frame.frame_id,
-            first_step=frame.first_step,
             n_steps=frame.last_step + 1 - frame.first_step,
-            pixels=frame.pixels,
-            mask=frame.mask,
             inputs=inputs,
             lead_inputs=lead,
             start_offset=frame.exposure_offset_ns / self._fast_step_ns,
             inputs_assumed=assumed + lead_assumed,
-            chunks_lost=frame.chunks_lost,
-            device_start_ns=frame.device_start_ns,
-            device_end_ns=frame.device_end_ns,
-            host_start_ns=frame.host_start_ns,
-            host_receive_ns=frame.host_receive_ns,
-            clock_sigma_ns=frame.clock_sigma_ns,
-            alignment_sigma_ns=frame.alignment_sigma_ns,
+            **{name: getattr(frame, name) for name in _OF_FRAME},
         )
+
+
+_OF_FRAME = (
+    "frame_id", "first_step", "pixels", "mask", "chunks_lost", "device_start_ns", "device_end_ns", "host_start_ns",
+    "host_receive_ns", "clock_sigma_ns", "alignment_sigma_ns", "slopes",
+)  # fmt: skip
+"""What an exposure has from its frame as it is."""

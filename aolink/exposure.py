@@ -96,6 +96,11 @@ class Exposure:
     Zero where the camera counts the steps together with its mirror. Of two clocks it is the error of their comparison,
     which neighbouring exposures have in common: it does not average out.
     """
+    slopes: NDArray[np.float64] | None = None
+    """Slopes that other software measured, slope units, (all outputs of all axes,), NaN where it measured none.
+
+    No pixel is known then: ``mask`` is False throughout. None where there are pixels.
+    """
     scene: Picture | None = None
     """The picture of the same exposure, where the rig has a picture sensor. It comes after the spot's frame, so
     that an exposure that is estimated live does not have it yet."""

@@ -144,23 +144,20 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
     existed = target.exists()
     try:
         descriptor = os.open(target, flags | (0 if overwrite else os.O_EXCL), 0o666)
+        try:
+            if not _lock(descriptor) or _others_write(target):
+                if not existed:
+                    target.unlink()
+                raise error(_in_use(target))
+            os.ftruncate(descriptor, 0)
+            _sync_folder(target.parent)
+        except BaseException:
+            os.close(descriptor)
+            raise
     except FileExistsError:
         raise error(_exists(target)) from None
     except OSError as problem:
         raise error(f"cannot create {target}: {why_not(problem)}") from None
-    try:
-        if not _lock(descriptor) or _others_write(target):
-            if not existed:
-                target.unlink()
-            raise error(_in_use(target))
-        os.ftruncate(descriptor, 0)
-        _sync_folder(target.parent)
-    except OSError as problem:
-        os.close(descriptor)
-        raise error(f"cannot create {target}: {why_not(problem)}") from None
-    except BaseException:
-        os.close(descriptor)
-        raise
     return descriptor
 
 

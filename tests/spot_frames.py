@@ -28,6 +28,13 @@ def nodes_and_places(kind, pitch, turn_deg, side, radius, pupil="round"):
     return nodes[inside], places[inside]
 
 
+def square_lattice(lit, pitch):
+    """Positions of the lit lenslets of a square grid, (n, 2) as (x, y), row by row, and its pairs of neighbours."""
+    positions = pitch * np.argwhere(lit)[:, ::-1].astype(float)
+    distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    return positions, np.argwhere(np.triu(abs(distance - pitch) < 1e-9))
+
+
 def spots_frame(side, places, sd, heights=1.0):
     """Gaussian spots integrated over pixels, (side, side); ``heights`` are about those of the brightest pixels."""
     edges = np.arange(side + 1) - 0.5

@@ -32,8 +32,10 @@ from aolink.recording.reader import Recording
 from aolink.rig import load_rig, parse_rig
 from aolink.session import record
 from aolink.simulation.model import simulate
-from tests.importing.synthetic import random_walk, spot_film
 from tests.kinds import must_be
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+from paper_report.spot_films import random_walk, spot_film
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(

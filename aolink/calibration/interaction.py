@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from aolink.errors import CalibrationError
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
 from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 # A pixel counts if its density exceeds this many sd of noise: pixels far from the spot only add noise.
 _THRESHOLD_SD = 4.0

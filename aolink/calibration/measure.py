@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -19,11 +19,10 @@ from scipy import stats
 
 from aolink.calibration.spot import Spot, check_at_rest, fit_spots
 from aolink.errors import CalibrationError
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.sensor import Sensor
 from aolink.rig import Rig
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Kind = Literal["dark", "flat", "still"]
 KINDS: tuple[Kind, ...] = ("dark", "flat", "still")
 
@@ -213,7 +212,7 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
 
 def _signal(lit: PixelStatistics, dark: PixelStatistics) -> PixelStatistics:
     """The same above each pixel's own dark level."""
-    return PixelStatistics(frames=lit.frames, mean=lit.mean - dark.mean, variance=lit.variance, spread=lit.spread)
+    return replace(lit, mean=lit.mean - dark.mean)
 
 
 def _mean_variance(variances: FloatArray, spread: float) -> Measured:

@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from aolink.errors import CalibrationError
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.kernel import pixel_mass, pixel_masses
 from aolink.optics.sensor import Kernel, Sensor
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _UNSTEADY = 1e-5
 """Probability by chance below which a spot counts as moving or flickering."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 
+from aolink.cli.terminal import progress_bar
 from aolink.errors import EstimatorError, RigError
 
 if TYPE_CHECKING:
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
     from aolink.recording.remote import Url
     from aolink.rig import Rig
+
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -40,6 +43,21 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
 
+OutputOption = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")]
+
+
+def warn(text: str) -> None:
+    """Say what is doubtful, on standard error."""
+    stderr.print(f"aolink: warning: {text}", markup=False)
+
+
+@contextmanager
+def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """A progress bar on a terminal; gives ``tell(done, note="")``, whose note is shown behind the bar."""
+    with progress_bar(stderr, total) as tell:
+        yield partial(tell, what)
+
+
 def load_checked(path_or_name: str) -> Rig:
     """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
     from aolink.jobs.check_rig import check_rig
@@ -50,7 +68,7 @@ def load_checked(path_or_name: str) -> Rig:
         if finding.severity == "error":
             raise RigError(f"{path_or_name}: {finding.key}: {finding.message}")
         if finding.severity == "warning":
-            stderr.print(f"aolink: warning: {escape(finding.key)}: {escape(finding.message)}")
+            warn(f"{finding.key}: {finding.message}")
     return loaded
 
 
@@ -60,7 +78,7 @@ def open_recording(file: str | Path | Url, *, check: bool = False, side: Sequenc
 
     recording = Recording(file, check=check, side=side)
     if recording.damage:
-        stderr.print(f"aolink: warning: {recording.path}: {recording.damage}", markup=False)
+        warn(f"{recording.path}: {recording.damage}")
     return recording
 
 

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import FileArgument, OverwriteOption, app, open_recording, stderr, stdout
-from aolink.cli.terminal import progress_bar
+from aolink.cli.common import FileArgument, OverwriteOption, app, open_recording, progress, stdout, warn
 
 
 @app.command(epilog="Example: aolink export session.mcap -o session.parquet -e o3")
@@ -34,8 +33,8 @@ def export(
 
     recording = open_recording(file)
     known = recording.damage
-    with progress_bar(stderr, recording.n_frames) as tell:
-        export_series(recording, output, estimator, overwrite=overwrite, progress=lambda n: tell("export", n))
+    with progress("export", recording.n_frames) as tell:
+        export_series(recording, output, estimator, overwrite=overwrite, progress=tell)
     if recording.damage != known:
-        stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
+        warn(f"{file}: {recording.damage}")
     stdout.print(f"written: {output}", markup=False)

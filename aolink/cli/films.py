@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, stderr, stdout
-from aolink.cli.terminal import progress_bar
+from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, progress, stdout
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
@@ -77,7 +76,7 @@ def import_(
             help="A film: .npy, .npz, TIFF, FITS cube, video, MCAP, ROS bag, AOT telemetry, or a folder of pictures.",
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    output: OutputOption,
     rig: Annotated[str, typer.Option(metavar="RIG.toml", help="What camera and plant the film shows.")],
     rate: RateOption = None,
     exposure: Annotated[
@@ -95,7 +94,12 @@ def import_(
     ] = False,
     gamma: GammaOption = 1.0,
     scale: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="Counts for a pixel value of one. Default: by the type.")
+        float | None,
+        typer.Option(
+            metavar="COUNTS",
+            help="Counts for a pixel value of one. Without it 8 bits, or floats up to 1.0, are the full range of the"
+            " camera and 16 bits are counts; floats above 1.0 need it. Of slopes: slope units for one of the file's.",
+        ),
     ] = None,
     topic: TopicOption = None,
     overwrite: OverwriteOption = False,
@@ -119,10 +123,10 @@ def import_(
     )  # fmt: skip
     loaded = load_rig(rig)
     film = open_film(source, topic)
-    with progress_bar(stderr, film.count // frames) as tell:
+    with progress("import", film.count // frames) as tell:
         account = import_film(
             film, loaded, settings, output, overwrite=overwrite, sources=[source, Path(rig)],
-            progress=lambda done: tell("import", done),
+            progress=tell,
         )  # fmt: skip
     if as_json:
         print(json.dumps({"out": str(output), **vars(account)}))

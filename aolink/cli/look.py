@@ -82,7 +82,7 @@ def slopes(
     The lenslet grid is found in the frames: square or hexagonal, turned by any angle, with spots missing.
     Without --pitch-m and --focal-m slopes are in pixels.
     """
-    from aolink.cli import tables
+    from aolink.cli.tables import rigs as tables
     from aolink.optics import slopes as job
 
     if (pitch_m is None) != (focal_m is None):

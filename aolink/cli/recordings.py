@@ -16,15 +16,17 @@ from aolink.cli.common import (
     EstimatorOption,
     FileArgument,
     JsonOption,
+    OutputOption,
     OverwriteOption,
     app,
     check_measured,
     get_ready,
     open_recording,
+    progress,
     stderr,
     stdout,
+    warn,
 )
-from aolink.cli.terminal import progress_bar
 from aolink.errors import AolinkError, EstimatorError, RecordingError
 from aolink.files import check_target, writing
 from aolink.signals import StopRequest
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
-    from aolink.jobs.batch import Done
+    from aolink.jobs.batch import Done, Job, SideJob
     from aolink.jobs.unit import Model
     from aolink.recording.editing import Edited
 
@@ -53,7 +55,7 @@ def info(
     as_json: JsonOption = False,
 ) -> None:
     """Say what a recording holds. Exit code 1 if a part of it cannot be read."""
-    from aolink.cli import tables
+    from aolink.cli.tables import recordings as tables
 
     recording = open_recording(file, check=check)
     facts = tables.recording_facts(recording)
@@ -123,53 +125,48 @@ def estimate(
     A file that fails does not stop the others (exit code 1). Exit code 6 if no exposure gave a measurement.
     """
     output, is_folder = (Path(target), target.endswith("/") or Path(target).is_dir()) if target else (None, False)
-    if side:
-        if output is None or only or parquet:
-            raise typer.BadParameter(
-                "--side needs -o DIR, and goes with --table X.parquet, not with --only or --parquet"
-            )
-        _estimate_beside(
-            files, batch_models(rig, settings), estimator or ["o3"], output, engine,
-            jobs=jobs, table=table, shard=shard, scheduler=scheduler, overwrite=overwrite, as_json=as_json,
-        )  # fmt: skip
-        return
-    if table or shard or scheduler:
+    if side and (output is None or only or parquet):
+        raise typer.BadParameter("--side needs -o DIR, and goes with --table X.parquet, not with --only or --parquet")
+    if not side and (table or shard or scheduler):
         raise typer.BadParameter("--table, --shard and --scheduler are for side files: give --side too")
     if only and output is None:
         raise typer.BadParameter("--only is for the copy that -o writes: give -o too")
-    from aolink.cli import tables
-    from aolink.jobs import batch
-    from aolink.jobs.tables import fill_table
-    from aolink.recording.remote import location
-
     models = batch_models(rig, settings)
-    if len(files) == 1 and len(models) == 1 and not is_folder:
+    if not side and len(files) == 1 and len(models) == 1 and not is_folder:
         if parquet or jobs > 1:
             raise typer.BadParameter("--parquet and --jobs are for many files or models, with -o DIR/")
         _estimate_one(
             files[0], models[0], estimator, output, engine, only=only, overwrite=overwrite, as_json=as_json
         )  # fmt: skip
         return
-    if output is None or (output.suffix == ".mcap" and not is_folder):
+    if output is None or (output.suffix == ".mcap" and not is_folder and not side):
         raise typer.BadParameter("many files or models need -o DIR: a folder for the results")
+    from aolink.jobs import batch
+    from aolink.jobs.tables import parquet as load_parquet
+    from aolink.recording.remote import location
+
+    if side:
+        if table is not None:
+            check_target(table, overwrite=True, suffix=".parquet")
+            load_parquet()
+        sources = batch.shard(files, shard) if shard else files
+        if scheduler:  # the workers have other folders
+            sources, output = [batch.absolute(each) for each in sources], output.absolute()
+        todo: Sequence[Job | SideJob] = batch.side_jobs(
+            sources, models, estimator or ["o3"], output, engine.value, table=table is not None, overwrite=overwrite
+        )
+        part = f"-{shard.replace('/', '-of-')}" if shard else ""
+        _estimate_many(
+            todo, output, table or output / f"results{part}.csv", jobs, scheduler, side=True, as_json=as_json
+        )
+        return
     if urls := [each for each in map(location, files) if not isinstance(each, Path)]:
         raise typer.BadParameter(f"{urls[0]} is a URL: of many recordings behind URLs --side makes side files")
     todo = batch.jobs(
         [*map(Path, files)], models, estimator or [], output, engine.value, only=only, overwrite=overwrite
     )  # fmt: skip
-    _make_folder(output)
-    table = output / ("results.parquet" if parquet else "results.csv")
-    with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
-        done = _told(batch.run(todo, jobs, stop=stop, progress=lambda n: tell("estimate", n)))
-    rows = batch.table_rows(done, output)
-    with writing(table, overwrite=True) as partial:
-        fill_table(partial, rows, table.suffix)
-    if as_json:
-        print(json.dumps(rows, allow_nan=False))
-    else:
-        stdout.print(tables.batch(rows))
-        _draw(rows, output / "results.png")
-    _end_batch(done, len(todo), stop, table, quiet=as_json)
+    name = "results.parquet" if parquet else "results.csv"
+    _estimate_many(todo, output, output / name, jobs, None, side=False, as_json=as_json)
 
 
 def batch_models(rig: str | None, settings: Sequence[str] | None) -> list[Model]:
@@ -180,59 +177,50 @@ def batch_models(rig: str | None, settings: Sequence[str] | None) -> list[Model]
     return batch.models(load_rig(rig).toml if rig else None, settings or [], Path(rig).stem if rig else "")
 
 
-def _estimate_beside(
-    files: Sequence[str], models: Sequence[Model], estimators: Sequence[str], folder: Path, engine: Engine, *,
-    jobs: int, table: Path | None, shard: str | None, scheduler: str | None, overwrite: bool, as_json: bool,
+def _estimate_many(
+    todo: Sequence[Job | SideJob], folder: Path, table: Path, workers: int, scheduler: str | None, *, side: bool,
+    as_json: bool,
 ) -> None:  # fmt: skip
-    from aolink.cli import tables
+    from aolink.cli.tables import recordings as tables
     from aolink.jobs import batch
-    from aolink.jobs.tables import fill_table, join_tables, parquet, table_beside
+    from aolink.jobs.tables import fill_table, join_tables, table_beside
 
-    if table is not None:
-        check_target(table, overwrite=True, suffix=".parquet")
-        parquet()
-    sources = batch.shard(files, shard) if shard else files
-    if scheduler:  # the workers have other folders
-        sources, folder = [batch.absolute(each) for each in sources], folder.absolute()
-    todo = batch.side_jobs(
-        sources, models, estimators, folder, engine.value, table=table is not None, overwrite=overwrite
-    )  # fmt: skip
-    _make_folder(folder)
-    part = f"-{shard.replace('/', '-of-')}" if shard else ""
-    target = table or folder / f"results{part}.csv"
-    # The table is held from the start, so that the same part that is begun twice is refused.
-    with writing(target, overwrite=True) as partial:
-        with StopRequest().installed() as stop, progress_bar(stderr, len(todo)) as tell:
-
-            def progress(count: int) -> None:
-                tell("estimate", count)
-
-            if scheduler:
-                from aolink.jobs.cluster import run_on
-
-                done = _told(run_on(scheduler, todo, stop=stop, progress=progress))
-            else:
-                done = _told(batch.run(todo, jobs, stop=stop, progress=progress))
-        rows = batch.table_rows(done)
-        fill_table(partial, rows, target.suffix)
-        if table is not None:
-            parts = [table_beside(each.job.output) for each in done if not each.error]
-            join_tables(sorted(parts), table.with_suffix(".exposures.parquet"))
-    if as_json:
-        print(json.dumps(rows, allow_nan=False))
-    elif len(rows) <= _MOST_ROWS_SHOWN:
-        stdout.print(tables.batch(rows))
-    _end_batch(done, len(todo), stop, target, quiet=as_json)
-
-
-_MOST_ROWS_SHOWN = 40
-
-
-def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise AolinkError(f"cannot make the folder {folder}: {(error.strerror or str(error)).lower()}") from None
+    # The table is held from the start, so that the same part that is begun twice is refused.
+    with writing(table, overwrite=True) as partial:
+        with StopRequest().installed() as stop, progress("estimate", len(todo)) as tell:
+            if scheduler:
+                from aolink.jobs.cluster import run_on
+
+                done = _told(run_on(scheduler, todo, stop=stop, progress=tell))
+            else:
+                done = _told(batch.run(todo, workers, stop=stop, progress=tell))
+        rows = batch.table_rows(done, None if side else folder)
+        fill_table(partial, rows, table.suffix)
+        if side and table.suffix == ".parquet":
+            parts = [table_beside(each.job.output) for each in done if not each.error]
+            join_tables(sorted(parts), table.with_suffix(".exposures.parquet"))
+    if as_json:
+        print(json.dumps(rows, allow_nan=False))
+    else:
+        if not side or len(rows) <= _MOST_ROWS_SHOWN:
+            stdout.print(tables.batch(rows))
+        if not side:
+            _draw(rows, folder / "results.png")
+        failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
+        text = f"{len(done)} of {len(todo)} done, {skipped} of them before, {failed} failed; table: {table}"
+        stdout.print(text, markup=False)
+    stop.raise_if_asked()
+    if any(each.error for each in done):
+        raise typer.Exit(1)
+    if any(each.nothing_measured for each in done):
+        raise typer.Exit(EstimatorError.exit_code)
+
+
+_MOST_ROWS_SHOWN = 40
 
 
 def _told(each_done: Iterable[Done]) -> list[Done]:
@@ -244,21 +232,8 @@ def _told(each_done: Iterable[Done]) -> list[Done]:
         if each.error:
             stderr.print(f"aolink: {of}: {each.error}", markup=False)
         for warning in each.warnings:
-            stderr.print(f"aolink: warning: {of}: {warning}", markup=False)
+            warn(f"{of}: {warning}")
     return done
-
-
-def _end_batch(done: Sequence[Done], count: int, stop: StopRequest, table: Path, *, quiet: bool) -> None:
-    """Say how a batch went, and end as its exit code says."""
-    if not quiet:
-        failed, skipped = sum(bool(each.error) for each in done), sum(each.skipped for each in done)
-        text = f"{len(done)} of {count} done, {skipped} of them before, {failed} failed; table: {table}"
-        stdout.print(text, markup=False)
-    stop.raise_if_asked()
-    if any(each.error for each in done):
-        raise typer.Exit(1)
-    if any(each.nothing_measured for each in done):
-        raise typer.Exit(EstimatorError.exit_code)
 
 
 def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -276,7 +251,7 @@ def _estimate_one(
     file: str, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
     only: bool, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    from aolink.cli import tables
+    from aolink.cli.tables import scores as tables
     from aolink.estimation.registry import DEFAULT_ESTIMATOR
     from aolink.recording.reader import Recording
     from aolink.recording.reestimate import (
@@ -293,24 +268,24 @@ def _estimate_one(
     total, known = recording.n_frames, recording.damage
     try:
         get_ready(recording.rig, names)
-        with progress_bar(stderr, total) as tell:
+        with progress("estimate", total) as tell:
             if output is not None:
                 write_reestimated(
                     recording, names, output,
-                    only=only, overwrite=overwrite, progress=lambda n: tell("estimate", n), engine=engine.value,
+                    only=only, overwrite=overwrite, progress=tell, engine=engine.value,
                 )  # fmt: skip
                 written = Recording(output)
                 each = zip(*(written.iter_estimates(name) for name in names), strict=True)
                 series: Iterable[tuple[Exposure, Sequence[Estimate]]] = zip(recording.exposures(), each, strict=True)
             else:
-                series = reestimated(recording, names, lambda n: tell("estimate", n), engine.value)
+                series = reestimated(recording, names, tell, engine.value)
             scores, differences = scored_and_compared(recording, series, names)
     except (ArithmeticError, ValueError) as error:
         if recording.rig_is_recorded:
             raise
         raise EstimatorError(f"{file} cannot be estimated with this rig: {error!r}; check its numbers") from None
     if recording.damage != known:
-        stderr.print(f"aolink: warning: {file}: {recording.damage}", markup=False)
+        warn(f"{file}: {recording.damage}")
     if as_json:
         print(json.dumps({**tables.scores_as_json(scores), "differs_from_recorded": differences}, allow_nan=False))
     else:
@@ -359,7 +334,7 @@ def compare(
     """
     from tempfile import TemporaryDirectory
 
-    from aolink.cli import tables
+    from aolink.cli.tables import recordings as tables
     from aolink.recording import topics
     from aolink.recording.compare import compare as compare_recordings
     from aolink.recording.reader import check_is_side_of
@@ -373,8 +348,8 @@ def compare(
     with TemporaryDirectory(prefix="aolink-") as folder:
         if second is None:
             second = f"{folder}/{one.path.name}"
-            with progress_bar(stderr, one.n_frames) as tell:
-                write_reestimated(one, one.estimators, second, progress=lambda n: tell("estimate", n), as_recorded=True)
+            with progress("estimate", one.n_frames) as tell:
+                write_reestimated(one, one.estimators, second, progress=tell, as_recorded=True)
         two = open_recording(second)
         if two.side_of and not one.side_of:
             check_is_side_of(two, one)
@@ -382,9 +357,9 @@ def compare(
                 raise typer.BadParameter(f"{second} is a side file, which cannot take the place of {first}")
             topic = topic or [topics.estimate_topic(name) for name in two.estimators]
         total = sum(one.counts.values()) + sum(two.counts.values())
-        with progress_bar(stderr, total) as tell:
+        with progress("compare", total) as tell:
             found = compare_recordings(
-                one, two, relative=relative, absolute=absolute, only=topic or (), progress=lambda n: tell("compare", n)
+                one, two, relative=relative, absolute=absolute, only=topic or (), progress=tell
             )  # fmt: skip
         same_rig = one.rig.digest == two.rig.digest
         same = same_rig and all(each.same for each in found.values())
@@ -396,7 +371,7 @@ def compare(
                 stdout.print("the rig files differ")
         damage = [f"{each.path}: {each.damage}" for each in (one, two) if each.damage]
         for text in damage:
-            stderr.print(f"aolink: warning: {text}", markup=False)
+            warn(text)
         if accept and not same:
             if damage:
                 raise RecordingError(f"{damage[0]}: a damaged recording is not accepted; `aolink recover` it first")
@@ -415,15 +390,15 @@ def compare(
 @app.command(epilog="Example: aolink recover broken.mcap -o whole.mcap")
 def recover(
     file: FileArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    output: OutputOption,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Save the undamaged part of a damaged or unfinished recording. Exit code 1 if something was lost."""
     from aolink.recording.editing import recover as recover_recording
 
-    with progress_bar(stderr, None) as tell:
-        edited = recover_recording(file, output, overwrite=overwrite, progress=lambda n: tell("exposures", n))
+    with progress("exposures", None) as tell:
+        edited = recover_recording(file, output, overwrite=overwrite, progress=tell)
     _print_edited(edited, as_json)
     if edited.losses:
         raise typer.Exit(1)
@@ -432,7 +407,7 @@ def recover(
 @app.command(epilog="Example: aolink cut session.mcap --start 10 --end 20 -o part.mcap")
 def cut(
     file: FileArgument,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    output: OutputOption,
     start: CutTime = None,
     end: CutTime = None,
     overwrite: OverwriteOption = False,
@@ -441,10 +416,10 @@ def cut(
     """Copy the exposures between two times, with the commands that belong to them."""
     from aolink.recording.editing import cut as cut_recording
 
-    with progress_bar(stderr, None) as tell:
+    with progress("exposures", None) as tell:
         edited = cut_recording(
             file, output, start or 0.0, math.inf if end is None else end,
-            overwrite=overwrite, progress=lambda n: tell("exposures", n),
+            overwrite=overwrite, progress=tell,
         )  # fmt: skip
     _print_edited(edited, as_json)
 
@@ -452,22 +427,21 @@ def cut(
 @app.command(epilog="Example: aolink merge session-001.mcap session-002.mcap -o session.mcap")
 def merge(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="The parts of one session.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    output: OutputOption,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Join the parts of one session; messages that several of them hold are written once."""
     from aolink.recording.editing import merge as merge_recordings
 
-    with progress_bar(stderr, None) as tell:
-        edited = merge_recordings(files, output, overwrite=overwrite, progress=lambda n: tell("exposures", n))
+    with progress("exposures", None) as tell:
+        edited = merge_recordings(files, output, overwrite=overwrite, progress=tell)
     _print_edited(edited, as_json)
 
 
 def _print_edited(edited: Edited, as_json: bool) -> None:
     if as_json:
-        losses = [asdict(loss) for loss in edited.losses]
-        print(json.dumps({**asdict(edited), "path": str(edited.path), "losses": losses}))
+        print(json.dumps({**asdict(edited), "path": str(edited.path)}))
         return
     for loss in edited.losses:
         stdout.print(f"lost: {loss.text()}", markup=False)

@@ -11,8 +11,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperOption
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, stderr, stdout
-from aolink.cli.terminal import progress_bar
+from aolink.cli.common import JsonOption, OverwriteOption, app, check_measured, open_recording, progress, stdout
 from aolink.errors import RestorationError
 from aolink.files import check_target
 
@@ -93,14 +92,14 @@ def deblur(
 def _deblur_recording(
     file: Path, out: Path, estimator: str, method: str, *, overwrite: bool, as_json: bool
 ) -> None:  # fmt: skip
-    from aolink.cli import tables
+    from aolink.cli.tables import sessions as tables
     from aolink.recording.deblur import write_deblurred
 
     recording = open_recording(file)
-    with progress_bar(stderr, recording.n_frames) as tell:
+    with progress("deblur", recording.n_frames) as tell:
         summary = write_deblurred(
             recording, out, estimator=estimator, method=method, overwrite=overwrite,
-            workers=os.cpu_count() or 1, progress=lambda n: tell("deblur", n),
+            workers=os.cpu_count() or 1, progress=tell,
         )  # fmt: skip
     if as_json:
         print(json.dumps({"out": str(out), "estimator": estimator, "method": method, **tables.deblurred(summary)}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from enum import StrEnum
 from functools import partial
@@ -19,6 +19,7 @@ from aolink.cli.common import (
     EstimatorOption,
     FileArgument,
     JsonOption,
+    OutputOption,
     OverwriteOption,
     RigArgument,
     app,
@@ -27,8 +28,10 @@ from aolink.cli.common import (
     load_checked,
     open_recording,
     program,
+    progress,
     stderr,
     stdout,
+    warn,
 )
 from aolink.cli.films import (
     AtOption,
@@ -41,19 +44,21 @@ from aolink.cli.films import (
     film_settings,
 )
 from aolink.cli.terminal import ask, input_ended, progress_bar
-from aolink.errors import AolinkError, EstimatorError, RigError
+from aolink.errors import AolinkError, CalibrationError, EstimatorError, RigError
 from aolink.files import check_target, writing
-from aolink.signals import Interrupted, StopRequest, stop_after
+from aolink.signals import StopRequest, stop_after
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Sequence
 
-    from aolink.estimation import Estimate
-    from aolink.exposure import Exposure
+    import numpy as np
+    from numpy.typing import NDArray
+
     from aolink.importing.exposures import Settings
     from aolink.recording.reader import Recording
     from aolink.rig import Rig
     from aolink.session import Report
+    from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
 
@@ -152,22 +157,22 @@ def _write_first_rig(path: Path, source: Path, topic: str | None, settings: Sett
 
     check_target(path, overwrite=overwrite, suffix=".toml", error=RigError)
     film = open_film(source, topic)
-    with progress_bar(stderr, film.count) as tell:
-        text = first_rig(film, settings, path.stem, lambda done: tell("follow", done))
+    with progress("follow", film.count) as tell:
+        text = first_rig(film, settings, path.stem, tell)
     with writing(path, overwrite=overwrite, error=RigError) as partial:
         partial.write_text(text, encoding="utf-8")
     stdout.print(f"{path}: written from {film.name}; read it, then: {program()} rig {path} --check", markup=False)
 
 
 def _print_scan(loaded: Rig, as_json: bool) -> None:
-    from aolink.cli import tables
+    from aolink.cli.tables.rigs import exposure_scan as scan_table
     from aolink.estimation.exposure_scan import best, exposure_scan
 
     errors = exposure_scan(loaded)
     if as_json:
         print(json.dumps([vars(each) for each in errors]))
         return
-    stdout.print(tables.exposure_scan(loaded, errors))
+    stdout.print(scan_table(loaded, errors))
     steps = best(errors).exposure_steps
     stdout.print(f"least error of the path: timing.exposure_steps = {steps}, {steps * loaded.timing.fast_step_s:g} s")
 
@@ -195,21 +200,25 @@ def devices(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the serial ports and the drivers of this machine, or identify what is behind the given ports."""
-    from aolink.devices.discovery import Found, identify_port, list_ports
-    from aolink.devices.drivers import driver_names
+    """List the serial ports and the drivers of this machine with their devices, or identify what is behind ports."""
+    from aolink.devices.discovery import Found, find_drivers, identify_port, list_ports
 
     if not ports:
-        listed = list_ports()
+        listed, drivers = list_ports(), find_drivers()
         if as_json:
-            print(json.dumps([{"port": name, "description": text} for name, text in listed]))
-        for name, text in [] if as_json else listed:
+            serial = [{"port": name, "description": text} for name, text in listed]
+            print(json.dumps({"ports": serial, "drivers": [vars(each) for each in drivers]}))
+            return
+        for name, text in listed:
             stdout.print(f"{name}  {escape(text)}")
-        if not listed and not as_json:
+        if not listed:
             stdout.print("no serial ports on this machine; `aolink rig section-vi` makes a simulated pair")
-        if not as_json:
-            stdout.print(f"camera drivers: {', '.join(driver_names('camera'))}")
-            stdout.print(f"mirror drivers: {', '.join(driver_names('mirror'))}")
+        for each in drivers:
+            stdout.print(f"{each.kind} driver {each.name}{': ' if each.problem else ''}{escape(each.problem)}")
+            for lack in each.lacks:
+                stdout.print(f"    {lack}", style="dim")
+            for address, text in each.devices:
+                stdout.print(f"    found: {escape(address)}  {escape(text)}")
         return
     found: list[Found] = []
     failed: AolinkError | None = None
@@ -236,7 +245,7 @@ def record(
     rig: Annotated[
         str, typer.Option(metavar="RIG.toml", help="A rig file, or the name of a rig that comes with aolink.")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")],
+    output: OutputOption,
     camera: Annotated[
         str | None,
         typer.Option(
@@ -294,16 +303,16 @@ def record(
     get_ready(loaded, estimator or [])
     report = session.Report()
 
-    def progress(done: int) -> None:
+    def told(done: int) -> None:
         skipped = report.exposures_skipped.items()
-        tell("exposures", done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
+        tell(done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
 
-    with _live_view(loaded, estimator or [], shown=view) as watch:
-        with StopRequest().installed() as stop, progress_bar(stderr, exposures) as tell:
+    with _live_view(loaded, estimator or [], shown=view) as live:
+        with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
-                calibration=calibration or "", watch=watch, overwrite=overwrite, options=options, stop=stop,
-                progress=progress, report=report,
+                calibration=calibration or "", watch=live.show if live else None, overwrite=overwrite,
+                options=options, stop=stop, progress=told, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
     stop.raise_if_asked()
@@ -312,10 +321,10 @@ def record(
 
 
 def _print_session(report: Report, output: Path, as_json: bool) -> None:
-    from aolink.cli import tables
+    from aolink.cli.tables import sessions as tables
 
     for warning in report.warnings:
-        stderr.print(f"aolink: warning: {escape(warning)}")
+        warn(warning)
     if as_json:
         print(json.dumps(tables.session_as_json(report), allow_nan=False), flush=True)
     else:
@@ -326,18 +335,15 @@ def _print_session(report: Report, output: Path, as_json: bool) -> None:
         stdout.print(text, markup=False)
 
 
-@contextmanager
 def _live_view(
-    rig: Rig, estimators: Sequence[str], *, shown: bool
-) -> Iterator[Callable[[Exposure, Sequence[Estimate]], None] | None]:
-    """A function that shows a session's exposures, or None."""
+    rig: Rig, estimators: Sequence[str], true_scene: NDArray[np.uint16] | None = None, *, shown: bool
+) -> AbstractContextManager[LiveView | None]:
+    """What shows exposures in the viewer, or None."""
     if not shown:
-        yield None
-        return
+        return nullcontext()
     from aolink import viewing
 
-    with viewing.live_viewer(rig, estimators) as live:
-        yield live.show
+    return viewing.live_viewer(rig, estimators, true_scene)
 
 
 @app.command(
@@ -382,27 +388,24 @@ def replay(
         return
     if camera or mirror or output:
         raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
-    from contextlib import nullcontext
-
-    from aolink import viewing
-    from aolink.cli import tables
+    from aolink.cli.tables import scores as tables
     from aolink.estimation import Scorer
     from aolink.session.replay import replay as replay_recording
 
     scorers = {name: Scorer() for name in names}
-    viewer = viewing.live_viewer(recording.rig, names, recording.true_scene) if view else nullcontext()
-    with viewer as shown, StopRequest().installed() as stop:
+    live_view = _live_view(recording.rig, names, recording.true_scene, shown=view)
+    with live_view as live, StopRequest().installed() as stop:
         total = recording.n_frames
-        with progress_bar(stderr, total if end is None and not start else None) as tell:
+        with progress("replay", total if end is None and not start else None) as tell:
             series = replay_recording(
                 recording, names, rate=rate, start_s=start, end_s=math.inf if end is None else end, stop=stop
             )
             for number, (exposure, estimates) in enumerate(series, 1):
                 for estimate in estimates:
                     scorers[estimate.estimator].add(exposure, estimate)
-                if shown is not None:
-                    shown.show(exposure, estimates)
-                tell("replay", number)
+                if live is not None:
+                    live.show(exposure, estimates)
+                tell(number)
         scores = {name: scorer.result() for name, scorer in scorers.items()}
         if as_json:
             print(json.dumps(tables.scores_as_json(scores), allow_nan=False), flush=True)
@@ -428,33 +431,37 @@ def _replay_to_rig(
     as_json: bool,
 ) -> None:
     from aolink import session
-    from aolink.cli import tables
+    from aolink.cli.tables import recordings as tables
+    from aolink.cli.tables import sessions
     from aolink.recording.compare import compare
     from aolink.recording.reader import Recording
     from aolink.recording.topics import TOPICS
     from aolink.session.replay import RecordedCommands
 
     commands = RecordedCommands(recording)
-    with StopRequest().installed() as stop, progress_bar(stderr, commands.exposures) as tell:
+    with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
         report = session.record(
             recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
             inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
-            progress=lambda done: tell("exposures", done),
+            progress=tell,
         )  # fmt: skip
     for warning in report.warnings:
-        stderr.print(f"aolink: warning: {escape(warning)}")
+        warn(warning)
     only = [row.name for row in TOPICS if row.repeatable]
     found = compare(recording, Recording(output), only=only, relative_to_start=True)
     if as_json:
         print(json.dumps(tables.comparison_as_json(found, same_rig=True), allow_nan=False))
     else:
-        stdout.print(tables.session(report))
+        stdout.print(sessions.session(report))
         stdout.print(tables.comparison(found))
         stdout.print(f"{output}: {report.exposures} exposures, {report.ended}", markup=False)
     stop.raise_if_asked()
 
 
-@app.command(epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml")
+@app.command(
+    epilog="Examples: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml;"
+    " aolink calibrate --interaction --camera PORT --mirror PORT --rig my.toml -o interaction.npz"
+)
 def calibrate(
     rig: Annotated[
         str,
@@ -462,43 +469,67 @@ def calibrate(
             metavar="RIG.toml", help="The rig file to start from, or the name of a rig that comes with aolink."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The rig file to write.")],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FILE", help="The rig file to write; with --interaction a .npz file."),
+    ],
     files: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[FILE]...", help="Recordings made with `aolink record --calibration`."),
+        typer.Argument(metavar="[FILE]...", help="Recordings made with `aolink record --calibration`, or with pokes."),
     ] = None,
     camera: Annotated[
         str | None, typer.Option(metavar="PORT", help="Port of the camera, to record the frames now.")
     ] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror.")] = None,
     frames: Annotated[int, typer.Option(help="How many frames of each light to record.")] = 100,
+    interaction: Annotated[
+        bool, typer.Option("--interaction", help="Poke the mirror, and measure its interaction matrix instead.")
+    ] = False,
+    poke: Annotated[
+        float, typer.Option(min=1e-6, max=1.0, help="How far to poke, as a share of each input's range.")
+    ] = 0.1,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each input is pushed and pulled.")] = 2,
     keep: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the recordings in this folder.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
 
-    It takes recordings of dark, flat and still light, or records from the devices, asking for each in turn.
+    It takes recordings of dark, flat and still light, or records from the devices, asking for each in turn. With
+    --interaction it pushes and pulls each of the mirror's inputs, and writes where the spots went.
     """
     from shutil import rmtree
     from tempfile import mkdtemp
 
-    from aolink.cli import tables
     from aolink.jobs import calibrate
     from aolink.rig import load_rig
 
     loaded = load_rig(rig)
-    if (files and (camera or mirror)) or not (files or _are_driven(loaded, camera, mirror)):
-        raise typer.BadParameter("give recordings, or --camera and --mirror, or [devices] in the rig file")
-    check_target(output, overwrite=overwrite, sources=files or [])
+    if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
+        raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
+    suffix = ".npz" if interaction else ""
+    check_target(output, overwrite=overwrite, sources=files or [], suffix=suffix, error=CalibrationError)
     folder = keep or Path(mkdtemp(prefix="aolink-"))
     try:
-        if not files:
-            files = calibrate.record_frames(
+        if files:
+            paths = files
+        elif interaction:
+            paths = [folder / "pokes.mcap"]
+            folder.mkdir(parents=True, exist_ok=True)
+            with stop_after() as stop, progress("exposures", None) as tell:
+                calibrate.record_pokes(
+                    loaded, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
+                    progress=tell,
+                )  # fmt: skip
+        else:
+            paths = calibrate.record_frames(
                 loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
             )  # fmt: skip
-        result = calibrate.calibrate_recordings(loaded, calibrate.rig_text(rig, loaded), files or [])
+        if interaction:
+            _write_interaction(loaded, paths, output, overwrite=overwrite, as_json=as_json)
+        else:
+            _write_calibrated(loaded, rig, paths, output, overwrite=overwrite, as_json=as_json)
     except AolinkError as error:
         # Somebody has covered and lit the camera for them.
         if not keep and (made := sorted(map(str, folder.glob("*.mcap")))):
@@ -508,7 +539,18 @@ def calibrate(
     finally:
         if not keep:
             rmtree(folder, ignore_errors=True)
-    with writing(output, overwrite=overwrite, sources=files or []) as unfinished:
+    if not as_json:
+        stdout.print(f"written: {output}")
+
+
+def _write_calibrated(
+    loaded: Rig, rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool
+) -> None:  # fmt: skip
+    from aolink.cli.tables import rigs as tables
+    from aolink.jobs.calibrate import calibrate_recordings, rig_text
+
+    result = calibrate_recordings(loaded, rig_text(rig, loaded), paths)
+    with writing(output, overwrite=overwrite, sources=paths) as unfinished:
         unfinished.write_text(result.text, newline="")  # with the line ends that the rig file had
     if as_json:
         print(json.dumps(tables.calibration_as_json(result)))
@@ -516,41 +558,38 @@ def calibrate(
     stdout.print(tables.calibration(result))
     for note in result.calibration.notes:
         stdout.print(f"note: {escape(note)}")
-    stdout.print(f"written: {output}")
 
 
-@app.command(epilog="Example: aolink demo --rig section-vi-lively --out /tmp")
-def demo(
-    rig: Annotated[str, typer.Option(help="Rig file or name.")] = "section-vi",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder in which to make a new, dated one.")] = Path(),
-    exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
-    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
-    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
-) -> None:
-    """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
-    from aolink.cli import tables
-    from aolink.jobs.demo import new_folder, possible_estimators, run_demo
-    from aolink.recording.reader import Recording
+def _write_interaction(loaded: Rig, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool) -> None:
+    import numpy as np
 
-    loaded = load_checked(rig)
-    folder = new_folder(out)
-    get_ready(loaded, possible_estimators(loaded))
-    stop = StopRequest()
-    try:
-        with progress_bar(stderr, exposures) as tell:
-            result = run_demo(
-                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stoppable=stop.installed,
-                progress=tell,
-            )  # fmt: skip
-    except Interrupted as interrupted:
-        raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None
-    if not stop():
-        recording = Recording(result.recording)
-        estimates = {name: recording.estimates(name) for name in recording.estimators}
-        stdout.print(tables.scores(tables.score_all(recording, estimates)))
-    stdout.print(tables.session(result.report))
-    for line in tables.demo_summary(result, program()):
-        stdout.print(line, markup=False)
-    stop.raise_if_asked()
-    if result.differences:
-        raise typer.Exit(1)
+    from aolink.jobs.calibrate import interaction
+
+    if len(paths) != 1:
+        raise typer.BadParameter(f"an interaction matrix is of one recording, not of {len(paths)}")
+    found = interaction(loaded, paths[0])
+    measured = found.measured
+    with writing(output, overwrite=overwrite, sources=paths) as unfinished, unfinished.open("wb") as file:
+        np.savez(
+            file, matrix=measured.matrix, offset=measured.offset, singular_values=measured.singular_values,
+            residual_rms=measured.residual_rms, exposures=measured.exposures, plant_matrix=found.modelled.matrix,
+        )  # fmt: skip
+    facts = {
+        "outputs": len(measured.matrix),
+        "inputs": measured.matrix.shape[1],
+        "exposures": measured.exposures,
+        "singular_values": measured.singular_values.tolist(),
+        "condition": measured.condition,
+        "residual_rms": measured.residual_rms,
+        "difference_from_plant": found.difference,
+    }
+    if as_json:
+        print(json.dumps(facts))
+        return
+    largest, smallest = measured.singular_values[0], measured.singular_values[-1]
+    stdout.print(
+        f"{facts['outputs']} slopes for {facts['inputs']} inputs from {measured.exposures} exposures; singular values"
+        f" {largest:.4g} to {smallest:.4g}, condition {measured.condition:.3g}; residual {measured.residual_rms:.3g}"
+        f" slope units (rms)\nthe rig file's plant leaves {100 * found.difference:.3g} % of the matrix unexplained"
+        f"{': a sign, an order of inputs or a scale may be wrong' if found.difference > 0.5 else ''}"
+    )

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import select
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -14,16 +14,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from aolink.signals import Interrupted
 
 
-class Tell(Protocol):
-    """Moves a progress bar."""
-
-    def __call__(self, what: str, done: int, note: str = "") -> None:
-        """``note`` is shown behind the bar."""
-
-
 @contextmanager
-def progress_bar(console: Console, total: int | None) -> Iterator[Tell]:
-    """A progress bar on a terminal; gives ``tell(what, done)``."""
+def progress_bar(console: Console, total: int | None) -> Iterator[Callable[..., None]]:
+    """A progress bar on a terminal; gives ``tell(what, done, note="")``, whose note is shown behind the bar."""
     columns = (
         TextColumn("{task.description:>14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         TextColumn("{task.fields[note]}"),

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from serial.tools import list_ports as serial_ports
 
-from aolink.devices.drivers import NATIVE, Kind, driver_names, load_driver
+from aolink.devices.drivers import KINDS, NATIVE, Kind, driver_names, load_driver
 from aolink.devices.identity import identify
 from aolink.devices.simple import Lacks
 from aolink.errors import AolinkError
@@ -57,8 +57,7 @@ def find_drivers() -> list[DriverFound]:
 
     A driver looks for its devices if its module has a function ``discover()``. None is opened.
     """
-    kinds: tuple[Kind, ...] = ("camera", "mirror")
-    return [_find(kind, name) for kind in kinds for name in driver_names(kind)]
+    return [_find(kind, name) for kind in KINDS for name in driver_names(kind)]
 
 
 def _find(kind: Kind, name: str) -> DriverFound:

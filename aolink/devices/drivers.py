@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from importlib.metadata import EntryPoint
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.extensions import installed, loaded
@@ -14,6 +14,7 @@ from aolink.rig import Rig
 from aolink.rig.device_tables import DeviceTable
 
 Kind = Literal["camera", "mirror"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 NATIVE = "native"
 """The driver of devices that speak aolink's packets; its only key is ``port``."""
 
@@ -33,14 +34,20 @@ def open_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Any:
     RigError
         The driver does not take the keys that the table has.
     """
+    make = check_driver(kind, table, rig)
+    with calling(kind, "when it was opened"):
+        return make(rig, **table.options)
+
+
+def check_driver(kind: Kind, table: DeviceTable, rig: Rig) -> Callable[..., Any]:
+    """The class of the driver that a rig file names, whose keys fit; nothing is opened. Raises as `open_driver`."""
     make = load_driver(kind, table.driver)
     try:
         with suppress(ValueError):  # one that is not written in Python may have no signature
             inspect.signature(make).bind(rig, **table.options)
     except TypeError as error:
         raise RigError(f"devices.{kind}: the driver {table.driver} cannot take these keys: {error}") from None
-    with calling(kind, "when it was opened"):
-        return make(rig, **table.options)
+    return make
 
 
 @contextmanager

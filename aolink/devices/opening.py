@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
-from aolink.devices.drivers import NATIVE, Kind, driver_names, open_driver
+from aolink.devices.drivers import KINDS, NATIVE, Kind, driver_names, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import check_against_rig, check_kind, identify
@@ -23,8 +23,6 @@ from aolink.rig import Rig
 from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.port import SerialPort
-
-_KINDS: tuple[Kind, Kind] = ("camera", "mirror")
 
 
 @contextmanager
@@ -51,7 +49,7 @@ def open_devices(
     RigError
         The rig file names no driver for a device, or wrong keys for it.
     """
-    given = {kind: _table(rig, kind, port) for kind, port in zip(_KINDS, (camera_port, mirror_port), strict=True)}
+    given = {kind: _table(rig, kind, port) for kind, port in zip(KINDS, (camera_port, mirror_port), strict=True)}
     tables = {kind: table for kind, table in given.items() if table is not None}
     if "camera" not in tables:
         raise RigError(

@@ -7,7 +7,6 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.batch import Batch, batches
 from aolink.estimation.estimate import Estimate
@@ -15,6 +14,7 @@ from aolink.estimation.estimator import Estimator
 from aolink.estimation.options import Engine
 from aolink.estimation.registry import make_estimator
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 
 _MOST_SKIPPED_STEPS = 100_000
@@ -29,7 +29,7 @@ class SkippedInputs:
     """
 
     def __init__(self) -> None:
-        self._rows: deque[NDArray[np.float64]] = deque()
+        self._rows: deque[FloatArray] = deque()
         self._steps = 0
 
     def skip(self, exposure: Exposure) -> None:

@@ -9,14 +9,12 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.model.exposure_model import path_from_coefficients
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.plain import plain_data
-
-FloatArray = NDArray[np.float64]
 
 
 class Status(enum.IntEnum):

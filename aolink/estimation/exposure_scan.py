@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.errors import EstimatorError
@@ -20,12 +19,11 @@ from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.plant.alike import MANY_STATES
 from aolink.plant.lifting import lift
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 _MOST_OUTPUTS = 256
 _LONGEST = 20_000

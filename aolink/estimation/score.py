@@ -9,13 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,17 +17,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import AlignmentError, Estimate, Status
-from aolink.estimation.model.base import by_axis
+from aolink.estimation.model.base import over_steps
 from aolink.exposure import Exposure
 from aolink.numerics import batched
-from aolink.plant.lifting import input_response, lift
+from aolink.numerics.arrays import FloatArray
+from aolink.plant.lifting import lift
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
 
 
 def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
@@ -112,13 +110,11 @@ def _corrected(
 def _gap(plant: Plant, before: Exposure, after: Exposure) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Transition, noise and response to the inputs of the fast steps between two exposures."""
     steps = max(0, after.first_step - before.first_step - before.n_steps)
-    transition, noise = lift(plant, steps)
     if not steps:
-        return transition, noise, np.zeros((plant.axes, plant.n_states))
+        return *lift(plant, 0), np.zeros((plant.axes, plant.n_states))
     known = after.lead_inputs[-steps:]
     held = np.tile(before.inputs[-1], (steps - len(known), 1))
-    _, kick = input_response(plant, by_axis(plant, np.concatenate([held, known])))
-    return transition, noise, kick
+    return over_steps(plant, np.concatenate([held, known]))
 
 
 def _without_negative(covariance: FloatArray) -> FloatArray:

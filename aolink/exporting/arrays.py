@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import ExportError
-from aolink.exporting.common import Progress, clock_of, no_progress, time_ns, together
+from aolink.exporting.common import Progress, clock_of, facts, needed, no_progress, time_ns, together
 from aolink.exporting.series import Series
 from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 _MOST_BYTES = 8 << 30
-"""More is not put into memory at once."""
+"""More is not put into memory at once, nor more than a quarter of what the machine has."""
 _SLOPE = "slope unit"
 
 
@@ -32,85 +36,59 @@ class Variable:
     unit: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Row:
     """How one variable is got."""
 
-    dims: tuple[str, ...]
-    """Besides time, and estimator."""
-    get: Callable[[Any], Any]
     text: str
+    dims: tuple[str, ...] = ()
+    """Besides time, and estimator."""
     unit: str = ""
+    get: Callable[[Any], Any] | None = None
+    """By its own name where None."""
     in_words: bool = False
 
+    def of(self, name: str, source: Any) -> Any:
+        return getattr(source, name) if self.get is None else self.get(source)
 
+
+_FRAME, _STATE, _PATH = ("row", "column"), ("axis", "state"), ("output", "step")
 EXPOSURE = {
-    "frame_id": _Row(dims=(), get=lambda e: e.frame_id, text="the camera's own count of its frames"),
-    "first_step": _Row(dims=(), get=lambda e: e.first_step, text="fast step at which the exposure starts"),
-    "n_steps": _Row(dims=(), get=lambda e: e.n_steps, text="fast steps in the exposure"),
-    "start_offset": _Row(
-        dims=(), get=lambda e: e.start_offset, text="how far into its first fast step the exposure starts", unit="step"
-    ),
-    "device_start_ns": _Row(dims=(), get=lambda e: e.device_start_ns, text="start, camera's clock", unit="ns"),
-    "device_end_ns": _Row(dims=(), get=lambda e: e.device_end_ns, text="end, camera's clock", unit="ns"),
-    "host_start_ns": _Row(dims=(), get=lambda e: e.host_start_ns, text="start, host's clock; 0: not known", unit="ns"),
-    "host_receive_ns": _Row(
-        dims=(), get=lambda e: e.host_receive_ns, text="when the host had the frame, host's clock", unit="ns"
-    ),
-    "clock_sigma_ns": _Row(
-        dims=(), get=lambda e: e.clock_sigma_ns, text="standard deviation of host_start_ns", unit="ns"
-    ),
-    "chunks_lost": _Row(dims=(), get=lambda e: e.chunks_lost, text="chunks of the frame that never arrived"),
-    "inputs_assumed": _Row(
-        dims=(), get=lambda e: e.inputs_assumed, text="steps of inputs and lead inputs without the mirror's report"
-    ),
-    "lead_steps": _Row(
-        dims=(), get=lambda e: len(e.lead_inputs), text="fast steps between the exposure before and this one"
-    ),
-    "pixels": _Row(dims=("row", "column"), get=lambda e: e.pixels, text="the frame", unit="count"),
-    "mask": _Row(dims=("row", "column"), get=lambda e: e.mask, text="whether the pixel arrived"),
-    "inputs": _Row(
-        dims=("step", "input"), get=lambda e: e.inputs, text="what the mirror held in each fast step", unit="input unit"
-    ),
+    "frame_id": _Row("the camera's own count of its frames"),
+    "first_step": _Row("fast step at which the exposure starts"),
+    "n_steps": _Row("fast steps in the exposure"),
+    "start_offset": _Row("how far into its first fast step the exposure starts", unit="step"),
+    "device_start_ns": _Row("start, camera's clock", unit="ns"),
+    "device_end_ns": _Row("end, camera's clock", unit="ns"),
+    "host_start_ns": _Row("start, host's clock; 0: not known", unit="ns"),
+    "host_receive_ns": _Row("when the host had the frame, host's clock", unit="ns"),
+    "clock_sigma_ns": _Row("standard deviation of host_start_ns", unit="ns"),
+    "chunks_lost": _Row("chunks of the frame that never arrived"),
+    "inputs_assumed": _Row("steps of inputs and lead inputs without the mirror's report"),
+    "lead_steps": _Row("fast steps between the exposure before and this one", get=lambda e: len(e.lead_inputs)),
+    "pixels": _Row("the frame", _FRAME, "count"),
+    "mask": _Row("whether the pixel arrived", _FRAME),
+    "inputs": _Row("what the mirror held in each fast step", ("step", "input"), "input unit"),
 }
 TRUTH = {
-    "truth_start_state": _Row(
-        dims=("axis", "state"), get=lambda t: t.start_state, text="true state at the start", unit="plant's unit"
-    ),
-    "truth_end_state": _Row(
-        dims=("axis", "state"), get=lambda t: t.end_state, text="true state a step after the end", unit="plant's unit"
-    ),
-    "truth_path": _Row(dims=("output", "step"), get=lambda t: t.path, text="true path", unit=_SLOPE),
+    "truth_start_state": _Row("true state at the start", _STATE, "plant's unit", lambda t: t.start_state),
+    "truth_end_state": _Row("true state a step after the end", _STATE, "plant's unit", lambda t: t.end_state),
+    "truth_path": _Row("true path", _PATH, _SLOPE, lambda t: t.path),
 }
 ESTIMATE = {
-    "status": _Row(
-        dims=(), get=lambda e: e.status.name, text="what became of the measurement; empty: no estimate", in_words=True
-    ),
-    "reason": _Row(dims=(), get=lambda e: e.reason, text="why the status is not OK", in_words=True),
-    "start_state": _Row(
-        dims=("axis", "state"), get=lambda e: e.start_state, text="state at the start", unit="plant's unit"
-    ),
-    "start_state_sd": _Row(
-        dims=("axis", "state"), get=lambda e: _sd(e.start_covariance), text="its standard deviation",
-        unit="plant's unit",
-    ),
-    "end_state": _Row(
-        dims=("axis", "state"), get=lambda e: e.end_state, text="state one fast step after the end", unit="plant's unit"
-    ),
-    "end_state_sd": _Row(
-        dims=("axis", "state"), get=lambda e: _sd(e.end_covariance), text="its standard deviation", unit="plant's unit"
-    ),
-    "path": _Row(dims=("output", "step"), get=lambda e: e.path, text="output at each fast step", unit=_SLOPE),
-    "path_sd": _Row(dims=("output", "step"), get=lambda e: e.path_sd, text="its standard deviation", unit=_SLOPE),
-    "path_rms": _Row(
-        dims=("axis",), get=lambda e: estimate_scalars(e)["path_rms"], text="RMS of the path about its mean",
-        unit=_SLOPE,
-    ),
+    "status": _Row("what became of the measurement; empty: no estimate", get=lambda e: e.status.name, in_words=True),
+    "reason": _Row("why the status is not OK", in_words=True),
+    "start_state": _Row("state at the start", _STATE, "plant's unit"),
+    "start_state_sd": _Row("its standard deviation", _STATE, "plant's unit", lambda e: _sd(e.start_covariance)),
+    "end_state": _Row("state one fast step after the end", _STATE, "plant's unit"),
+    "end_state_sd": _Row("its standard deviation", _STATE, "plant's unit", lambda e: _sd(e.end_covariance)),
+    "path": _Row("output at each fast step", _PATH, _SLOPE),
+    "path_sd": _Row("its standard deviation", _PATH, _SLOPE),
+    "path_rms": _Row("RMS of the path about its mean", ("axis",), _SLOPE, lambda e: estimate_scalars(e)["path_rms"]),
     "nis": _Row(
-        dims=("axis",), get=lambda e: estimate_scalars(e)["nis"],
-        text="normalised innovation squared; NaN: no measurement",
+        "normalised innovation squared; NaN: no measurement", ("axis",), get=lambda e: estimate_scalars(e)["nis"]
     ),
-}  # fmt: skip
+}
 
 
 def arrays(
@@ -141,7 +119,7 @@ def arrays(
     columns: dict[str, list[Any]] = {name: [] for name in (*EXPOSURE, *TRUTH)}
     by_estimator: dict[str, list[list[Any]]] = {name: [[] for _ in names] for name in ESTIMATE}
     times: list[int] = []
-    leads, scenes = [], []
+    leads, scenes, slopes = [], [], []
     first: Exposure | None = None
     clock = ""
     for exposure, estimates in together(series, names, progress):
@@ -151,13 +129,14 @@ def arrays(
         times.append(time_ns(series, exposure, clock))
         leads.append(exposure.lead_inputs)
         scenes.append(exposure.scene)
+        slopes.append(exposure.slopes)
         for name, row in EXPOSURE.items():
-            columns[name].append(row.get(exposure))
+            columns[name].append(row.of(name, exposure))
         for name, row in TRUTH.items():
-            columns[name].append(None if exposure.truth is None else row.get(exposure.truth))
+            columns[name].append(None if exposure.truth is None else row.of(name, exposure.truth))
         for name, row in ESTIMATE.items():
             for column, estimate in zip(by_estimator[name], estimates, strict=True):
-                column.append(None if estimate is None else row.get(estimate))
+                column.append(None if estimate is None else row.of(name, estimate))
     found = {
         "time": Variable(
             dims=("time",), values=np.array(times).astype("datetime64[ns]"),
@@ -171,6 +150,12 @@ def arrays(
         unit="input unit",
     )  # fmt: skip
     found |= _scenes(scenes)
+    if any(each is not None for each in slopes):
+        none = np.full(series.rig.n_outputs, np.nan)
+        found["slopes"] = Variable(
+            dims=("time", "output"), values=np.array([none if each is None else each for each in slopes]),
+            text="slopes of other software, where there are no pixels", unit=_SLOPE,
+        )  # fmt: skip
     sizes = {
         "axis": series.rig.plant.axes, "state": series.rig.plant.n_states, "output": series.rig.n_outputs,
         "step": found["inputs"].values.shape[1],
@@ -236,8 +221,29 @@ def _check_size(series: Series, n_estimators: int) -> None:
     numbers += 4 * n_estimators * rig.plant.axes * rig.plant.n_states
     pixels = int(np.prod(rig.sensor.shape)) + (int(np.prod(rig.scene.shape)) if rig.scene else 0)
     size = len(series) * (8 * numbers + 3 * pixels)
-    if size > _MOST_BYTES:
+    most = min(_MOST_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 4)
+    if size > most:
         raise ExportError(
-            f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {_MOST_BYTES >> 30} are allowed:"
+            f"{series.path} would take {size / 2**30:.0f} GiB of memory, at most {most / 2**30:.1f} are allowed here:"
             " take fewer estimators or a part of it (`aolink cut`), or a table (.csv, .parquet), written row by row"
         )
+
+
+def to_xarray(series: Series, estimators: Sequence[str] | None = None, progress: Progress = no_progress) -> xr.Dataset:
+    """What `Series.to_xarray` gives. Raises as `arrays`, and ExportError where xarray is missing."""
+    xarray = needed("xarray", "tables", "a dataset")
+    found = arrays(series, estimators, progress)
+    coordinates = ("time", "frame_id", "estimator")
+    parts = {
+        name: (each.dims, each.values, {"long_name": each.text} | ({"units": each.unit} if each.unit else {}))
+        for name, each in found.items()
+    }
+    step_s = np.arange(found["inputs"].values.shape[1]) * series.rig.timing.fast_step_s
+    parts["rig_toml"] = ((), np.array(series.rig.toml), {"long_name": "the rig file"})
+    parts["step"] = (("step",), step_s, {"long_name": "time since the exposure's first fast step", "units": "s"})
+    dataset: xr.Dataset = xarray.Dataset(
+        {name: each for name, each in parts.items() if name not in (*coordinates, "step")},
+        coords={name: parts[name] for name in (*coordinates, "step") if name in parts},
+        attrs=facts(series),
+    )
+    return dataset

@@ -33,21 +33,10 @@ def needed(module: str, extra: str, what: str) -> Any:
 def together(
     series: Series, names: Sequence[str], progress: Progress = no_progress
 ) -> Iterator[tuple[Exposure, list[Estimate | None]]]:
-    """The exposures with the estimates of each by the estimators ``names``, None where there is none.
-
-    Raises ExportError where there is no exposure.
-    """
-    left = [series.iter_estimates(name) for name in names]
-    nexts = [next(each, None) for each in left]
+    """What `Series.with_estimates` gives. Raises ExportError where there is no exposure."""
     number = 0
-    for number, exposure in enumerate(series.exposures(), 1):
-        found: list[Estimate | None] = []
-        for k, estimate in enumerate(nexts):
-            its = estimate is not None and estimate.frame_id == exposure.frame_id
-            found.append(estimate if its else None)
-            if its:
-                nexts[k] = next(left[k], None)
-        yield exposure, found
+    for number, both in enumerate(series.with_estimates(names), 1):
+        yield both
         progress(number)
     if not number:
         raise ExportError(f"{series.path} holds no exposure to export; `aolink info` says what it holds")

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import ExportError
-from aolink.exporting.arrays import arrays
+from aolink.exporting.arrays import arrays, to_xarray
 from aolink.exporting.common import Progress, facts, needed, no_progress
-from aolink.exporting.dataset import to_xarray
 from aolink.exporting.series import Series
 from aolink.exporting.table import columns, rows
 from aolink.exporting.telemetry import write_fits

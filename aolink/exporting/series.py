@@ -70,6 +70,15 @@ class Series(ABC):
         self.named([name])
         return list(self.iter_estimates(name))
 
+    def with_estimates(self, names: Sequence[str]) -> Iterator[tuple[Exposure, list[Estimate | None]]]:
+        """The exposures, each with its estimates by the estimators ``names``: None where there is none."""
+        left = [self.iter_estimates(name) for name in names]
+        ahead = [next(each, None) for each in left]
+        for exposure in self.exposures():
+            its = [each if each is not None and each.frame_id == exposure.frame_id else None for each in ahead]
+            ahead = [old if its[k] is None else next(left[k], None) for k, old in enumerate(ahead)]
+            yield exposure, its
+
     def named(self, estimators: Sequence[str] | None) -> list[str]:
         """The names themselves, or those of all estimators for None. Raises RecordingError for one that is not here."""
         for name in estimators or ():
@@ -108,7 +117,7 @@ class Series(ABC):
         ExportError
             There is no exposure, the exposures have different sizes, it would be too large, or xarray is missing.
         """
-        from aolink.exporting.dataset import to_xarray
+        from aolink.exporting.arrays import to_xarray
 
         return to_xarray(self, estimators)
 

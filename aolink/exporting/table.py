@@ -50,10 +50,9 @@ def columns(series: Series, names: Sequence[str], *, lists: bool = False) -> lis
     inputs, states = range(1, plant.n_inputs + 1), range(1, plant.n_states + 1)
     outputs = range(1, plant.n_outputs + 1)
     found = [Column(name, "text") for name in ("recording", "rig")]
-    found += [Column("frame_id", "integer"), Column("time", "time")]
-    found += [Column(name, "integer") for name in ("axis", "first_step", "n_steps")]
-    found += [Column(name, "number") for name in ("start_offset", "clock_sigma_ns")]
-    found += [Column(name, "integer") for name in _COUNTED]
+    found += [Column("frame_id", "integer"), Column("time", "time"), Column("axis", "integer")]
+    found += [Column(name, kind) for name, kind in _OF_EXPOSURE.items() if name != "frame_id"]
+    found.append(Column("lead_steps", "integer"))
     found += [Column(f"input_{j}_mean", "number") for j in inputs]
     path = [Column(f"path_{j}_mean", "number") for j in outputs] + [Column("path_rms", "number")]
     if series.has_truth:
@@ -72,12 +71,6 @@ def columns(series: Series, names: Sequence[str], *, lists: bool = False) -> lis
     return found + [Column(f"{name}_{each.name}", each.kind) for name in names for each in each_has]
 
 
-_COUNTED = (
-    "device_start_ns", "device_end_ns", "host_start_ns", "host_receive_ns",
-    "chunks_lost", "inputs_assumed", "lead_steps",
-)  # fmt: skip
-
-
 def rows(
     series: Series, names: Sequence[str], *, lists: bool = False, progress: Progress = no_progress
 ) -> Iterator[dict[str, Any]]:
@@ -93,7 +86,7 @@ def rows(
             "rig": series.rig.name,
             "time": time_ns(series, exposure, clock),
             "lead_steps": len(exposure.lead_inputs),
-        } | {name: getattr(exposure, name) for name in _SHARED}
+        } | {name: getattr(exposure, name) for name in _OF_EXPOSURE}
         inputs = exposure.inputs.reshape(exposure.n_steps, plant.axes, -1).swapaxes(0, 1)
         truth = {} if exposure.truth is None else _of_truth(exposure.truth, plant.axes, lists)
         of_each = [
@@ -111,10 +104,11 @@ def rows(
             yield row
 
 
-_SHARED = (
-    "frame_id", "first_step", "n_steps", "start_offset", "clock_sigma_ns", "device_start_ns", "device_end_ns",
-    "host_start_ns", "host_receive_ns", "chunks_lost", "inputs_assumed",
-)  # fmt: skip
+_OF_EXPOSURE: dict[str, Kind] = {
+    "frame_id": "integer", "first_step": "integer", "n_steps": "integer", "start_offset": "number",
+    "clock_sigma_ns": "number", "device_start_ns": "integer", "device_end_ns": "integer", "host_start_ns": "integer",
+    "host_receive_ns": "integer", "chunks_lost": "integer", "inputs_assumed": "integer",
+}  # fmt: skip
 
 
 def _of_truth(truth: Truth, axes: int, lists: bool) -> dict[str, ByAxis]:

@@ -23,7 +23,7 @@ from aolink.exporting.common import Progress, check_frame, facts, needed
 from aolink.exporting.series import Series
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
-from aolink.optics.sensor import SpotSensor
+from aolink.optics.sensor import BaseSensor, SpotSensor
 
 FloatArray = NDArray[np.float64]
 
@@ -61,13 +61,16 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
     telescope = aot.MainTelescope(uid="NONE")  # AOT asks for one, and for a source
     source = aot.NaturalGuideStar(uid="SPOT")
     sensor, pixels = rig.sensor, found["pixels"].values
-    spots, centres = _centres(series, pixels, found["mask"].values)
+    if "slopes" in found:
+        spots, centres = _slopes(sensor, found["slopes"].values)
+    else:
+        spots, centres = _centres(series, pixels, found["mask"].values)
     shape, lit = (sensor.grid, sensor.lit) if isinstance(sensor, SpotSensor) else ((1, 1), [0])
     grid = np.full(shape, -1)
     grid.flat[lit] = np.arange(spots)
     camera = aot.Detector(
         uid="CAMERA",
-        pixel_intensities=aot.Image("PIXELS", pixels, unit="adu", time=frames),
+        pixel_intensities=None if "slopes" in found else aot.Image("PIXELS", pixels, unit="adu", time=frames),
         integration_time=rig.timing.exposure_steps * step_s,
         frame_rate=1 / (rig.timing.frame_period_steps * step_s),
     )
@@ -80,7 +83,7 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
         mask_offsets=[aot.Coordinates(0, 0)],
         subaperture_size=float(sensor.window[1]) if isinstance(sensor, SpotSensor) else None,
         detector=camera,
-        centroiding_algorithm="centre of gravity of the window",
+        centroiding_algorithm=None if "slopes" in found else "centre of gravity of the window",
     )
     mirrors = {1: aot.LinearStage, 2: aot.TipTiltMirror}
     sized = {} if rig.n_inputs in mirrors else {"n_valid_actuators": rig.n_inputs}
@@ -129,6 +132,13 @@ def _centres(series: Series, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
     if not isinstance(sensor, SpotSensor):
         return 1, np.stack([found, np.full_like(found, np.nan)], axis=1)
     return sensor.spots, found.reshape(len(pixels), sensor.spots, 2).swapaxes(1, 2)
+
+
+def _slopes(sensor: BaseSensor, slopes: FloatArray) -> tuple[int, FloatArray]:
+    """Number of spots, and recorded slopes as the format has them, (frames, 2, spots); NaN where there is no second."""
+    if isinstance(sensor, SpotSensor):
+        return sensor.spots, slopes.reshape(len(slopes), sensor.spots, 2).swapaxes(1, 2)
+    return slopes.shape[1], np.stack([slopes, np.full_like(slopes, np.nan)], axis=1)
 
 
 def _commands(found: Mapping[str, Variable]) -> tuple[NDArray[np.int64], FloatArray]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,8 @@ FloatArray = NDArray[np.float64]
 
 _CLOSE = 0.01
 """Rates and exposure times that differ by a smaller share are the same."""
+_FASTER = 0.75
+"""Commands that follow each other after less of a fast step than this are too many for it."""
 _IRREGULAR = 0.25
 """Frame periods by which a frame may come too early or too late."""
 
@@ -147,10 +149,12 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
         notes.append(f"nothing says the frame rate: that of the rig file is assumed, {own:.6g} frames/s")
     elif abs(rate / own - 1) > _CLOSE:
         each = f"{K} frames" if K > 1 else "a frame"
+        whole = round(rate / own)
+        summed = f"give --sum {whole} as the rig file has it, " if K == 1 < whole == timing.exposure_steps else ""
         raise ImportingError(
             f"{film.name} has {rate:.6g} frames/s, and the rig file {rig.name} wants {each} every"
-            f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: change its [timing], or give"
-            " the right --rate"
+            f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: {summed}change its"
+            " [timing], or give the right --rate"
         )
     if K > 1 and (timing.exposure_steps, timing.frame_period_steps) != (K, K):
         raise ImportingError(
@@ -196,6 +200,9 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     account.notes = (*film.notes, *notes)
     if film.nonlinear and settings.gamma == 1.0:
         account.notes += (f"light may not be linear: {film.nonlinear}; --gamma 2.2 undoes the usual curve",)
+    if film.slopes:
+        yield from _of_slopes(film, rig, settings, periods, account)
+        return
     if settings.track:
         from aolink.importing.tracking import tracked
 
@@ -211,15 +218,45 @@ def imported(film: Film, rig: Rig, settings: Settings, account: Account) -> Iter
     offset = rig.sensor.black_level if settings.invert or settings.subtract_median else 0.0
     scale = settings.scale or default_scale(film, rig)
     inputs = _Inputs(film, rig, settings, periods)
+    account.notes += inputs.notes
     for group in grouped(film, settings.frames_per_exposure, periods):
         each = [light.of(frame) for frame in group.frames]
         mean = np.mean([one for one, _ in each], axis=0)
+        if settings.scale is None and film.dtype.kind == "f" and mean.max() > 1.0:
+            raise ImportingError(
+                f"{film.name} has floating-point values up to {mean.max():.6g}, where 1.0 would be full scale: say with"
+                " --scale how many counts a value of one is"
+            )
         usable = ~np.any([bad for _, bad in each], axis=0)
         pixels, mask = counts_of(offset + scale * mean, usable, rig, account)
         account.frames += len(each)
         account.exposures += 1
         frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
         yield ImportedExposure(frame=frame, inputs=inputs.until(frame.last_step + 1))
+
+
+def _of_slopes(
+    film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64], account: Account
+) -> Iterator[ImportedExposure]:
+    """The exposures of a film without pictures: every pixel of theirs is missing."""
+    if settings.track or settings.invert or settings.subtract_median or settings.gamma != 1.0:
+        raise ImportingError(
+            f"{film.name} has slopes and no pictures: --track, --invert, --background and --gamma need pixels"
+        )
+    if film.shape[1] != rig.n_outputs:
+        raise ImportingError(
+            f"{film.name} has {film.shape[1]} slopes in each frame, the rig file {rig.name} {rig.n_outputs}: change its"
+            " [plant] and [sensor]"
+        )
+    pixels, mask = np.zeros(rig.sensor.shape, np.uint16), np.zeros(rig.sensor.shape, np.bool_)
+    inputs = _Inputs(film, rig, settings, periods)
+    account.notes += inputs.notes
+    for group in grouped(film, settings.frames_per_exposure, periods):
+        slopes = np.array(group.frames, dtype=np.float64).mean(axis=0)[0] * (settings.scale or 1.0)
+        account.frames += len(group.frames)
+        account.exposures += 1
+        frame = rig_frame(film, rig, settings, group.first_period // settings.frames_per_exposure, pixels, mask)
+        yield ImportedExposure(frame=replace(frame, slopes=slopes), inputs=inputs.until(frame.last_step + 1))
 
 
 def default_scale(film: Film, rig: Rig) -> float:
@@ -266,6 +303,8 @@ class _Inputs:
 
     def __init__(self, film: Film, rig: Rig, settings: Settings, periods: NDArray[np.int64]) -> None:
         self._rows, self._park, self._next = film.inputs, rig.mirror.park, 0
+        self.notes: tuple[str, ...] = ()
+        """What a user should know of steps whose inputs are not known."""
         if film.inputs is None:
             return
         if film.inputs.shape[1] != rig.n_inputs:
@@ -276,7 +315,9 @@ class _Inputs:
         timing, K = rig.timing, settings.frames_per_exposure
         last = int(periods[-1]) * (timing.frame_period_steps // K)  # first step of the last frame
         end = last + (timing.exposure_steps if K == 1 else 1)
-        if len(film.inputs) == film.count:  # one for each frame, held until the next
+        if film.input_times_ns is not None:
+            self._rows, self.notes = self._at_times(film.inputs, film.input_times_ns, film.name, rig, end)
+        elif len(film.inputs) == film.count:  # one for each frame, held until the next
             steps = np.diff(periods, append=periods[-1] + 1) * (timing.frame_period_steps // K)
             self._rows = np.repeat(film.inputs, steps, axis=0)
         elif len(film.inputs) < end:
@@ -284,6 +325,30 @@ class _Inputs:
                 f"{film.name} has inputs of {len(film.inputs)} steps: give one for each of its {film.count} frames, or"
                 f" one for each of its {end} fast steps"
             )
+
+    def _at_times(
+        self, rows: FloatArray, times_ns: NDArray[np.int64], name: str, rig: Rig, end: int
+    ) -> tuple[FloatArray, tuple[str, ...]]:
+        """The rows in the steps 0 .. end - 1, each from the step that its time is nearest to until the next one's."""
+        first = np.rint(times_ns / rig.timing.fast_step_ns).astype(np.int64)
+        period = float(np.median(np.diff(times_ns))) / 1e9 if len(rows) > 1 else np.inf
+        if period < _FASTER * rig.timing.fast_step_s:
+            raise ImportingError(
+                f"{name} has a command every {period:.6g} s, the rig file {rig.name} a fast step every"
+                f" {rig.timing.fast_step_s:.6g} s, which holds only one: change timing.fast_step_s"
+            )
+        held = np.searchsorted(first, np.arange(end), side="right") - 1
+        known = np.where((held >= 0)[:, None], rows[np.maximum(held, 0)], self._park)
+        early, late = int(np.count_nonzero(first < 0)), int(np.count_nonzero(first >= end))
+        unknown = int(np.count_nonzero(held < 0))
+        notes = []
+        if early or late:
+            notes.append(f"{early} commands before the first exposure and {late} after the last are left out")
+        if replaced := int(np.count_nonzero(np.diff(first) < 1)):
+            notes.append(f"{replaced} commands are left out: the next one came in the same fast step")
+        if unknown:
+            notes.append(f"the first command comes {unknown} fast steps after the first exposure: parked until then")
+        return known, tuple(notes)
 
     def until(self, end: int) -> FloatArray:
         """Inputs of the steps from where the last call ended, (steps, n_inputs)."""

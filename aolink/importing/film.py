@@ -37,6 +37,11 @@ class Film:
     """When each exposure began, ns from any beginning, where the file says it, (count,)."""
     inputs: NDArray[np.float64] | None = None
     """What the mirror held in each fast step, where the file has it, (steps, n_inputs)."""
+    input_times_ns: NDArray[np.int64] | None = None
+    """When each row of ``inputs`` was put out, to be held until the next; ns from the start of the first exposure.
+    None: there is a row for each frame, or for each fast step from the first exposure on."""
+    slopes: bool = False
+    """Whether there are no pictures, but slopes alone: a frame is then one row of them, x and y of each spot."""
     nonlinear: str = ""
     """Why pixel values may not be proportional to light; empty where nothing speaks against it."""
     notes: tuple[str, ...] = field(default=())

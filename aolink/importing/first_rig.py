@@ -146,6 +146,8 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
     ImportingError
         There are not so many objects, or nothing says the frame rate.
     """
+    if film.slopes:
+        raise ImportingError(f"{film.name} has slopes and no pictures: a first rig file is made from pictures")
     if not settings.track:
         raise ImportingError("a first rig file is about objects in the film: say how many with --track N")
     objects = find_objects(film, settings)

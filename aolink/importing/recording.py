@@ -49,11 +49,10 @@ def import_film(
             f"{film.name} has {film.count} frames: not enough for an exposure of {settings.frames_per_exposure}"
         )
     facts = {
-        "session": hashlib.sha256(f"{film.name} {film.count} {settings} {rig.digest}".encode()).hexdigest()[:16],
         "aolink_version": version("aolink"),
         "rig": rig.name,
         "rig_digest": rig.digest,
-        "camera": f"imported from {film.name}",
+        "camera": f"{'slopes without pictures, ' if film.slopes else ''}imported from {film.name}",
         "mirror": "none" if film.inputs is None else f"imported from {film.name}",
         "import_settings": str(settings),
     }
@@ -61,13 +60,16 @@ def import_film(
         file = McapFile(partial, WriteOptions(), descriptor=open_unfinished(partial))
         try:
             begin_recording(file, rig, facts, first.frame.host_start_ns, {})
-            sequence = 0
+            sequence, digest = 0, hashlib.sha256(f"{film.name} {settings} {rig.digest}".encode())
             for each in chain([first], made):
                 for topic, message in _messages(each):
                     sequence += 1
                     data = message.SerializeToString(deterministic=True)
+                    digest.update(data)
                     file.add(topic, schema_of(type(message)), data, each.frame.host_receive_ns, sequence)
                 progress(account.exposures)
+            # Another film is another session, even one of the same name: known when its last pixel is.
+            file.add_metadata(topics.SESSION_METADATA, {"session": digest.hexdigest()[:16]})
             file.add_metadata(topics.END_METADATA, {"ended": "end of the film", "exposures": str(account.exposures)})
             file.finish()
         except BaseException:

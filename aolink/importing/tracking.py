@@ -301,7 +301,7 @@ def _steps(places: FloatArray) -> tuple[float, float]:
 
 
 def reach(known: Survey, frames: int) -> float:
-    """How far from where it was last an object's light may be after an exposure of so many frames, pixels."""
+    """How far from the middle of its blur an object's light may be in an exposure of so many frames, pixels."""
     return _REST * math.sqrt(known.sd**2 + known.walk * frames)
 
 
@@ -330,7 +330,8 @@ def tracked(
         shown = [light.of(frame) for frame in group.frames]
         mean = np.mean([one for one, _ in shown], axis=0)
         bad = np.any([wrong for _, wrong in shown], axis=0)
-        values, usable, own = windows.cut(mean, ~bad, known.places[max(group.first_frame - 1, 0)])
+        blurs = _blurs(mean, known.places[max(group.first_frame - 1, 0)], known, len(shown))
+        values, usable, own = windows.cut(mean, ~bad, blurs)
         # Beyond an object's reach there is no light of it: what shines there belongs to others.
         values = np.where(own, values - known.ground[:, None, None], 0.0)
         density = values / known.light[:, None, None] / area
@@ -352,6 +353,20 @@ def tracked(
                 path=path, path_sd=known.place_sd * sensor.pixel_width,
             )  # fmt: skip
         yield ImportedExposure(frame=frame, inputs=inputs, truth=truth)
+
+
+def _blurs(picture: FloatArray, last: FloatArray, known: Survey, frames: int) -> FloatArray:
+    """Where the objects' blurs are in an exposure of so many frames, after they were ``last`` (n, 2); NaN as there.
+
+    It is told from the exposure alone: what the single frames know must not show in its pixels.
+    """
+    start = np.where(np.isfinite(last), last, 0.0)
+    far = reach(known, frames)
+    windows, corners = cut_windows(picture, start, math.ceil(far + 2 * _WEIGHT * known.sd))
+    spread = math.sqrt(known.sd**2 + known.walk * frames / 6)  # a walk's mean square about its own mean
+    found = corners + weighted_centroid(windows, _WEIGHT * spread, start=start - corners)
+    near = np.linalg.norm(found - last, axis=1) <= far  # False where either is NaN
+    return np.where(near[:, None], found, last)
 
 
 def _state(rig: Rig, output: FloatArray | None) -> FloatArray:
@@ -389,7 +404,7 @@ class _Windows:
     def cut(
         self, picture: FloatArray, usable: BoolArray, places: FloatArray
     ) -> tuple[FloatArray, BoolArray, BoolArray]:
-        """What the windows see, which pixels can be used, and which may have light of the objects last at ``places``.
+        """What the windows see, which pixels can be used, and which may have light of the blurs at ``places``.
 
         (n, side, side) each.
         """

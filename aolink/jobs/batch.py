@@ -18,14 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from aolink.errors import AolinkError, RecordingError, RigError
-from aolink.estimation import Engine, Scorer
+from aolink.estimation import Engine
 from aolink.estimation.registry import DEFAULT_ESTIMATOR
+from aolink.exporting.common import Progress, no_progress
 from aolink.files import remove_unfinished, writing
 from aolink.jobs.tables import COLUMNS
-from aolink.jobs.unit import Model, Settings, estimated, score_values
+from aolink.jobs.unit import Model, Settings, estimated, score_row
 from aolink.numerics.workers import processes
 from aolink.recording.reader import Recording
-from aolink.recording.reestimate import check_has_exposures, fill_reestimated
+from aolink.recording.reestimate import check_has_exposures, fill_reestimated, scored
 from aolink.recording.remote import Url, location
 
 _IN_EVERY_ROW = {"recording", "model", "estimator", "exposures", "output"}
@@ -264,7 +265,7 @@ def run(
     workers: int,
     *,
     stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Progress = no_progress,
 ) -> Iterator[Done]:
     """Do the jobs on ``workers`` processes; gives each when it is done, in no order. A failed one stops no other.
 
@@ -372,28 +373,12 @@ def _estimated(job: Job, target: Path) -> list[dict[str, Any]]:
     names = list(job.estimators or recording.estimators or [DEFAULT_ESTIMATOR])
     fill_reestimated(recording, names, target, only=job.only, engine=job.engine)
     seconds = time.perf_counter() - begin
-    written = Recording(target)
-    scorers, not_ok = {name: Scorer() for name in names}, dict.fromkeys(names, 0)
-    each = zip(*(written.iter_estimates(name) for name in names), strict=True)
-    count = 0
-    for exposure, estimates in zip(written.exposures(), each, strict=True):
-        count += 1
-        for estimate in estimates:
-            scorers[estimate.estimator].add(exposure, estimate)
-            not_ok[estimate.estimator] += estimate.status.name not in ("OK", "PREDICTED")
-    rows = []
-    for name, scorer in scorers.items():
-        score = scorer.result()
-        values = score_values(score)
-        known = {key: value if value == value else None for key, value in values.items()}
-        rows.append(
-            {
-                "recording": str(job.source), "model": job.model.name, "estimator": name, "exposures": count,
-                **known, "not_ok": not_ok[name], "nothing_measured": score.nothing_measured or None,
-                "seconds": round(seconds, 3), "output": job.output.name, "damage": recording.damage or None,
-            }
-        )  # fmt: skip
-    return rows
+    return [
+        {"recording": str(job.source), "model": job.model.name, "estimator": name, "output": job.output.name}
+        | score_row(score)
+        | {"seconds": round(seconds, 3), "damage": recording.damage or None}
+        for name, score in scored(Recording(target), names).items()
+    ]
 
 
 def _values(text: str, setting: str) -> list[Any]:

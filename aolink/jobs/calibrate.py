@@ -170,7 +170,7 @@ class Poked:
     def difference(self) -> float:
         """Rms of what the plant leaves unexplained of the measured matrix, as a share of its rms."""
         apart = self.measured.matrix - self.modelled.matrix
-        return float(np.linalg.norm(apart) / max(np.linalg.norm(self.measured.matrix), 1e-300))
+        return float(np.linalg.norm(apart)) / max(float(np.linalg.norm(self.measured.matrix)), 1e-300)
 
 
 def record_pokes(

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.devices.drivers import KINDS, NATIVE, check_driver
+from aolink.errors import AolinkError
 from aolink.estimation.frames.moments import least_significance, spot_significance
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import exposure_density
@@ -50,14 +53,20 @@ _WINDOWS = 64
 """Exposures along the drive's path whose blur is checked."""
 
 
-@dataclass(frozen=True, kw_only=True)
+Severity = Literal["error", "warning", "info"]
+
+
+@dataclass(frozen=True)
 class Finding:
     """Something that `check_rig` has to say."""
 
-    severity: Literal["error", "warning", "info"]
+    severity: Severity
     key: str
     """The rig file's key that it is about."""
     message: str
+
+
+_error, _warning, _info = (partial(Finding, severity) for severity in get_args(Severity))
 
 
 def check_rig(rig: Rig) -> list[Finding]:
@@ -68,23 +77,31 @@ def check_rig(rig: Rig) -> list[Finding]:
             findings = [
                 *_check_timing(rig), *_check_sensor(rig), *_check_signal(rig, path), *_check_motion(rig, path),
                 *_check_field(rig, path, sd), *_check_mirror(rig), *_check_simulation(rig), *_check_observability(rig),
+                *_check_devices(rig),
             ]  # fmt: skip
     except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
         return [_error("rig", f"it has numbers that are too large or too small to compute with ({error})")]
-    order = ("error", "warning", "info")
-    return sorted(findings, key=lambda f: order.index(f.severity))
+    return sorted(findings, key=lambda finding: get_args(Severity).index(finding.severity))
 
 
-def _error(key: str, message: str) -> Finding:
-    return Finding(severity="error", key=key, message=message)
-
-
-def _warning(key: str, message: str) -> Finding:
-    return Finding(severity="warning", key=key, message=message)
-
-
-def _info(key: str, message: str) -> Finding:
-    return Finding(severity="info", key=key, message=message)
+def _check_devices(rig: Rig) -> Iterator[Finding]:
+    for kind in KINDS:
+        table = rig.devices.get(kind)
+        if table is None:
+            continue
+        key = f"devices.{kind}"
+        if table.driver != NATIVE:
+            try:
+                driver = check_driver(kind, table, rig)
+            except AolinkError as error:
+                yield _error(key, str(error))
+                continue
+            lacks = "; ".join(getattr(driver, "lacks", ())) or "nothing"
+            yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
+        elif table.delay is not None:
+            yield _error(key, f"the driver {NATIVE} tells its time: delay_s and delay_sd_s are for others")
+    if rig.devices and "mirror" not in rig.devices:
+        yield _info("devices.mirror", "no mirror is named: without --mirror the camera is recorded alone")
 
 
 def _check_timing(rig: Rig) -> Iterator[Finding]:

@@ -10,23 +10,24 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from aolink.errors import AolinkError
-from aolink.jobs.batch import Done, SideJob, do
+from aolink.exporting.common import Progress, no_progress
+from aolink.jobs.batch import Done, Job, SideJob, do
 from aolink.jobs.unit import aolink_version
 
 if TYPE_CHECKING:
     from distributed import Client
 
 _CONNECT_S = 5.0
-_POLL_S = 0.1
+_POLL_S = 0.02
 """How often the user's wish to stop is looked for."""
 
 
 def run_on(
     address: str,
-    todo: Sequence[SideJob],
+    todo: Sequence[Job | SideJob],
     *,
     stop: Callable[[], bool] = lambda: False,
-    progress: Callable[[int], None] = lambda done: None,
+    progress: Progress = no_progress,
 ) -> Iterator[Done]:
     """Do jobs on the workers of a scheduler; gives each when it is done, in no order. A failed one stops no other.
 
@@ -67,7 +68,7 @@ def run_on(
                 time.sleep(_POLL_S)
 
 
-def _on_worker(job: SideJob, version: str) -> Done:
+def _on_worker(job: Job | SideJob, version: str) -> Done:
     """What a worker does; one that came late was not asked before what aolink it has."""
     if aolink_version() != version:
         return Done(job, [], f"a worker has aolink {aolink_version()}, this is {version}: install the same everywhere")

@@ -9,9 +9,9 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from aolink.errors import AolinkError, DeviceError, ViewerError
@@ -32,10 +32,10 @@ class DemoResult:
     """The results of the demo."""
 
     recording: Path
-    rrd: Path | None
+    rrd: Path | None = None
     """None if the demo was interrupted before."""
-    picture: Path | None
-    not_of_viewer: str
+    picture: Path | None = None
+    not_of_viewer: str = ""
     """Why the picture is not one of the viewer, but of matplotlib or None; empty where it is the viewer's."""
     report: Report
     deblurred: Summary | None = None
@@ -44,7 +44,7 @@ class DemoResult:
     """Estimator whose path they were restored with."""
     deblurred_recording: Path | None = None
     """The session with them."""
-    differences: dict[str, str]
+    differences: Mapping[str, str] = field(default_factory=dict)
     """Where online and offline estimates differ, by estimator; empty if nowhere."""
     seconds: dict[str, float]
     """Wall time of each part."""
@@ -142,10 +142,7 @@ def run_demo(
             progress=tell,
         )  # fmt: skip
     if stop():
-        return DemoResult(
-            recording=path, rrd=None, picture=None, not_of_viewer="interrupted", report=report, differences={},
-            seconds=seconds,
-        )  # fmt: skip
+        return DemoResult(recording=path, report=report, seconds=seconds)
     with part("estimate again") as tell:
         recording = Recording(path)
         offline = reestimate(recording, estimators, tell, as_recorded=True)
@@ -154,14 +151,14 @@ def run_demo(
             for name, again in offline.items()
             if (difference := first_difference(list(recording.iter_estimates(name)), again))
         }
-    deblurred, deblurred_recording = None, None
+    deblurred, sharp = None, None
     if rig.scene is not None:
-        deblurred_recording = folder / "deblurred.mcap"
+        sharp = folder / "deblurred.mcap"
         with part("deblur") as tell:
             deblurred = write_deblurred(
-                recording, deblurred_recording, estimator=estimators[-1], workers=os.cpu_count() or 1, progress=tell
+                recording, sharp, estimator=estimators[-1], workers=os.cpu_count() or 1, progress=tell
             )
-        recording = Recording(deblurred_recording)
+        recording = Recording(sharp)
     with part("write .rrd"):
         viewing.save_rrd(recording, rrd)
     drawn: Path | None = picture
@@ -176,14 +173,6 @@ def run_demo(
             except ViewerError as also:
                 not_of_viewer += f"; {also}"
     return DemoResult(
-        recording=path,
-        rrd=rrd,
-        picture=drawn,
-        not_of_viewer=not_of_viewer,
-        report=report,
-        deblurred=deblurred,
-        deblurred_by=estimators[-1],
-        deblurred_recording=deblurred_recording,
-        differences=differences,
-        seconds=seconds,
-    )
+        recording=path, rrd=rrd, picture=drawn, not_of_viewer=not_of_viewer, report=report, deblurred=deblurred,
+        deblurred_by=estimators[-1], deblurred_recording=sharp, differences=differences, seconds=seconds,
+    )  # fmt: skip

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from aolink.errors import AolinkError, EstimatorError, RecordingError, RigError
-from aolink.estimation import Driver, Engine, Estimate, Score, Scorer, Status
+from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.exposure import Exposure
 from aolink.files import check_target, writing
 from aolink.jobs.tables import COLUMNS, is_table_of, rows_into, table_beside
+from aolink.recording.editing import recorded_estimate, side_file
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import check_has_exposures
-from aolink.recording.side import SideFile
 from aolink.rig import parse_rig
 from aolink.rig.edit import with_value
 
@@ -114,7 +114,6 @@ def estimated(url: str | Path, out: Path, settings: Settings) -> tuple[dict[str,
     if settings.engine != "aolink":
         notes["engine"] = settings.engine
     scorer = Scorer()
-    count = not_ok = 0
     row: dict[str, Any] = dict.fromkeys(COLUMNS)
     row |= {
         "recording": str(recording.path), "model": settings.model.name, "estimator": settings.estimator,
@@ -123,24 +122,17 @@ def estimated(url: str | Path, out: Path, settings: Settings) -> tuple[dict[str,
     names = {key: row[key] for key in ("recording", "model", "estimator")}
     with (
         writing(out, overwrite=True, sources=recording.files, error=RecordingError) as partial,
-        SideFile(recording, partial, notes) as side,
+        side_file(recording, partial, notes) as side,
         rows_into(table_beside(out) if settings.table else None, digest) as add_row,
     ):
         for time_ns, exposure, estimate in _estimates(recording, settings):
-            side.add(estimate, time_ns)
+            side.add(recorded_estimate(estimate, time_ns))
             scorer.add(exposure, estimate)
-            count += 1
-            not_ok += estimate.status not in (Status.OK, Status.PREDICTED)
             if settings.table:
                 add_row(names | exposure_row(time_ns, exposure, estimate))
-        score = scorer.result()
-        values = score_values(score)
-        row |= {key: value for key, value in values.items() if not math.isnan(value)}
-        row |= {
-            "exposures": count, "not_ok": not_ok, "nothing_measured": score.nothing_measured or None,
-            "seconds": round(time.perf_counter() - begin, 3), "damage": recording.damage or None,
-        }  # fmt: skip
-        side.finish({"row": json.dumps(row)})
+        row |= score_row(scorer.result())
+        row |= {"seconds": round(time.perf_counter() - begin, 3), "damage": recording.damage or None}
+        side.finish(end={"row": json.dumps(row)})
     return row, False
 
 
@@ -230,11 +222,15 @@ def _row_before(out: Path, digest: str, settings: Settings) -> dict[str, Any] | 
     return dict(json.loads(before.end_metadata["row"]))
 
 
-def score_values(score: Score) -> dict[str, float]:
-    """What a row of a table says of a score, by column; NaN for what is not known."""
-    return {
+def score_row(score: Score) -> dict[str, Any]:
+    """What a row of a table says of a score, by column; None for what is not known."""
+    values = {
         "path_rmse": score.path_rmse, "start_rmse": score.start_rmse, "end_rmse": score.end_rmse,
         "nis": score.nis.mean, "nis_low": score.nis.low, "nis_high": score.nis.high,
         "start_nees": score.start_nees.mean, "end_nees": score.end_nees.mean,
         "nees_low": score.end_nees.low, "nees_high": score.end_nees.high,
+    }  # fmt: skip
+    return {name: None if math.isnan(value) else value for name, value in values.items()} | {
+        "exposures": score.estimated, "not_ok": sum(each.exposures for each in score.unused),
+        "nothing_measured": score.nothing_measured or None,
     }  # fmt: skip

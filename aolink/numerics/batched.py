@@ -7,9 +7,8 @@ four are written out in elementwise operations, larger ones are one product each
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 _WRITTEN_OUT = 4
 _SMALL_PRODUCT = 100_000

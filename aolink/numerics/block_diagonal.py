@@ -10,8 +10,7 @@ from scipy import linalg
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-FloatArray = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from aolink.numerics.arrays import FloatArray, Indices
 
 
 def components(*matrices: FloatArray) -> list[Indices]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.numerics import single_thread
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 # Added to the diagonal, relative to each variance: a state that the prior knows for certain stays certain to this.
 _JITTER = 1e-10

@@ -12,12 +12,11 @@ from threading import RLock
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 from scipy.sparse import csr_array
 from threadpoolctl import ThreadpoolController
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 # A matrix with a smaller share of nonzero entries than this is multiplied as a sparse one.
 _SPARSE = 0.05
@@ -57,7 +56,7 @@ by_one_thread = _ByOneThread()
 
 @by_one_thread
 def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(n, k) @ (k, m)"""
+    """(n, k) @ (k, m), or @ (k,)"""
     return np.asarray(a @ b)
 
 
@@ -65,17 +64,6 @@ def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
 def gram(a: FloatArray) -> FloatArray:
     """a' a, (n, m) -> (m, m), symmetric to the last bit."""
     return np.asarray(a.T @ a)
-
-
-@by_one_thread
-def matvec(a: FloatArray, x: FloatArray) -> FloatArray:
-    """(n, k) @ (k,)"""
-    return np.asarray(a @ x)
-
-
-def congruences(a: FloatArray, p: FloatArray) -> FloatArray:
-    """`congruence` of many, p (axes, n, n)."""
-    return np.stack([congruence(a, each) for each in p])
 
 
 @by_one_thread

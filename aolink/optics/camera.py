@@ -10,9 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.sensor import BaseSensor
-
-FloatArray = NDArray[np.float64]
 
 
 def to_counts(sensor: BaseSensor, density: FloatArray) -> NDArray[np.uint16]:
@@ -26,7 +25,7 @@ def to_density(sensor: BaseSensor, counts: NDArray[np.uint16] | FloatArray) -> F
     return (counts.astype(np.float64) - sensor.black_level) / sensor.counts_per_density
 
 
-def is_saturated(sensor: BaseSensor, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+def is_saturated(sensor: BaseSensor, counts: NDArray[np.uint16]) -> BoolArray:
     """True where a count is at an end of the scale (zero or full scale), so that the light is not known."""
     return np.asarray((counts == 0) | (counts >= sensor.full_scale))
 
@@ -39,11 +38,6 @@ def pixel_noise_sd(sensor: BaseSensor) -> float:
 def shot_gain(sensor: BaseSensor) -> float:
     """Variance of a pixel's density by shot noise for each unit of density, 1/(photoelectrons D); 0 if negligible."""
     return 1 / (sensor.photoelectrons * sensor.pixel_size) if sensor.photoelectrons else 0.0
-
-
-def pixel_noise_variance(sensor: BaseSensor, density: FloatArray) -> FloatArray:
-    """Variance of pixels' densities by read-out and shot noise, V/D + Y/(photoelectrons D), shape of ``density``."""
-    return sensor.noise_density / sensor.pixel_size + shot_gain(sensor) * np.maximum(density, 0.0)
 
 
 def effective_noise_density(sensor: BaseSensor) -> float:

@@ -7,9 +7,8 @@ the columns and y along the rows, and 0 is the middle of the first pixel. NaN wh
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 def centre_of_gravity(windows: FloatArray, threshold: FloatArray | float = 0.0) -> FloatArray:

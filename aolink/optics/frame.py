@@ -9,11 +9,11 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density, pixel_mass, pixel_masses
 from aolink.optics.plane import exposure_density_2d
 from aolink.optics.sensor import BaseSensor, Kernel, Sensor, SpotSensor
 
-FloatArray = NDArray[np.float64]
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 # Spots computed together: their masses stay in the processor's cache.

@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import FrameError
+from aolink.numerics.arrays import FloatArray
 
 _BLOCK, _CARD = 2880, 80
 _TYPES = {8: "u1", 16: ">i2", 32: ">i4", 64: ">i8", -32: ">f4", -64: ">f8"}
 
 
-def read_frame(path: str | Path) -> NDArray[np.float64]:
+def read_frame(path: str | Path) -> FloatArray:
     """The picture in a .fits, .fits.gz or .npy file, (rows, columns).
 
     Raises
@@ -43,7 +44,7 @@ def read_frame(path: str | Path) -> NDArray[np.float64]:
     return np.asarray(picture, dtype=np.float64)
 
 
-def parse_fits(data: bytes) -> NDArray[np.float64]:
+def parse_fits(data: bytes) -> FloatArray:
     """The primary image of a FITS file with two axes.
 
     Raises

@@ -8,12 +8,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import erf
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Kernel
 
-FloatArray = NDArray[np.float64]
 Integrals = list[FloatArray]
 
 

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from aolink.errors import FrameError
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.optics.maxima import (
     Maxima,
     find_maxima,
@@ -25,9 +26,6 @@ from aolink.optics.maxima import (
     spot_sd,
 )
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 Kind = Literal["square", "hexagonal"]
 
 # The fewest spots of a lattice, and the fewest that must be neighbours for the search to start from them.

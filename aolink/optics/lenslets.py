@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import BoolArray, FloatArray
 
 # Points along a lenslet's side to compute how much of it is lit; and for means of a wavefront that is smooth over it.
 _EDGE_POINTS = 64
@@ -52,7 +51,7 @@ class Lenslets:
         y, x = np.mgrid[:rows, :columns].astype(np.float64)
         return self.pitch_m * np.stack([x - (columns - 1) / 2, y - (rows - 1) / 2], axis=-1).reshape(-1, 2)
 
-    def is_lit(self, points_m: FloatArray) -> NDArray[np.bool_]:
+    def is_lit(self, points_m: FloatArray) -> BoolArray:
         """Whether points (..., 2) lie in the pupil, (...)."""
         if self.pupil_diameter_m is None:
             return np.ones(points_m.shape[:-1], dtype=np.bool_)
@@ -70,7 +69,7 @@ class Lenslets:
         """Evenly spaced points along a lenslet's side, m from its middle, (per_side,)."""
         return self.pitch_m * ((np.arange(per_side) + 0.5) / per_side - 0.5)
 
-    def lit_part(self, spot: int, per_side: int = _EDGE_POINTS) -> NDArray[np.bool_]:
+    def lit_part(self, spot: int, per_side: int = _EDGE_POINTS) -> BoolArray:
         """Which of a lenslet's evenly spaced points are in the pupil, (per_side, per_side), y before x."""
         points = self.centres_m[spot] + _square(self.offsets_m(per_side))
         return self.is_lit(points).reshape(per_side, per_side)
@@ -99,14 +98,6 @@ class Lenslets:
             mean = np.tensordot(weight, gradient(points), axes=1)
             slopes.append(mean if light else np.full_like(mean, np.nan))
         return np.array(slopes)
-
-    def pixels_to_slope(self, pixel_m: float) -> float:
-        """Slope in radians for a displacement of one pixel of side ``pixel_m``."""
-        return pixel_m / self.focal_length_m
-
-    def diffraction_width(self, wavelength_m: float) -> float:
-        """Slope from the middle of a spot to the first zero of its sinc^2, lambda / pitch, radians."""
-        return wavelength_m / self.pitch_m
 
 
 def _square(offset: FloatArray) -> FloatArray:

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from aolink.errors import FrameError
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.centroid import weighted_centroid
-
-FloatArray = NDArray[np.float64]
 
 # A spot is a maximum this many standard deviations above the noise of the smoothed frame.
 _SIGNIFICANCE = 8.0
@@ -105,7 +104,7 @@ def smoothed_noise(flat: FloatArray, scale: float) -> float:
     return float(np.quantile(fine, 0.25)) / (0.3186 * 6) / (2 * math.sqrt(math.pi) * scale)
 
 
-def noise_map(smooth: FloatArray, dark: NDArray[np.bool_]) -> FloatArray:
+def noise_map(smooth: FloatArray, dark: BoolArray) -> FloatArray:
     """Standard deviation of the dark pixels near each pixel, (rows, columns): noise grows with stray light."""
     noise = np.full(smooth.shape, spread(smooth[dark]))
     for rows in np.array_split(np.arange(smooth.shape[0]), _PARTS):

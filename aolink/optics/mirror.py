@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

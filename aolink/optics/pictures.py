@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import RestorationError
 from aolink.files import writing
+from aolink.numerics.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -49,7 +50,7 @@ def image_pixels(image: Image.Image) -> NDArray[Any]:
     return np.asarray(image)
 
 
-def finite_pixels(picture: NDArray[Any]) -> NDArray[np.bool_] | None:
+def finite_pixels(picture: NDArray[Any]) -> BoolArray | None:
     """Where a picture (rows, columns, any colours) holds numbers, (rows, columns); None where it does everywhere."""
     if picture.dtype.kind != "f" or picture.ndim not in (2, 3):
         return None
@@ -91,7 +92,7 @@ def _format(path: Path) -> str:
     return kind
 
 
-def read_psf(path: Path) -> NDArray[np.float64]:
+def read_psf(path: Path) -> FloatArray:
     """A PSF as numbers, from ``.npy`` or from text with commas or spaces; one row or column is a PSF along the rows.
 
     Raises

@@ -8,26 +8,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import pixel_masses
 
-FloatArray = NDArray[np.float64]
-
 _QUADRATURE = np.polynomial.legendre.leggauss(8)
-
-
-def kernel_covariance(width: FloatArray) -> FloatArray:
-    """Covariance of Psi(w) = exp(-w' Sigma^-2 w) / (pi |Sigma|), (2, 2): Sigma^2 / 2.
-
-    Mishra & Wen (4), with the constant that gives it unit mass.
-
-    Parameters
-    ----------
-    width:
-        Sigma, symmetric positive definite, slope units, (2, 2).
-    """
-    return np.asarray(width @ width / 2)
+# Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
+_SERIES = 1e-6
+_MOST_TERMS = 30
 
 
 def pixel_mass_2d(
@@ -116,3 +104,11 @@ def kernel_moments_2d(covariance: FloatArray, pixel: tuple[float, float], highes
                 for b in range(q + 1)
             )
     return out
+
+
+def mehler_series(kernel: FloatArray) -> list[float]:
+    """Terms c^j / j! of Mehler's series that matter, c the covariance of the two directions in ``kernel`` (2, 2)."""
+    (xx, xy), (_, yy) = kernel
+    rho = abs(xy) / math.sqrt(xx * yy)
+    count = 1 if rho == 0 else min(_MOST_TERMS, math.ceil(math.log(_SERIES) / math.log(rho)))
+    return [xy**j / math.factorial(j) for j in range(count)]

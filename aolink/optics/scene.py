@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.sensor import Kernel
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +49,7 @@ class SceneSensor:
         """The intensity for counts; noise makes it negative where it is dark."""
         return np.asarray((counts.astype(np.float64) - self.black_level) / self.counts_per_intensity)
 
-    def is_saturated(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    def is_saturated(self, counts: NDArray[np.uint16]) -> BoolArray:
         """True where a count is at an end of the scale."""
         return np.asarray((counts == 0) | (counts >= self.full_scale))
 

@@ -13,9 +13,8 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray, Indices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +157,7 @@ class SpotSensor(BaseSensor):
         return len(self.lit)
 
     @cached_property
-    def lit(self) -> NDArray[np.intp]:
+    def lit(self) -> Indices:
         """Windows that have a spot, counted along the rows of the grid, (spots,)."""
         return np.arange(self.grid[0] * self.grid[1]) if self.light is None else np.flatnonzero(self.light)
 

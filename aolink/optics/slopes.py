@@ -11,13 +11,11 @@ from scipy.spatial import ConvexHull
 
 from aolink.errors import FrameError
 from aolink.files import writing
+from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.optics.frame_file import read_frame
 from aolink.optics.lattice import Lattice, find_lattice, match
 from aolink.optics.wavefront import SpotReconstructor, modal_reconstructor, residual_rms, zernike_slopes
 from aolink.optics.zernike import zernike
-
-FloatArray = NDArray[np.float64]
-
 
 # Zernike modes that are fitted, by Noll's index, up to the fourth order; fewer where the spots do not determine them.
 _HIGHEST = (15, 10, 6, 3)
@@ -61,7 +59,7 @@ class FrameSlopes:
     """(rows, columns, 2): radians, or pixels where the optics are not known."""
     wavefront: FloatArray
     """Zonal wavefront, (rows, columns), without piston and tilt: metres, or pixels times the pitch of a lenslet."""
-    pieces: NDArray[np.int64]
+    pieces: IntArray
     """Connected piece that each lenslet belongs to, from 0, -1 where the frame has no spot, (rows, columns).
 
     Slopes do not determine the step from one piece to another; the wavefront's mean is zero in each.
@@ -138,7 +136,7 @@ def measure_slopes(
 
 
 def _zernikes(
-    base: Lattice, nodes: NDArray[np.int64], slopes: FloatArray, pitch: float
+    base: Lattice, nodes: IntArray, slopes: FloatArray, pitch: float
 ) -> tuple[tuple[int, ...], FloatArray, FloatArray, tuple[FloatArray, float]]:
     """Indices and coefficients of the modes, their sum at the nodes, centre and radius of the pupil in pixels."""
     middles = base.node_positions(base.nodes)

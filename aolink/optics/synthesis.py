@@ -17,8 +17,7 @@ from scipy import fft
 from scipy.special import sici
 
 from aolink.errors import FrameError
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 
 # Spots computed together: their masses stay in the processor's cache.
 _AT_ONCE = 16
@@ -169,7 +168,7 @@ def _image_spectrum(image: FloatArray, fine: int, size: int) -> NDArray[np.compl
     return np.asarray(fft.rfft2(over_pixel))
 
 
-def _cut(light: FloatArray, corner: NDArray[np.int64], side: int) -> FloatArray:
+def _cut(light: FloatArray, corner: IntArray, side: int) -> FloatArray:
     """Windows from squares (spots, pixels, pixels) whose corners (spots, 2), x and y, lie there in the windows."""
     pixels = light.shape[1]
     at = np.arange(side) - corner[..., None]
@@ -193,7 +192,7 @@ class Detector:
     """Dark current of a pixel in one exposure, photo-electrons; it has shot noise."""
     flat: FloatArray | float = 1.0
     """Sensitivity of the pixels (flat field)."""
-    dead: NDArray[np.bool_] | None = None
+    dead: BoolArray | None = None
     """Pixels that always read the offset, (rows, columns)."""
 
     def __post_init__(self) -> None:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.lenslets import Lenslets
-
-FloatArray = NDArray[np.float64]
 
 # The longest wave over the outer scale: longer ones add nothing to the structure function within it.
 _LONGEST = 20.0
@@ -35,20 +34,6 @@ class Layer:
     """Along x and y."""
     outer_scale_m: float = 25.0
     wavelength_m: float = 500e-9
-
-
-def structure_function(layer: Layer, distance_m: FloatArray) -> FloatArray:
-    """von Karman's phase structure function, rad^2, (...).
-
-    D(r) = (L0/r0)^(5/3) 2^(1/6) Gamma(11/6)/pi^(8/3) (24/5 Gamma(6/5))^(5/6)
-    (Gamma(5/6)/2^(1/6) - (2 pi r/L0)^(5/6) K_(5/6)(2 pi r/L0)); Conan (2000).
-    """
-    from scipy.special import gamma, kv  # every rig file is read by this module, few of them have turbulence
-
-    x = 2 * math.pi * np.maximum(np.asarray(distance_m, dtype=np.float64), 1e-12) / layer.outer_scale_m
-    scale = (layer.outer_scale_m / layer.r0_m) ** (5 / 3) * 2 ** (1 / 6) * gamma(11 / 6) / math.pi ** (8 / 3)
-    scale *= (24 / 5 * gamma(6 / 5)) ** (5 / 6)
-    return np.asarray(scale * (gamma(5 / 6) / 2 ** (1 / 6) - x ** (5 / 6) * kv(5 / 6, x)))
 
 
 class FrozenFlow:
@@ -106,7 +91,7 @@ def _spectrum(layer: Layer, k: FloatArray) -> FloatArray:
 
     0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) over cycles per metre, and (2 pi)^-2 of that over radians per metre.
     """
-    from scipy.special import gamma
+    from scipy.special import gamma  # every rig file is read by this module, few of them have turbulence
 
     exact = gamma(11 / 6) ** 2 / (2 * math.pi ** (11 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)  # 0.0229
     cycles = k / (2 * math.pi)

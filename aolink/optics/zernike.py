@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 def noll_to_orders(index: int) -> tuple[int, int]:

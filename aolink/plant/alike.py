@@ -6,13 +6,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from aolink.numerics.block_diagonal import Indices, alike
+from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.block_diagonal import alike
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
-
 
 MANY_STATES = 64
 """With more states than this a plant's matrices are large, and a mirror is treated actuator by actuator."""

@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import components, eigenvalues
 from aolink.plant.lifting import input_response, lift, output_rows
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
-
 
 _LARGEST_CHECK = 200_000
 

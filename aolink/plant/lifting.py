@@ -8,15 +8,12 @@ from __future__ import annotations
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.numerics import single_thread
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import blockwise, components
 from aolink.plant.alike import alike_systems
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
-
 
 _BLOCK_STEPS = 32
 

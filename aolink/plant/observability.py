@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.numerics.block_diagonal import Indices, blockwise, components, eigenvalues, null_space
+from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.block_diagonal import blockwise, components, eigenvalues, null_space
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
-
 
 # A mode that decays to this over one exposure is gone before the next, observed or not.
 _FORGOTTEN = 1e-3
@@ -58,11 +56,6 @@ class ObservabilityReport:
     modes: tuple[Mode, ...]
     o2_needs: str
     """What an estimator of the second moment alone (`o2`) needs before it can work."""
-
-    @property
-    def detectable(self) -> bool:
-        """Whether every unobservable mode decays by itself."""
-        return all(m.seen or abs(m.eigenvalue) < 1 - 1e-9 for m in self.modes)
 
     @property
     def unseen(self) -> tuple[Mode, ...]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError, Message
 from google.protobuf.wrappers_pb2 import BytesValue
 
 from aolink.errors import RecordingError
+from aolink.exporting.common import Progress, no_progress
 from aolink.recording import schemas_pb2, topics
 from aolink.recording.reader import Recording
 from aolink.wire import messages_pb2 as wire
@@ -85,8 +86,7 @@ def compare(
     absolute: float = ABSOLUTE,
     only: Sequence[str] = (),
     relative_to_start: bool = False,
-    memory_bytes: int = _BYTES_KEPT,
-    progress: Callable[[int], None] = lambda messages: None,
+    progress: Progress = no_progress,
 ) -> dict[str, TopicComparison]:
     """Compare two recordings by topic.
 
@@ -101,8 +101,6 @@ def compare(
     relative_to_start:
         Count exposures and fast steps from the first of each recording, and leave out clock times: in two sessions of
         one rig they differ.
-    memory_bytes:
-        For messages whose counterpart has not come yet; more of them are in a temporary file.
 
     Raises
     ------
@@ -115,60 +113,43 @@ def compare(
         raise RecordingError(f"there is nothing{asked} to compare in {first.path} and {second.path}")
     result = {name: TopicComparison() for name in sorted(names)}
     in_both = {name for name in names if name in first.counts and name in second.counts}
-    with _Waiting(memory_bytes) as waiting:
+    with _Waiting() as waiting:
         each = _alternating(first, second, sorted(names), relative_to_start)
         for number, (is_first, key, message, frame_id) in enumerate(each, 1):
             found = result[key[0]]
             if key[0] not in in_both:
-                found.count_alone(is_first=is_first, text=_called(key, frame_id))
+                found.count_alone(is_first=is_first, text=key[1])
             elif (other := waiting.partner(key, is_first=is_first)) is None:
-                waiting.put(key, message, frame_id, is_first=is_first)
+                waiting.put(key, message, is_first=is_first)
             else:
                 found.compared += 1
                 pair = (message, other) if is_first else (other, message)
                 if pair[0] != pair[1]:
                     _compare_messages(found, *pair, frame_id, relative, absolute, times=not relative_to_start)
             progress(number)
-        for key, is_first, frame_id in waiting.left():
-            result[key[0]].count_alone(is_first=is_first, text=_called(key, frame_id))
+        for topic, name, is_first in waiting.left():
+            result[topic].count_alone(is_first=is_first, text=name)
     return result
 
 
-def _called(key: _Key, frame_id: int | None) -> str:
-    return f"frame {frame_id}" if frame_id is not None else key[1]
-
-
-class _Kept(NamedTuple):
-    """A message whose counterpart has not come yet."""
-
-    is_first: bool
-    frame_id: int | None
-    kind: str
-    """Full name of its type."""
-    data: bytes
-
-    def message(self) -> Message:
-        return topics.SCHEMAS.get(self.kind, BytesValue).FromString(self.data)
-
-
 class _Waiting:
-    """Messages whose counterpart has not come yet: the first megabytes in memory, what comes then in a temporary file.
-
-    Messages with the same name come out in their order; those in the file came after all those in memory.
+    """Messages whose counterpart has not come yet, in a database of SQLite: in memory up to `_BYTES_KEPT`, what comes
+    then in its temporary file. Messages with the same name come out in their order.
     """
 
-    def __init__(self, memory_bytes: int) -> None:
-        self._memory_bytes = memory_bytes
-        self._memory: dict[_Key, deque[_Kept]] = {}
-        self._bytes = 0
+    def __init__(self) -> None:
+        self._numbers = count()
         self._file = sqlite3.connect("", isolation_level=None)
-        self._in_file = 0
-        self._file.execute("PRAGMA journal_mode = OFF")
-        self._file.execute(
-            "CREATE TABLE kept (topic TEXT, name TEXT, is_first INT, frame_id TEXT, kind TEXT, data BLOB)"
+        self._file.executescript(
+            f"""
+            PRAGMA journal_mode = OFF;
+            PRAGMA cache_size = -{_BYTES_KEPT >> 10};
+            CREATE TABLE kept (
+                topic, name, number, is_first, kind, data, PRIMARY KEY (topic, name, number)
+            ) WITHOUT ROWID;
+            BEGIN
+            """
         )
-        self._file.execute("CREATE INDEX by_name ON kept (topic, name)")
-        self._file.execute("BEGIN")
 
     def __enter__(self) -> Self:
         return self
@@ -181,57 +162,25 @@ class _Waiting:
                 " folder as SQLITE_TMPDIR"
             ) from None
 
-    def put(self, key: _Key, message: Message, frame_id: int | None, *, is_first: bool) -> None:
+    def put(self, key: _Key, message: Message, *, is_first: bool) -> None:
         """Keep a message."""
-        kept = _Kept(is_first, frame_id, message.DESCRIPTOR.full_name, message.SerializeToString())
-        if self._in_file or self._bytes + _size(kept) > self._memory_bytes:
-            frame = None if frame_id is None else str(frame_id)  # it may need all of 64 bits
-            self._file.execute("INSERT INTO kept VALUES (?, ?, ?, ?, ?, ?)", (*key, is_first, frame, *kept[2:]))
-            self._in_file += 1
-        else:
-            self._memory.setdefault(key, deque()).append(kept)
-            self._bytes += _size(kept)
+        kept = (*key, next(self._numbers), is_first, message.DESCRIPTOR.full_name, message.SerializeToString())
+        self._file.execute("INSERT INTO kept VALUES (?, ?, ?, ?, ?, ?)", kept)
 
     def partner(self, key: _Key, *, is_first: bool) -> Message | None:
         """Take out what the other recording has under a name; None if it has not come."""
-        if key in self._memory:
-            of_name = self._memory[key]
-            if of_name[0].is_first == is_first:
-                return None
-            kept = of_name.popleft()
-            self._bytes -= _size(kept)
-            if not of_name:
-                del self._memory[key]
-            return kept.message()
-        if not self._in_file:
-            return None
         row = self._file.execute(
-            f"SELECT rowid, {_COLUMNS} FROM kept WHERE topic = ? AND name = ? ORDER BY rowid LIMIT 1", key
+            "SELECT number, kind, data FROM kept WHERE topic = ? AND name = ? AND is_first != ? ORDER BY number",
+            (*key, is_first),
         ).fetchone()
-        if row is None or row[1] == is_first:
+        if row is None:
             return None
-        self._file.execute("DELETE FROM kept WHERE rowid = ?", row[:1])
-        self._in_file -= 1
-        return _Kept(*row[1:]).message()
+        self._file.execute("DELETE FROM kept WHERE topic = ? AND name = ? AND number = ?", (*key, row[0]))
+        return topics.SCHEMAS.get(row[1], BytesValue).FromString(row[2])
 
-    def left(self) -> Iterator[tuple[_Key, bool, int | None]]:
-        """What has no counterpart: its name, whether it is in the first recording, its exposure."""
-        for key, of_name in self._memory.items():
-            for kept in of_name:
-                yield key, kept.is_first, kept.frame_id
-        for topic, name, is_first, frame_id in self._file.execute(
-            "SELECT topic, name, is_first, frame_id FROM kept ORDER BY rowid"
-        ):
-            yield (topic, name), bool(is_first), None if frame_id is None else int(frame_id)
-
-
-_COLUMNS = "is_first, frame_id, kind, data"
-_ENTRY_BYTES = 500
-"""What Python takes for a message besides its data, about."""
-
-
-def _size(kept: _Kept) -> int:
-    return len(kept.data) + _ENTRY_BYTES
+    def left(self) -> Iterator[tuple[str, str, bool]]:
+        """What has no counterpart: topic, name, and whether it is in the first recording."""
+        yield from self._file.execute("SELECT topic, name, is_first FROM kept ORDER BY number")
 
 
 def _is_wanted(topic: str, only: Sequence[str]) -> bool:
@@ -294,7 +243,7 @@ def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[_Key, Mess
             frame_id = message.frame_id  # type: ignore[attr-defined] # as the table says
             exposures |= dict.fromkeys(topics.PICTURES.get(topic, ()), frame_id)
         if frame_id is not None:
-            name = str(frame_id)
+            name = f"frame {frame_id}"
         elif isinstance(message, wire.Applied) and message.source == wire.Applied.AWAITED:
             name = f"report awaited from fast step {message.first_step}"
         elif isinstance(message, wire.CommandBlock | wire.Applied):

@@ -25,28 +25,22 @@ _COUNTS = np.dtype("<u2")
 _MOST_STEPS = 1_000_000
 """Fast steps of an exposure; more is damage, not data."""
 
+# What a frame, restored pictures and an estimate have alike with their messages.
+_OF_FRAME = (
+    "frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns",
+    "alignment_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "frames_lost_before",
+    "exposure_offset_ns",
+)  # fmt: skip
+_OF_RESTORATION = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
+_OF_ESTIMATE = ("estimator", "frame_id", "first_step", "n_steps", "reason")
+
 
 def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
     """A frame as it is recorded: its facts, and its picture."""
     height, width = frame.pixels.shape
     offsets, lengths = _runs(~frame.mask.ravel())
-    info = pb.ExposureInfo(
-        frame_id=frame.frame_id,
-        first_step=frame.first_step,
-        last_step=frame.last_step,
-        device_start_ns=frame.device_start_ns,
-        device_end_ns=frame.device_end_ns,
-        host_start_ns=frame.host_start_ns,
-        clock_sigma_ns=frame.clock_sigma_ns,
-        alignment_sigma_ns=frame.alignment_sigma_ns,
-        host_first_byte_ns=frame.host_first_byte_ns,
-        host_receive_ns=frame.host_receive_ns,
-        chunks_lost=frame.chunks_lost,
-        missing_offset=2 * offsets,
-        missing_length=2 * lengths,
-        frames_lost_before=frame.frames_lost_before,
-        exposure_offset_ns=frame.exposure_offset_ns,
-    )
+    facts = {name: getattr(frame, name) for name in _OF_FRAME}
+    info = pb.ExposureInfo(missing_offset=2 * offsets, missing_length=2 * lengths, slopes=frame.slopes, **facts)
     sensor = "scene" if frame.plane else "camera"
     image = RawImage(frame_id=sensor, width=width, height=height, encoding="mono16", step=2 * width)
     image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
@@ -56,22 +50,16 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
 
 def restoration_message(done: RestoredPictures) -> pb.Restoration:
     """The facts about an exposure's restored pictures, as they are recorded."""
-    return pb.Restoration(
-        frame_id=done.frame_id, estimator=done.estimator, method=done.method, scene_noise_sd=done.scene_noise_sd,
-        path_noise_sd=done.path_noise_sd, reason=done.reason,
-    )  # fmt: skip
+    return pb.Restoration(**{name: getattr(done, name) for name in _OF_RESTORATION})
 
 
-def restored_from_messages(
-    info: pb.Restoration, scene: RawImage | None, spots: RawImage | None
-) -> RestoredPictures:  # fmt: skip
+def restored_from_messages(info: pb.Restoration, scene: RawImage | None, spots: RawImage | None) -> RestoredPictures:
     """Inverse of `restoration_message` and `float_image`."""
     from aolink.restoration import RestoredPictures  # it takes a second that few who read a recording need to spend
 
     return RestoredPictures(
-        frame_id=info.frame_id, estimator=info.estimator, method=info.method, scene_noise_sd=info.scene_noise_sd,
-        path_noise_sd=info.path_noise_sd, reason=info.reason, scene=scene and picture_from_float_image(scene),
-        spots=spots and picture_from_float_image(spots),
+        scene=scene and picture_from_float_image(scene), spots=spots and picture_from_float_image(spots),
+        **{name: getattr(info, name) for name in _OF_RESTORATION},
     )  # fmt: skip
 
 
@@ -109,23 +97,9 @@ def frame_from_messages(info: pb.ExposureInfo, image: RawImage) -> Frame:
         for offset, length in zip(lost, lengths, strict=True):
             mask[offset // 2 : (offset + length + 1) // 2] = False
         mask = mask.reshape(shape)
-    return Frame(
-        frame_id=info.frame_id,
-        first_step=first,
-        last_step=last,
-        pixels=np.frombuffer(data, _COUNTS).astype(np.uint16, copy=False).reshape(shape),
-        mask=mask,
-        chunks_lost=info.chunks_lost,
-        frames_lost_before=info.frames_lost_before,
-        device_start_ns=info.device_start_ns,
-        device_end_ns=info.device_end_ns,
-        host_first_byte_ns=info.host_first_byte_ns,
-        host_receive_ns=info.host_receive_ns,
-        host_start_ns=info.host_start_ns,
-        clock_sigma_ns=info.clock_sigma_ns,
-        alignment_sigma_ns=info.alignment_sigma_ns,
-        exposure_offset_ns=info.exposure_offset_ns,
-    )
+    pixels = np.frombuffer(data, _COUNTS).astype(np.uint16, copy=False).reshape(shape)
+    slopes = np.array(info.slopes) if info.slopes else None
+    return Frame(pixels=pixels, mask=mask, slopes=slopes, **{name: getattr(info, name) for name in _OF_FRAME})
 
 
 @lru_cache(maxsize=8)
@@ -141,12 +115,8 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
     axes, n_states = estimate.end_state.shape
     spread = estimate.innovation_covariance.ravel()
     message = pb.Estimate(
-        estimator=estimate.estimator,
-        frame_id=estimate.frame_id,
-        first_step=estimate.first_step,
-        n_steps=estimate.n_steps,
+        **{name: getattr(estimate, name) for name in _OF_ESTIMATE},
         status=pb.Estimate.Status.Name(estimate.status),
-        reason=estimate.reason,
         axes=axes,
         n_states=n_states,
         n_coefficients=estimate.coefficients.shape[1],
@@ -200,12 +170,8 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         )
         start_covariance = alignment.added_to(start_covariance, "coefficients")
     return Estimate(
-        estimator=message.estimator,
-        frame_id=message.frame_id,
-        first_step=message.first_step,
-        n_steps=message.n_steps,
+        **{name: getattr(message, name) for name in _OF_ESTIMATE},
         status=Status(message.status),
-        reason=message.reason,
         start_state=coefficients[:, :n].copy(),
         start_covariance=start_covariance,
         end_state=_array(message.end_state, axes, n),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError
 from aolink.estimation import Estimate, Scorer
+from aolink.exporting.common import Progress, no_progress
 from aolink.exposure import Exposure
 from aolink.files import check_target, writing
 from aolink.numerics.workers import processes
 from aolink.optics.scene import scene_motion
 from aolink.recording import convert, schemas_pb2, topics
-from aolink.recording.editing import RecordingCopy
+from aolink.recording.editing import RecordingCopy, recorded_estimate
 from aolink.recording.reader import RawMessage, Recording
 from aolink.recording.reestimate import check_has_exposures, reestimated
 from aolink.restoration import RestoredPictures, deblur, find_method
@@ -50,7 +51,7 @@ class Summary:
 
 def write_deblurred(
     recording: Recording, path: Path, *, estimator: str, method: str = DEFAULT_METHOD, overwrite: bool = False,
-    workers: int = 0, progress: Callable[[int], None] = lambda exposures: None,
+    workers: int = 0, progress: Progress = no_progress,
 ) -> Summary:  # fmt: skip
     """Copy a recording with its pictures restored.
 
@@ -77,21 +78,22 @@ def write_deblurred(
         "deblurred_with": f"{estimator} {method}",
         "recorded_with": recording.metadata.get("aolink_version", "unknown"),
     }
-    with writing(path, overwrite=overwrite, sources=recording.files, error=RecordingError) as partial:
-        return _written(recording, partial, made, held, estimator, notes, progress)
+    with (
+        writing(path, overwrite=overwrite, sources=recording.files, error=RecordingError) as partial,
+        RecordingCopy(recording, partial, recording.metadata | notes) as copy,
+    ):
+        return _written(recording, copy, made, held, estimator, progress)
 
 
 def _written(
     recording: Recording,
-    path: Path,
+    copy: RecordingCopy,
     made: Iterator[tuple[Exposure, Estimate, RestoredPictures]],
     held: tuple[Exposure, Estimate, RestoredPictures] | None,
     estimator: str,
-    notes: dict[str, str],
-    progress: Callable[[int], None],
+    progress: Progress,
 ) -> Summary:
     true_scene = recording.true_scene
-    copy = RecordingCopy(recording, path, recording.metadata | notes)
     summary, log_times = Summary(), dict[int, int]()
     left_out: tuple[str, ...] = (topics.RESTORED,)
     if estimator not in recording.estimators:
@@ -99,37 +101,29 @@ def _written(
     elif skipped := len(recording.skipped(estimator)):
         summary.reasons["the session had no time to estimate it: `aolink estimate -o` does"] = skipped
 
-    def add(topic: str, message: Message, log_time_ns: int) -> None:
-        data = message.SerializeToString(deterministic=True)
-        copy.add(RawMessage(topic, message.DESCRIPTOR.full_name, log_time_ns, 0, data))
-
     def emit(exposure: Exposure, estimate: Estimate, done: RestoredPictures) -> None:
         log_time_ns = log_times.pop(exposure.frame_id, recording.end_ns)
         if estimator not in recording.estimators:
-            add(topics.estimate_topic(estimator), convert.estimate_message(estimate), log_time_ns)
+            copy.add(recorded_estimate(estimate, log_time_ns))
         for topic, message in _messages(done, exposure.host_start_ns):
-            add(topic, message, log_time_ns)
+            copy.add(RawMessage.of(topic, message, log_time_ns))
         _score(summary, recording.rig, true_scene, exposure, estimate, done)
         progress(summary.exposures)
 
-    try:
-        for raw in recording.raw_messages():
-            if raw.topic == topics.EXPOSURE:
-                frame_id = schemas_pb2.ExposureInfo.FromString(raw.data).frame_id
-                # What belongs to the exposures before this one has all gone by.
-                while held is not None and held[0].frame_id < frame_id:
-                    emit(*held)
-                    held = next(made, None)
-                log_times[frame_id] = raw.log_time_ns
-            if not raw.topic.startswith(left_out):
-                copy.add(raw)
-        while held is not None:
-            emit(*held)
-            held = next(made, None)
-        copy.finish(recording.losses)
-    except BaseException:
-        copy.give_up()
-        raise
+    for raw in recording.raw_messages():
+        if raw.topic == topics.EXPOSURE:
+            frame_id = schemas_pb2.ExposureInfo.FromString(raw.data).frame_id
+            # What belongs to the exposures before this one has all gone by.
+            while held is not None and held[0].frame_id < frame_id:
+                emit(*held)
+                held = next(made, None)
+            log_times[frame_id] = raw.log_time_ns
+        if not raw.topic.startswith(left_out):
+            copy.add(raw)
+    while held is not None:
+        emit(*held)
+        held = next(made, None)
+    copy.finish(recording.losses)
     return summary
 
 
@@ -139,13 +133,9 @@ def _estimated(recording: Recording, name: str) -> Iterator[tuple[Exposure, Esti
         for exposure, (estimate,) in reestimated(recording, [name]):
             yield replace(exposure, truth=None), estimate
         return
-    recorded = recording.iter_estimates(name)
-    ahead = next(recorded, None)
-    for exposure in recording.exposures():
-        while ahead is not None and ahead.frame_id < exposure.frame_id:
-            ahead = next(recorded, None)
-        if ahead is not None and ahead.frame_id == exposure.frame_id:
-            yield replace(exposure, truth=None), ahead
+    for exposure, (recorded,) in recording.with_estimates([name]):
+        if recorded is not None:
+            yield replace(exposure, truth=None), recorded
 
 
 def _deblurred(

@@ -1,20 +1,26 @@
-"""Recordings made from recordings: salvaged, cut, merged. Messages are copied as bytes; sources stay untouched."""
+"""Recordings made from recordings: salvaged, cut, merged, and side files.
+
+Messages are copied as bytes; sources stay untouched.
+"""
 
 from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from google.protobuf.message import DecodeError, Message
 from mcap.records import Schema
 from mcap.well_known import MessageEncoding
 
 from aolink.errors import RecordingError
+from aolink.estimation import Estimate
+from aolink.exporting.common import Progress, no_progress
 from aolink.files import open_unfinished, writing
-from aolink.recording import topics
+from aolink.recording import convert, topics
 from aolink.recording.lead import Lead
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import RawMessage, Recording, in_time
@@ -26,14 +32,14 @@ _ALIKE_NS = 2_000_000_000
 """Largest difference in log time at which equal messages in two files are one message."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True)
 class Edited:
     """The contents of a new recording, and what was lost."""
 
     path: Path
-    messages: int = 0
-    exposures: int = 0
-    losses: list[Loss] = field(default_factory=list)
+    messages: int
+    exposures: int
+    losses: list[Loss]
     """Parts of the source that could not be read."""
 
 
@@ -43,24 +49,37 @@ class RecordingCopy:
     Parameters
     ----------
     path:
-        An empty file that is there already, as `aolink.files.writing` gives one.
+        An empty file that is there already, as `aolink.files.writing` gives one. It is cut back to its last whole part
+        where a ``with`` block ends before `finish`.
     notes:
         Facts about the session in the place of those that the source has.
+    attachments:
+        Those of the source by default.
     """
 
-    def __init__(self, source: Recording, path: Path, notes: dict[str, str]) -> None:
-        self.result = Edited(path)
+    def __init__(
+        self, source: Recording, path: Path, notes: dict[str, str], attachments: Mapping[str, bytes] | None = None
+    ) -> None:
+        self.messages = self.exposures = 0
+        """How many have been written."""
         self._foreign, self._encodings = source.schemas, source.encodings
         self._schemas: dict[str, Schema] = {}
         self._file = McapFile(path, WriteOptions(), descriptor=open_unfinished(path))
-        begin_recording(self._file, source.rig, notes, source.start_ns, source.attachments)
+        attachments = source.attachments if attachments is None else attachments
+        begin_recording(self._file, source.rig, notes, source.start_ns, attachments)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.cut_back()  # nothing, where it is finished
 
     def add(self, message: RawMessage) -> None:
         schema = self._schemas.get(message.schema) or self._schema(message.schema)
-        self.result.messages += 1
-        self.result.exposures += message.topic == topics.EXPOSURE
+        self.messages += 1
+        self.exposures += message.topic == topics.EXPOSURE
         encoding = self._encodings.get(message.topic, MessageEncoding.Protobuf)
-        self._file.add(message.topic, schema, message.data, message.log_time_ns, self.result.messages, encoding)
+        self._file.add(message.topic, schema, message.data, message.log_time_ns, self.messages, encoding)
 
     def _schema(self, name: str) -> Schema:
         """That of this aolink, or of a kind that it does not know the source's."""
@@ -69,23 +88,37 @@ class RecordingCopy:
         self._schemas[name] = schema = schema or Schema(id=0, name=name, encoding="", data=b"")
         return schema
 
-    def finish(self, losses: list[Loss], end: dict[str, str] | None = None) -> Edited:
+    def finish(self, losses: Sequence[Loss] = (), end: Mapping[str, str] | None = None) -> None:
         """Write the index, and ``end`` as facts from the session's end."""
-        self.result.losses = losses
         damage = {"damage": "; ".join(loss.what for loss in losses[:20])} if losses else {}
-        if end or damage:
-            self._file.add_metadata(topics.END_METADATA, (end or {}) | damage)
+        if facts := {**(end or {}), **damage}:
+            self._file.add_metadata(topics.END_METADATA, facts)
         self._file.finish()
-        return self.result
-
-    def give_up(self) -> None:
-        """Close the file as it is."""
-        self._file.cut_back()
 
 
-def recover(
-    source: Path, target: Path, *, overwrite: bool = False, progress: Callable[[int], None] = lambda exposures: None
-) -> Edited:
+def side_file(recording: Recording, path: Path, notes: dict[str, str]) -> RecordingCopy:
+    """A side file that is being written: the same estimates give the same bytes, but for the facts from its end.
+
+    Parameters
+    ----------
+    recording:
+        What is estimated, with the rig that it is estimated with.
+    path:
+        An empty file that is there already, as `aolink.files.writing` gives one.
+    notes:
+        Facts about the estimates.
+    """
+    known = {key: value for key in ("session", "rig") if (value := recording.metadata.get(key)) is not None}
+    facts = {"estimated_from": recording.path.name, topics.SIDE_OF: recording.digest}
+    return RecordingCopy(recording, path, known | facts | notes, attachments={})
+
+
+def recorded_estimate(estimate: Estimate, log_time_ns: int) -> RawMessage:
+    """An estimate as the message that it is recorded as."""
+    return RawMessage.of(topics.estimate_topic(estimate.estimator), convert.estimate_message(estimate), log_time_ns)
+
+
+def recover(source: Path, target: Path, *, overwrite: bool = False, progress: Progress = no_progress) -> Edited:
     """Copy the undamaged parts of a recording into a new one with an index.
 
     Raises
@@ -98,21 +131,13 @@ def recover(
     if not recording.counts:
         raise RecordingError(f"{source} holds no whole message: there is nothing to recover")
     notes = recording.metadata | {"recovered_from": source.name}
-    with writing(target, overwrite=overwrite, sources=[source], error=RecordingError) as partial:
-        result = _copied(recording, partial, recording.raw_messages(), notes, None, progress)
-    result.path = target
-    return result
+    return _copied([recording], target, recording.raw_messages(), notes, overwrite, progress)
 
 
 def cut(
-    source: Path,
-    target: Path,
-    start_s: float,
-    end_s: float,
-    *,
-    overwrite: bool = False,
-    progress: Callable[[int], None] = lambda exposures: None,
-) -> Edited:
+    source: Path, target: Path, start_s: float, end_s: float, *, overwrite: bool = False,
+    progress: Progress = no_progress,
+) -> Edited:  # fmt: skip
     """Copy the exposures that were received between two times, s from the recording's start, with all they need.
 
     The commands that were given before and reach into the first exposure come along, and the reports on the last one.
@@ -127,13 +152,9 @@ def cut(
     recording = Recording(source)
     low, high = (recording.start_ns + round(t * 1e9) for t in (min(start_s, 1e9), min(end_s, 1e9)))
     notes = _begun(recording) | {"cut_from": source.name, "cut": f"{start_s:g} s to {end_s:g} s"}
-    with writing(target, overwrite=overwrite, sources=[source], error=RecordingError) as partial:
-        result = _copied(recording, partial, _between(recording, low, high), notes, None, progress)
-        if not result.exposures:
-            duration_s = (recording.end_ns - recording.start_ns) / 1e9
-            raise RecordingError(f"{source} has no exposure {between(start_s, end_s)}: it is {duration_s:.3g} s long")
-    result.path = target
-    return result
+    duration_s = (recording.end_ns - recording.start_ns) / 1e9
+    nothing = f"{source} has no exposure {between(start_s, end_s)}: it is {duration_s:.3g} s long"
+    return _copied([recording], target, _between(recording, low, high), notes, overwrite, progress, nothing=nothing)
 
 
 def between(start_s: float, end_s: float) -> str:
@@ -142,11 +163,7 @@ def between(start_s: float, end_s: float) -> str:
 
 
 def merge(
-    sources: Sequence[Path],
-    target: Path,
-    *,
-    overwrite: bool = False,
-    progress: Callable[[int], None] = lambda exposures: None,
+    sources: Sequence[Path], target: Path, *, overwrite: bool = False, progress: Progress = no_progress
 ) -> Edited:
     """Join the parts of one session, in any order. Messages that are in several parts are written once.
 
@@ -165,11 +182,8 @@ def merge(
                 f"{other.path} is not of the same session as {first.path}: only parts of one session can be merged"
             )
     notes = _begun(first) | {"merged_from": " ".join(each.path.name for each in recordings)}
-    with writing(target, overwrite=overwrite, sources=sources, error=RecordingError) as partial:
-        result = _copied(first, partial, _joined(recordings), notes, recordings[-1].end_metadata, progress)
-    result.losses = [loss for each in recordings for loss in each.losses]
-    result.path = target
-    return result
+    end = recordings[-1].end_metadata
+    return _copied(recordings, target, _joined(recordings), notes, overwrite, progress, end=end)
 
 
 def _begun(recording: Recording) -> dict[str, str]:
@@ -183,22 +197,22 @@ def _identity(recording: Recording) -> tuple[str, str]:
 
 
 def _copied(
-    recording: Recording,
-    path: Path,
-    messages: Iterator[RawMessage],
-    notes: dict[str, str],
-    end: dict[str, str] | None,
-    progress: Callable[[int], None],
-) -> Edited:
-    copy = RecordingCopy(recording, path, notes)
-    try:
+    recordings: Sequence[Recording], target: Path, messages: Iterator[RawMessage], notes: dict[str, str],
+    overwrite: bool, progress: Progress, *, end: Mapping[str, str] | None = None, nothing: str = "",
+) -> Edited:  # fmt: skip
+    """Write messages of these recordings; ``nothing`` is what is wrong where there is no exposure among them."""
+    first, sources = recordings[0], [path for each in recordings for path in each.files]
+    with (
+        writing(target, overwrite=overwrite, sources=sources, error=RecordingError) as partial,
+        RecordingCopy(first, partial, notes) as copy,
+    ):
         for message in messages:
             copy.add(message)
-            progress(copy.result.exposures)
-        return copy.finish(recording.losses, end)
-    except BaseException:
-        copy.give_up()
-        raise
+            progress(copy.exposures)
+        if nothing and not copy.exposures:
+            raise RecordingError(nothing)
+        copy.finish(first.losses, end)
+    return Edited(target, copy.messages, copy.exposures, [loss for each in recordings for loss in each.losses])
 
 
 def _decoded(message: RawMessage) -> Message | None:
@@ -223,7 +237,7 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
         if raw.topic == topics.EXPOSURE and message is not None:
             if inside:
                 if not frames:
-                    yield from _raw(lead)
+                    yield from (RawMessage.of(*each) for each in lead.messages())
                 frames.add(message.frame_id)  # type: ignore[attr-defined]
                 last_step = message.last_step  # type: ignore[attr-defined]
                 yield raw
@@ -241,12 +255,6 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
             yield raw
         if message is not None and not frames:
             lead.add(raw.topic, message, raw.log_time_ns, raw.sequence)
-
-
-def _raw(lead: Lead) -> Iterator[RawMessage]:
-    for topic, message, log_time_ns, sequence in lead.messages():
-        data = message.SerializeToString(deterministic=True)
-        yield RawMessage(topic, message.DESCRIPTOR.full_name, log_time_ns, sequence, data)
 
 
 def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:

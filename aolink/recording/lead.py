@@ -15,23 +15,18 @@ class Lead:
     """Follows the messages of a recording, and keeps those that later exposures are made from."""
 
     def __init__(self) -> None:
-        self._kept: deque[tuple[str, Message, int, int]] = deque()
+        self._kept: deque[tuple[str, wire.CommandBlock | wire.Applied, int, int]] = deque()
 
     def add(self, topic: str, message: Message, log_time_ns: int, sequence: int) -> None:
         """Take the next message."""
-        if topics.named(topic).belongs_to == "steps":
+        if isinstance(message, wire.CommandBlock | wire.Applied):
             self._kept.append((topic, message, log_time_ns, sequence))
         elif topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
             # Exposures still to come begin after the last step of this one.
-            self._kept = deque(each for each in self._kept if _end_step(each[1]) > message.last_step + 1)
+            self._kept = deque(
+                each for each in self._kept if each[1].first_step + each[1].n_steps > message.last_step + 1
+            )
 
     def messages(self) -> Iterator[tuple[str, Message, int, int]]:
         """Topic, message, log time and sequence of what is kept, in order."""
         return iter(self._kept)
-
-
-def _end_step(message: Message) -> int:
-    """First fast step after a block."""
-    if not isinstance(message, wire.CommandBlock | wire.Applied):
-        raise TypeError(f"{type(message).__name__} has no fast steps")
-    return int(message.first_step + message.n_steps)

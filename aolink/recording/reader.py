@@ -29,7 +29,7 @@ from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.frame_index import FrameIndex, StepRun
 from aolink.recording.remote import Url, location, only_paths
-from aolink.recording.scan import Loss, chunk_at, open_recording, read_summary, record_at, scan
+from aolink.recording.scan import Loss, Summary, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.recording.slices import RecordingSlice
 from aolink.rig import Rig, parse_rig
 from aolink.wire.messages_pb2 import Applied, CommandBlock
@@ -63,6 +63,12 @@ class RawMessage(NamedTuple):
     log_time_ns: int
     sequence: int
     data: bytes
+
+    @classmethod
+    def of(cls, topic: str, message: Message, log_time_ns: int, sequence: int = 0) -> RawMessage:
+        """A message as it is written: the same fields always give the same bytes."""
+        data = message.SerializeToString(deterministic=True)
+        return cls(topic, message.DESCRIPTOR.full_name, log_time_ns, sequence, data)
 
 
 class Recording(Series):
@@ -126,6 +132,7 @@ class Recording(Series):
         self._index: list[ChunkIndex] | None = None
         self._left_out: frozenset[str] = frozenset()
         """Topics that side files have instead."""
+        self._second_rig_text: str | None = None
         rig_text = self._survey(check=check)
         if rig_text is None:
             raise RecordingError(f"{self.path} is an MCAP file but not a recording of aolink: it holds no rig file")
@@ -218,9 +225,7 @@ class Recording(Series):
         """The exposure model that expands the recorded coefficients."""
         return exposure_model(self.rig.plant, self.rig.timing.exposure_steps)
 
-    def messages(
-        self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[RecordedMessage]:
+    def messages(self, *wanted: str, start_ns: int = 0, end_ns: int = _END_OF_TIME) -> Iterator[RecordedMessage]:
         """The messages of some topics (of all, if none is named) in the order in which they were recorded.
 
         With ``start_ns`` (inclusive) and ``end_ns`` (exclusive) those whose log time is between them; with
@@ -258,23 +263,13 @@ class Recording(Series):
         return run if len(run.u) == 8 * run.n_steps * self.rig.n_inputs else None
 
     def raw_messages(
-        self, *wanted: str, start_ns: int | None = None, end_ns: int | None = None
+        self, *wanted: str, start_ns: int = 0, end_ns: int = _END_OF_TIME, first_chunk: int = 0
     ) -> Iterator[RawMessage]:
-        """As `messages`, as bytes, and those of other software too."""
-        low = start_ns if start_ns is not None else 0
-        return self._raw(wanted, low, end_ns if end_ns is not None else _END_OF_TIME)
-
-    def _raw(
-        self, wanted: Collection[str], low: int = 0, high: int = _END_OF_TIME, chunks: slice = slice(None)
-    ) -> Iterator[RawMessage]:
-        """The messages in some chunks of the index, if there is one, with those of side files.
-
-        They are of all topics if none is ``wanted``.
-        """
-        own = self._own_messages(wanted, low, high, chunks)
+        """As `messages`, as bytes, and those of other software too; with an index, from one of its chunks on."""
+        own = self._own_messages(wanted, start_ns, end_ns, slice(first_chunk, None))
         if not self._side:
             return own
-        others = (each.raw_messages(*wanted, start_ns=low, end_ns=high) for each in self._side)
+        others = (each.raw_messages(*wanted, start_ns=start_ns, end_ns=end_ns) for each in self._side)
         timed = heapq.merge(*map(in_time, (own, *others)), key=lambda each: each[0])
         return (raw for _, raw in timed)
 
@@ -291,24 +286,6 @@ class Recording(Series):
             if isinstance(record, McapMessage) and record.channel_id in channels and low <= record.log_time < high:
                 topic, schema = channels[record.channel_id]
                 yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
-
-    def assembled(self, *others: str) -> Iterator[tuple[RecordedMessage | None, list[Exposure]]]:
-        """Messages with the exposures that each completes, as they were in the session.
-
-        The messages are those of the topics ``others`` (of all, if none is named), besides those that make exposures.
-        Exposures that were still incomplete when the recording ended come last, with None.
-        """
-        return self._assembled(others)
-
-    def _assembled(
-        self, others: tuple[str, ...], chunks: slice = slice(None)
-    ) -> Iterator[tuple[RecordedMessage | None, list[Exposure]]]:
-        assembly = ExposureAssembly(self.rig)
-        for raw in self._raw((*others, *_ASSEMBLED) if others else (), chunks=chunks):
-            if (message := self.decoded(raw)) is not None:
-                recorded = RecordedMessage(raw.topic, raw.log_time_ns, raw.sequence, message)
-                yield recorded, assembly.take(recorded.topic, message)
-        yield None, assembly.flush()
 
     def __len__(self) -> int:
         return self.n_frames
@@ -341,31 +318,30 @@ class Recording(Series):
         if stop is not None and stop <= start:
             return iter(())
         chunk, before = self._beginning(start)
-        exposures = (exposure for _, exposure in self._timed(chunk))
+        exposures = (exposure for _, exposure in self.timed_exposures(chunk))
         return islice(exposures, start - before, None if stop is None else stop - before)
 
-    def timed_exposures(self) -> Iterator[tuple[int, Exposure]]:
-        """As `exposures`, each after the log time of the message that it was whole with, ns."""
-        return self._timed(0)
+    def timed_exposures(self, first_chunk: int = 0) -> Iterator[tuple[int, Exposure]]:
+        """As `exposures`, each after the log time of the message that it was whole with, ns.
 
-    def _timed(self, chunk: int) -> Iterator[tuple[int, Exposure]]:
-        for now, exposures in self._whole_exposures(chunk):
-            for exposure in exposures:
-                yield now, exposure
-
-    def _whole_exposures(self, chunk: int) -> Iterator[tuple[int, list[Exposure]]]:
+        With ``first_chunk`` those of a file with an index that are whole by what is in that chunk and after it.
+        """
         now = 0
         assembly, beside = ExposureAssembly(self.rig), Companions(self.counts)
-        for raw in self._raw((*_ASSEMBLED, *_BESIDE), chunks=slice(chunk, None)):
+        for raw in self.raw_messages(*_ASSEMBLED, *_BESIDE, first_chunk=first_chunk):
             if (message := self.decoded_run(raw) or self.decoded(raw)) is None:
                 continue
             now = raw.log_time_ns
             if raw.topic in _BESIDE:
-                yield now, beside.take(raw.topic, message)
+                whole = beside.take(raw.topic, message)
             elif completed := assembly.take(raw.topic, message):
-                yield now, beside.add(completed)
-        yield now, beside.add(assembly.flush())
-        yield now, beside.flush()
+                whole = beside.add(completed)
+            else:
+                continue
+            for exposure in whole:
+                yield now, exposure
+        for exposure in (*beside.add(assembly.flush()), *beside.flush()):
+            yield now, exposure
 
     def _beginning(self, number: int) -> tuple[int, int]:
         """Where to read from so that an exposure is made as from the file's start: a chunk, and the frames before it.
@@ -386,7 +362,7 @@ class Recording(Series):
             reach = {topics.APPLIED: info.first_step, topics.COMMAND: info.first_step - self.rig.mirror.queue_steps}
             reach = {topic: step for topic, step in reach.items() if self.counts.get(topic)}
             chunk = index.first_chunk(first, reach, self._runs_in)
-            known = next(islice(self._timed(chunk), first - index.before[chunk], None), None)
+            known = next(islice(self.timed_exposures(chunk), first - index.before[chunk], None), None)
             if known is None:
                 break
             if not known[1].inputs_assumed:
@@ -454,9 +430,7 @@ class Recording(Series):
         waiting: deque[schemas_pb2.Estimate] = deque()
         ended, done = False, -1
         """Whether all of the exposures have come, and the last of them that has had its estimate."""
-        wanted = (topics.estimate_topic(name), topics.estimation_topic(name))
-        for recorded, completed in self._assembled(wanted, slice(chunk, None)):
-            received = None if recorded is None else recorded.message
+        for received, completed in self._beside_exposures(name, chunk):
             if isinstance(received, schemas_pb2.Estimate):
                 waiting.append(received)
             elif isinstance(received, schemas_pb2.Estimation) and received.skipped:
@@ -467,7 +441,7 @@ class Recording(Series):
                     exposures[exposure.frame_id] = exposure
             # At the end of the recording, an exposure that has not come will not; nor will one of the part before this.
             first = next(iter(exposures), 0)
-            while waiting and (recorded is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
+            while waiting and (received is None or waiting[0].frame_id in exposures or waiting[0].frame_id < first):
                 message = waiting.popleft()
                 if message.frame_id not in exposures:
                     continue
@@ -479,6 +453,18 @@ class Recording(Series):
             last = next(reversed(exposures), done)
             if ended and (last == done or (waiting and waiting[0].frame_id > last)):
                 return
+
+    def _beside_exposures(self, name: str, first_chunk: int) -> Iterator[tuple[Message | None, list[Exposure]]]:
+        """Messages of exposures and of an estimator, each with the exposures that it completes.
+
+        The exposures that were incomplete when the recording ended come last, with None.
+        """
+        assembly = ExposureAssembly(self.rig)
+        wanted = (topics.estimate_topic(name), topics.estimation_topic(name), *_ASSEMBLED)
+        for raw in self.raw_messages(*wanted, first_chunk=first_chunk):
+            if (message := self.decoded(raw)) is not None:
+                yield message, assembly.take(raw.topic, message)
+        yield None, assembly.flush()
 
     def _take_side(self, rig: Rig | None) -> None:
         """Put the estimates of side files in the place of the file's own."""
@@ -508,35 +494,22 @@ class Recording(Series):
 
     def _survey(self, *, check: bool) -> str | None:
         """Find out what is in the file: from its index, or else by a scan. Gives the text of the rig file."""
-        rig_texts: dict[str, str] = {}
         with open_recording(self.path) as file:
             summary = None if check else read_summary(file)
-            if summary is not None and summary.is_index and summary.statistics is not None:
-                self._index = summary.chunks
-                for schema in summary.schemas.values():
-                    self.schemas[schema.name] = schema
-                for channel in summary.channels.values():
-                    known = summary.schemas.get(channel.schema_id)
-                    self._channels[channel.id] = (channel.topic, known.name if known else "")
-                    self.encodings[channel.topic] = channel.message_encoding
-                statistics = summary.statistics
-                for channel_id, count in sorted(statistics.channel_message_counts.items()):
-                    if channel_id in self._channels:
-                        self.counts[self._channels[channel_id][0]] = count
-                self.start_ns, self.end_ns = statistics.message_start_time, statistics.message_end_time
-                others = sorted(summary.others, key=lambda each: each.offset)
-                with open_recording(self.path, [(each.offset, each.length) for each in others]) as again:
-                    for each in others:
-                        self._note(record_at(again, each.offset), rig_texts)
-                return rig_texts.get(topics.RIG_ATTACHMENT, rig_texts.get(topics.RIG_METADATA))
+        held: dict[int, int] = {}
+        """Number of messages by the channel's id."""
+        if summary is not None and summary.is_index and (known := summary.statistics) is not None:
+            self._index, held = summary.chunks, dict(sorted(known.channel_message_counts.items()))
+            self.start_ns, self.end_ns = known.message_start_time, known.message_end_time
+            records = self._summarised(summary)
+        else:
+            records = self._scanned()
         ids: dict[int, str] = {}
-        names: dict[int, int] = {}
-        first_ns: int | None = None
-        for record, sure in self._scanned():
+        for record, sure in records:
             if isinstance(record, McapMessage):
-                names[record.channel_id] = names.get(record.channel_id, 0) + 1
-                first_ns = record.log_time if first_ns is None else min(first_ns, record.log_time)
+                self.start_ns = min(self.start_ns, record.log_time) if held else record.log_time
                 self.end_ns = max(self.end_ns, record.log_time)
+                held[record.channel_id] = held.get(record.channel_id, 0) + 1
             elif isinstance(record, Schema):
                 if sure or record.id not in ids:
                     ids[record.id] = record.name
@@ -548,27 +521,35 @@ class Recording(Series):
                     self._channels[record.id] = (record.topic, kind)
                     self.encodings[record.topic] = record.message_encoding
             else:
-                self._note(record, rig_texts)
-        self.start_ns = first_ns or 0
-        for channel_id, count in names.items():
+                self._note(record)
+        for channel_id, number in held.items():
             if channel_id in self._channels:
-                self.counts[self._channels[channel_id][0]] = count
-        return rig_texts.get(topics.RIG_ATTACHMENT, rig_texts.get(topics.RIG_METADATA))
+                self.counts[self._channels[channel_id][0]] = number
+        attached = self.attachments.get(topics.RIG_ATTACHMENT)
+        return self._second_rig_text if attached is None else attached.decode(errors="replace")
 
-    def _note(self, record: McapRecord | None, rig_texts: dict[str, str]) -> None:
+    def _summarised(self, summary: Summary) -> Iterator[tuple[McapRecord, bool]]:
+        """What the index of the file names besides its chunks, and that it is what was written."""
+        for record in (*summary.schemas.values(), *summary.channels.values()):
+            yield record, True
+        others = sorted(summary.others, key=lambda each: each.offset)
+        with open_recording(self.path, [(each.offset, each.length) for each in others]) as file:
+            for each in others:
+                if (found := record_at(file, each.offset)) is not None:
+                    yield found, True
+
+    def _note(self, record: McapRecord) -> None:
         """Keep what an attachment or metadata says."""
         if isinstance(record, Attachment):
             self.attachments[record.name] = record.data
-            if record.name == topics.RIG_ATTACHMENT:
-                rig_texts[record.name] = record.data.decode(errors="replace")
         elif isinstance(record, Metadata):
             values = record.metadata
             if record.name in (topics.SESSION_METADATA, topics.END_METADATA):
                 self.metadata.update(values)
                 if record.name == topics.END_METADATA:
                     self.end_metadata.update(values)
-            elif record.name == topics.RIG_METADATA and "toml" in values:
-                rig_texts[record.name] = values["toml"]
+            elif record.name == topics.RIG_METADATA:
+                self._second_rig_text = values.get("toml", self._second_rig_text)
             elif record.name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
                 self._channels.setdefault(int(values["id"]), (values.get("topic", ""), values.get("schema", "")))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -11,10 +11,11 @@ import numpy as np
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Engine, Estimate, Score, Scorer
 from aolink.estimation.estimate import COMPARED
+from aolink.exporting.common import Progress, no_progress
 from aolink.exposure import Exposure
 from aolink.files import writing
-from aolink.recording import convert, schemas_pb2, topics
-from aolink.recording.editing import RecordingCopy
+from aolink.recording import schemas_pb2, topics
+from aolink.recording.editing import RecordingCopy, recorded_estimate
 from aolink.recording.exposures import ExposureAssembly
 from aolink.recording.reader import RawMessage, Recording, check_stands_alone
 
@@ -27,7 +28,7 @@ _BYTES_AT_ONCE = 4 << 20
 def reestimate(
     recording: Recording,
     names: Sequence[str],
-    progress: Callable[[int], None] = lambda exposures: None,
+    progress: Progress = no_progress,
     *,
     as_recorded: bool = False,
 ) -> dict[str, list[Estimate]]:
@@ -51,7 +52,7 @@ def reestimate(
 def reestimated(
     recording: Recording,
     names: Sequence[str],
-    progress: Callable[[int], None] = lambda exposures: None,
+    progress: Progress = no_progress,
     engine: Engine = "aolink",
     *,
     as_recorded: bool = False,
@@ -66,6 +67,16 @@ def reestimated(
 def skipped_by(recording: Recording, names: Sequence[str]) -> dict[str, frozenset[int]]:
     """Frame ids of the exposures that estimators skipped in the session, by the names of those that skipped any."""
     return {name: skipped for name in names if (skipped := recording.skipped(name))}
+
+
+def scored(recording: Recording, names: Sequence[str]) -> dict[str, Score]:
+    """Scores of the estimates in a recording against its truth, by name; one exposure at a time is in memory."""
+    scorers = {name: Scorer() for name in names}
+    for exposure, estimates in recording.with_estimates(names):
+        for estimate in estimates:
+            if estimate is not None:
+                scorers[estimate.estimator].add(exposure, estimate)
+    return {name: scorer.result() for name, scorer in scorers.items()}
 
 
 def scored_and_compared(
@@ -118,7 +129,7 @@ def write_reestimated(
     *,
     only: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int], None] = lambda exposures: None,
+    progress: Progress = no_progress,
     engine: Engine = "aolink",
     as_recorded: bool = False,
 ) -> None:
@@ -147,7 +158,7 @@ def fill_reestimated(
     path: Path,
     *,
     only: bool = False,
-    progress: Callable[[int], None] = lambda exposures: None,
+    progress: Progress = no_progress,
     engine: Engine = "aolink",
     as_recorded: bool = False,
 ) -> None:
@@ -161,20 +172,14 @@ def fill_reestimated(
     }
     if engine != "aolink":
         notes["engine"] = engine
-    copy = RecordingCopy(recording, path, notes)
-    try:
-        done = 0
-        skipped = skipped_by(recording, names) if as_recorded else None
-        # What a session had no time for is told in the copy where that is so of its estimates as well.
-        told = [*kept, *(names if as_recorded else ())]
+    skipped = skipped_by(recording, names) if as_recorded else None
+    # What a session had no time for is told in the copy where that is so of its estimates as well.
+    told = [*kept, *(names if as_recorded else ())]
+    with RecordingCopy(recording, path, notes) as copy:
         for some in _with_estimates(recording, Driver(recording.rig, names, engine, skipped), kept, told):
             copy.add(some)
-            if done < copy.result.exposures:
-                progress(done := copy.result.exposures)
+            progress(copy.exposures)
         copy.finish(recording.losses)
-    except BaseException:
-        copy.give_up()
-        raise
 
 
 def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -> list[str]:
@@ -232,9 +237,7 @@ def _estimated(driver: Driver, messages: Sequence[tuple[RawMessage, list[Exposur
         yield raw
         for _ in completed:
             for estimate in next(made)[1]:
-                message = convert.estimate_message(estimate)
-                topic, kind = topics.estimate_topic(estimate.estimator), message.DESCRIPTOR.full_name
-                yield RawMessage(topic, kind, raw.log_time_ns, 0, message.SerializeToString(deterministic=True))
+                yield recorded_estimate(estimate, raw.log_time_ns)
 
 
 def first_difference(ours: Sequence[Estimate], theirs: Sequence[Estimate]) -> str | None:

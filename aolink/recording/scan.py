@@ -359,17 +359,3 @@ def _decompressed(chunk: Chunk) -> bytes:
     if len(data) != chunk.uncompressed_size:
         raise ValueError("a chunk that is not of the size that it says")
     return data
-
-
-__all__ = [
-    "MAX_RECORD",
-    "Loss",
-    "McapMessage",
-    "Summary",
-    "broken_up",
-    "chunk_at",
-    "open_recording",
-    "read_summary",
-    "record_at",
-    "scan",
-]

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration.psf import line_matrix
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # From this many lines on, products of blocks are faster than solving line by line.
 _MANY_LINES = 64

@@ -16,6 +16,7 @@ from aolink.errors import RestorationError
 from aolink.estimation import Estimate
 from aolink.estimation.estimate import coefficient_roots, motion
 from aolink.exposure import Exposure, step_shares
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.scene import SceneSensor, scene_motion
 from aolink.optics.sensor import Kernel, SpotSensor
@@ -24,8 +25,6 @@ from aolink.restoration.psf import Psf, motion_psf_by_root
 from aolink.restoration.registry import DEFAULT_METHOD
 from aolink.restoration.restore import restore
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -119,13 +118,13 @@ def _unit(image: FloatArray) -> NDArray[np.float32]:
     return np.clip(image, 0.0, 1.0).astype(np.float32)
 
 
-def psnr(picture: FloatArray, scene: FloatArray, mask: NDArray[np.bool_] | None = None) -> float:
+def psnr(picture: FloatArray, scene: FloatArray, mask: BoolArray | None = None) -> float:
     """Peak signal-to-noise ratio, dB, for a peak of one."""
     error = (picture - scene)[... if mask is None else mask]
     return float(-10 * np.log10(np.mean(error**2))) if error.size else math.nan
 
 
-def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: NDArray[np.intp], scene: FloatArray) -> float:
+def blurred_psnr(sensor: SceneSensor, exposure: Exposure, shift_px: Indices, scene: FloatArray) -> float:
     """`psnr` of the scene before restoration, against the true scene moved by the mean displacement.
 
     Parameters

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.errors import RestorationError
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration.psf import line_matrix
 
-FloatArray = NDArray[np.float64]
 Direction = Literal["forward", "backward"]
 
 # Zeros may lie on the unit circle, as those of a uniform PSF do: an error then keeps its size.
@@ -31,39 +30,31 @@ def largest_zero(values: FloatArray) -> float:
     return largest
 
 
-def stable_direction(values: FloatArray) -> Direction:
-    """The direction in which lines can be inverted exactly; backwards the PSF is reversed.
+def stable_direction(values: FloatArray, wanted: Direction | None = None) -> Direction:
+    """The direction in which lines can be inverted exactly, or the one that is wanted; backwards the PSF is reversed.
 
     Raises
     ------
     RestorationError
-        The PSF has zeros on both sides of the unit circle.
+        It is unstable in the direction that is wanted; or in both: the PSF has zeros on both sides of the unit circle.
     """
-    forward, backward = largest_zero(values), largest_zero(values[..., ::-1])
-    if min(forward, backward) > 1 + _ON_CIRCLE:
+    zeros: dict[Direction, float] = {"forward": largest_zero(values), "backward": largest_zero(values[..., ::-1])}
+    best: Direction = "forward" if zeros["forward"] <= zeros["backward"] else "backward"
+    way = wanted or best
+    if zeros[way] <= 1 + _ON_CIRCLE:
+        return way
+    if wanted is None:
         raise RestorationError(
-            f"the exact inverse is unstable: the PSF's largest zero is {forward:.3g} forwards and {backward:.3g} with"
-            " the line scanned backwards, and it must lie within the unit circle; use the method smoother,"
-            " gauss_markov or tv"
+            f"the exact inverse is unstable: the PSF's largest zero is {zeros['forward']:.3g} forwards and"
+            f" {zeros['backward']:.3g} with the line scanned backwards, and it must lie within the unit circle; use the"
+            " method smoother, gauss_markov or tv"
         )
-    return "forward" if forward <= backward else "backward"
-
-
-def check_direction(values: FloatArray, direction: Direction) -> None:
-    """Refuse a direction in which the inverse is unstable, before it runs."""
-    there, back = (largest_zero(v) for v in (values, values[..., ::-1]))
-    found, other = (there, back) if direction == "forward" else (back, there)
-    if found > 1 + _ON_CIRCLE:
-        turned = "backward" if direction == "forward" else "forward"
-        cure = (
-            f"direction={turned!r} is stable ({other:.3g})"
-            if other <= 1 + _ON_CIRCLE
-            else f"so is the other direction ({other:.3g})"
-        )
-        raise RestorationError(
-            f"the exact inverse is unstable {direction}s: the PSF's largest zero is {found:.3g}, and it must lie within"
-            f" the unit circle; {cure}, or use the method smoother, gauss_markov or tv"
-        )
+    turned: Direction = "backward" if way == "forward" else "forward"
+    cure = f"direction={turned!r} is stable" if zeros[turned] <= 1 + _ON_CIRCLE else "so is the other direction"
+    raise RestorationError(
+        f"the exact inverse is unstable {way}s: the PSF's largest zero is {zeros[way]:.3g}, and it must lie within"
+        f" the unit circle; {cure} ({zeros[turned]:.3g}), or use the method smoother, gauss_markov or tv"
+    )
 
 
 def invert_lines(lines: FloatArray, values: FloatArray, known: FloatArray | None) -> FloatArray:

@@ -7,21 +7,19 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from aolink.errors import RestorationError
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration import spectrum
 from aolink.restoration.banded import smooth_lines
-from aolink.restoration.inverse import Direction, check_direction, invert_lines, stable_direction
-from aolink.restoration.kalman import LineModel, kalman, line_model, scene_from_states, smooth
+from aolink.restoration.inverse import Direction, invert_lines, stable_direction
+from aolink.restoration.kalman import kalman, line_model, scene_from_states, smooth
 from aolink.restoration.method import Blurred, Restored
 from aolink.restoration.psf import STRAIGHT_PX
 from aolink.restoration.rotation import to_lines
 from aolink.restoration.scanner import Scanner, first_order
 from aolink.restoration.uncertainty import line_variance
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # States of all lines kept at once, numbers.
 _MOST_KEPT = 20_000_000
@@ -33,8 +31,7 @@ def inverse(
 ) -> Restored:
     """The scene whose blur is exactly this picture; noise and ``scanner`` are ignored."""
     values, origin = _without_delay(picture.psf.values, picture.psf.origin[0])
-    way = _checked_direction(direction) or stable_direction(values)
-    check_direction(values, way)
+    way = stable_direction(values, _checked_direction(direction))
     lines = _Lines.of(picture, values, origin, boundary, way)
     columns = lines.rows.shape[1]
     out = invert_lines(lines.rows, lines.values, lines.known)
@@ -60,7 +57,7 @@ def kalman_estimate(
     way = _checked_direction(direction) or "forward"
     back = None
     if not picture.psf.on_line:
-        planes, seen, back = to_lines(picture.planes, picture.seen, picture.line.angle_rad)
+        planes, seen, back = to_lines(picture.whole, picture.seen, picture.line.angle_rad)
         picture = replace(picture, planes=planes, psf=picture.line.psf, seen=seen)
     psf, noise = picture.psf, picture.noise_variance
     if scanner is None:
@@ -183,7 +180,7 @@ def _estimated(scanned: _Lines, which: str, scanner: Scanner, variance: float) -
     out = np.empty((n_lines, columns))
     for k in range(0, n_lines, step):
         some = slice(k, k + step)
-        here = model if known is None or len(model.start_mean) == 1 else _of_lines(model, some)
+        here = model if len(model.start_mean) == 1 else replace(model, start_mean=model.start_mean[some])
         result = kalman(here, lines[some], variance, None if seen is None else seen[some], keep=which == "smoother")
         if which == "smoother":
             states = smooth(here, result)
@@ -191,7 +188,3 @@ def _estimated(scanned: _Lines, which: str, scanner: Scanner, variance: float) -
             states = result.predicted if which == "predictor" else result.filtered
         out[some] = scene_from_states(model, states, pixels, lag=m if which == "lag" else 0, first=first)
     return np.asarray(out + mean)
-
-
-def _of_lines(model: LineModel, some: slice) -> LineModel:
-    return replace(model, start_mean=model.start_mean[some])

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
 
+from aolink.numerics.arrays import BoolArray
 from aolink.restoration.banded import dense, normal_bands
 from aolink.restoration.psf import Psf, line_matrix
 
 FloatArray = NDArray[np.floating[Any]]
-BoolArray = NDArray[np.bool_]
 
 _THREADS = 2
 _MOST_STEPS = 400

@@ -12,13 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration import spectrum
 from aolink.restoration.inverse import Direction
 from aolink.restoration.psf import Line, Psf, along_line
 from aolink.restoration.scanner import Scanner
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration import spectrum
 from aolink.restoration.markov import Solver, make_solver, plane_solver
 from aolink.restoration.method import Blurred, Restored
@@ -81,7 +82,7 @@ def why_not_pnp(picture: Blurred) -> str | None:
     return "pnp needs one PSF for the whole picture: use tv" if picture.psf.varies else None
 
 
-def _with_edges(picture: Blurred, weights: _Weights) -> tuple[NDArray[np.float64], Solver]:
+def _with_edges(picture: Blurred, weights: _Weights) -> tuple[FloatArray, Solver]:
     # Total variation does not need the last digits; half of them take half of the time.
     level = picture.whole.mean()
     scene, solver = total_variation(

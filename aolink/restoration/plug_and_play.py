@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration.markov import IterativeSolver
 
-FloatArray = NDArray[np.float64]
 Denoiser = Callable[[FloatArray, float], FloatArray]
 """From a picture (rows, columns) and the standard deviation of its noise to the picture without noise."""
 

@@ -11,17 +11,16 @@ and what is restored with it lies where the scene lies when the displacement is 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import erf
 
 from aolink.errors import RestorationError
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.optics.sensor import Kernel
-
-FloatArray = NDArray[np.float64]
 
 # Light beyond this many standard deviations of the kernel is left out, as are taps below this share of the largest.
 _REACH = 5.0
@@ -108,10 +107,8 @@ def as_psf(psf: Psf | ArrayLike) -> Psf:
     if isinstance(psf, Psf):
         return psf
     values = np.asarray(psf, dtype=np.float64)
-    origin = tuple(n // 2 for n in values.shape)
-    if values.ndim in (1, 2) and values.size and np.isfinite(values).all() and values.min() >= 0 and values.sum() > 0:
-        values = values / values.sum()
-    return Psf(values=values, origin=origin)
+    given = Psf(values=values, origin=tuple(n // 2 for n in values.shape))
+    return replace(given, values=values / values.sum())
 
 
 def motion_psf(
@@ -220,9 +217,7 @@ def _correlated_part(spread: FloatArray) -> tuple[FloatArray, FloatArray, FloatA
     return c, points[near], weights[near] / weights[near].sum()
 
 
-def _path_root(covariance: ArrayLike | None, size: int) -> FloatArray:
-    if covariance is None:
-        return np.zeros((size, 1))
+def _path_root(covariance: ArrayLike, size: int) -> FloatArray:
     matrix = np.asarray(covariance, dtype=np.float64)
     if matrix.shape != (size, size) or not np.isfinite(matrix).all():
         raise RestorationError(

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.errors import RestorationError
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration.method import Blurred, Restored
 from aolink.restoration.psf import Psf, as_psf
 from aolink.restoration.registry import DEFAULT_METHOD, check_parameters, find_method
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _COLOURS = (3, 4)
 

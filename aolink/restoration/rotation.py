@@ -6,11 +6,9 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from aolink.numerics.arrays import BoolArray, FloatArray
 
 
 def to_lines(
@@ -21,7 +19,7 @@ def to_lines(
     Parameters
     ----------
     planes:
-        (batch, rows, columns)
+        Pictures with a likely value in each pixel that was not measured, (batch, rows, columns).
     good:
         True where a pixel was measured, (rows, columns).
     angle_rad:
@@ -39,9 +37,6 @@ def to_lines(
     shape = (int(size[0]), int(size[1]))
     here, there = (np.array([rows, columns]) - 1) / 2, (np.array(shape) - 1) / 2
     offset = here - turn @ there
-    if good is not None:
-        nearest = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
-        planes = planes[:, nearest[0], nearest[1]]
     turned = np.stack([ndimage.affine_transform(p, turn, offset, shape, order=3, mode="nearest") for p in planes])
     weight = np.ones((rows, columns)) if good is None else good.astype(np.float64)
     seen = ndimage.affine_transform(weight, turn, offset, shape, order=1, mode="constant") > 0.999

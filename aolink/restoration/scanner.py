@@ -6,12 +6,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import linalg
 
 from aolink.errors import RestorationError
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

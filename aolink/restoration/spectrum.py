@@ -10,13 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, optimize
 
 from aolink.errors import RestorationError
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from aolink.numerics.arrays import BoolArray, FloatArray
 
 # Share of the frequencies, those where the blurred scene is weakest, that are taken to hold noise only.
 _DARK_SHARE = 0.02

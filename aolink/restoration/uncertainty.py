@@ -7,12 +7,10 @@ variance sum_i m_i' R m_i that no restoration with the expected PSF can explain.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, linalg
 
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration.scanner import Scanner
-
-FloatArray = NDArray[np.float64]
 
 _GRID = 256
 

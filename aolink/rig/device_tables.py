@@ -40,7 +40,6 @@ def read_devices(table: Table) -> dict[str, DeviceTable]:
         if table.has(kind):
             device = table.table(kind)
             devices[kind] = DeviceTable(driver=device.text("driver"), delay=_delay(device), options=device.others())
-    table.finish()
     return devices
 
 

@@ -43,47 +43,42 @@ class Disturbance:
 
 def read_disturbance(table: Table) -> Disturbance:
     """The table ``[disturbance]``. Raises `RigError`."""
-    layers: tuple[Layer, ...] = ()
-    pupil = 0.0
-    if table.has("turbulence"):
-        air = table.table("turbulence")
-        pupil = air.number("pupil_m", above=0.0)
-        outer, wavelength = air.number("outer_scale_m", 25.0, above=0.0), air.number("wavelength_m", 500e-9, above=0.0)
-        layers = tuple(_layer(each, outer, wavelength) for each in air.tables("layers"))
-        if not layers:
-            raise RigError(f"{air.key('layers')} is empty: give each layer's r0_m and wind_m_s")
-        air.finish()
+    pupil, layers = table.read_any("turbulence", _turbulence) or (0.0, ())
     zernike = table.matrix("zernike_m", (None, 2), "Noll's index and metres") if table.has("zernike_m") else None
     if zernike is not None and not all(index >= 2 and index == round(index) for index in zernike[:, 0]):
         raise RigError(f"{table.key('zernike_m')}: each row begins with one of Noll's indices, a whole number from 2")
-    disturbance = Disturbance(
+    return Disturbance(
         plant_noise=table.flag("plant_noise", True),
         layers=layers,
         pupil_m=pupil,
-        vibrations=tuple(_vibration(each) for each in table.tables("vibration")),
+        vibrations=table.read_all("vibration", _vibration),
         zernike_m=np.zeros((0, 2)) if zernike is None else zernike,
         recorded=table.text("recorded", ""),
     )
-    table.finish()
-    return disturbance
+
+
+def _turbulence(table: Table) -> tuple[float, tuple[Layer, ...]]:
+    """Width that the lenslets cover, m, and the layers."""
+    pupil = table.number("pupil_m", above=0.0)
+    outer, wavelength = table.number("outer_scale_m", 25.0, above=0.0), table.number("wavelength_m", 500e-9, above=0.0)
+    layers = table.read_all("layers", _layer, outer, wavelength)
+    if not layers:
+        raise RigError(f"{table.key('layers')} is empty: give each layer's r0_m and wind_m_s")
+    return pupil, layers
 
 
 def _layer(table: Table, outer_scale_m: float, wavelength_m: float) -> Layer:
     wind = table.vector("wind_m_s", 2, "along x and y")
-    layer = Layer(
+    return Layer(
         r0_m=table.number("r0_m", above=0.0),
         wind_m_s=(float(wind[0]), float(wind[1])),
         outer_scale_m=outer_scale_m,
         wavelength_m=wavelength_m,
     )
-    table.finish()
-    return layer
 
 
 def _vibration(table: Table) -> Vibration:
     amplitude = table.vector("amplitude", 2, "along x and y")
-    line = Vibration(
+    return Vibration(
         frequency_hz=table.number("frequency_hz", above=0.0), amplitude=(float(amplitude[0]), float(amplitude[1]))
     )
-    table.finish()
-    return line

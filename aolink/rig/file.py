@@ -123,21 +123,21 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
         raise RigError(f"not valid TOML: {error}") from None
     root.finish(*_TABLES)
     name, summary = root.text("name"), root.text("summary", "")
-    timing = read_timing(root.table("timing"))
-    optics = read_optics(root.table("lenslets"), read_grid(root.table("sensor"))) if root.has("lenslets") else None
-    plant = read_plant(root, optics, timing)
+    timing = root.read("timing", read_timing)
+    optics = root.read("lenslets", read_optics, read_grid(root.table("sensor"))) if root.has("lenslets") else None
+    plant = root.read("plant", read_plant, root, optics, timing)
     seen = (optics.field, optics.light) if optics else (None, None)
-    sensor = read_sensor(root.table("sensor"), plant.axes, plant.n_outputs, *seen)
+    sensor = root.read("sensor", read_sensor, plant.axes, plant.n_outputs, *seen)
     n_inputs = plant.axes * plant.n_inputs
-    mirror = read_mirror(root.table("mirror"), n_inputs, timing)
-    drive = read_drive(root.table("drive", optional=True), n_inputs, mirror)
-    disturbance = read_disturbance(root.table("disturbance")) if root.has("disturbance") else None
+    mirror = root.read("mirror", read_mirror, n_inputs, timing)
+    drive = root.read("drive", read_drive, n_inputs, mirror, optional=True)
+    disturbance = root.read_any("disturbance", read_disturbance)
     if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
         raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
-    scene = read_scene(root.table("scene")) if root.has("scene") else None
-    simulation = read_simulation(root.table("simulation", optional=True))
-    calibration = read_calibration(root.table("calibration")) if root.has("calibration") else None
-    devices = read_devices(root.table("devices", optional=True))
+    scene = root.read_any("scene", read_scene)
+    simulation = root.read("simulation", read_simulation, optional=True)
+    calibration = root.read_any("calibration", read_calibration)
+    devices = root.read("devices", read_devices, optional=True)
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
         mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,

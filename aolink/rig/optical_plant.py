@@ -79,7 +79,6 @@ def read_optics(table: Table, grid: tuple[int, ...]) -> Optics:
             f"{table.key('least_light')} = {optics.least_light:g}: no lenslet is lit so much, the brightest has"
             f" {lenslets.light.max():.2g} of its area in the pupil"
         )
-    table.finish()
     return optics
 
 
@@ -157,5 +156,4 @@ def read_voltage(table: Table) -> VoltageLaw:
     )
     if law.max_v <= law.bias_v:
         raise RigError(f"{table.key('bias_v')} = {law.bias_v:g} must be below max_v = {law.max_v:g}")
-    table.finish()
     return law

@@ -24,14 +24,11 @@ _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 def read_scene(table: Table) -> SceneSensor:
     """The table ``[scene]``; the picture itself is not opened. Raises `RigError`."""
-    kernel_table = table.table("kernel")
-    kernel = read_kernel(kernel_table)
-    kernel_table.finish()
     rows, columns = table.integers("pixels", 2, "rows and columns", low=2, high=8192)
     sensor = SceneSensor(
         shape=(rows, columns),
         pixel_scale=table.number("pixel_scale", above=0.0),
-        kernel=kernel,
+        kernel=table.read("kernel", read_kernel),
         noise_sd=table.number("noise_sd", low=0.0),
         bit_depth=table.integer("bit_depth", 16, low=1, high=16),
         black_level=table.number("black_level", 0.0, low=0.0),
@@ -41,7 +38,6 @@ def read_scene(table: Table) -> SceneSensor:
     )
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"scene.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
-    table.finish()
     return sensor
 
 

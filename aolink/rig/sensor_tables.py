@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -48,7 +48,6 @@ def read_sensor(
         sensor = _spots(table, axes, n_outputs, read_out | {"light": light})
     if sensor.black_level >= sensor.full_scale:
         raise RigError(f"sensor.black_level = {sensor.black_level:g} is not below the full scale, {sensor.full_scale}")
-    table.finish()
     return sensor
 
 
@@ -99,13 +98,10 @@ def _read_out(table: Table, known_field: tuple[float, float] | None) -> dict[str
     field = known_field or table.vector("field", 2, "lower and upper edge")
     if field[0] >= field[1]:
         raise RigError(f"sensor.field = [{field[0]:g}, {field[1]:g}]: the lower edge must be below the upper one")
-    kernel_table = table.table("kernel")
-    kernel = read_kernel(kernel_table)
-    kernel_table.finish()
     return {
         "field": (float(field[0]), float(field[1])),
         "noise_density": table.number("noise_density", low=0.0),
-        "kernel": kernel,
+        "kernel": table.read("kernel", read_kernel),
         "bit_depth": table.integer("bit_depth", 16, low=1, high=16),
         "black_level": table.number("black_level", 0.0, low=0.0),
         "counts_per_density": table.number("counts_per_density", above=0.0),
@@ -128,16 +124,7 @@ def read_kernel(table: Table) -> Kernel:
 
 def read_calibration(table: Table) -> CalibrationTable:
     """The table ``[calibration]``. Raises `RigError`."""
-    calibration = CalibrationTable(
-        black_level_sd=table.optional_number("black_level_sd", low=0.0),
-        noise_density_sd=table.optional_number("noise_density_sd", low=0.0),
-        counts_per_density_sd=table.optional_number("counts_per_density_sd", low=0.0),
-        photoelectrons_sd=table.optional_number("photoelectrons_sd", low=0.0),
-        kernel_sigma_sd=table.optional_number("kernel_sigma_sd", low=0.0),
-        dark_frames=table.integer("dark_frames", 0, low=0),
-        flat_frames=table.integer("flat_frames", 0, low=0),
-        still_frames=table.integer("still_frames", 0, low=0),
-        sources=table.texts("sources"),
-    )
-    table.finish()
-    return calibration
+    names = [each.name for each in fields(CalibrationTable)]
+    deviations: dict[str, Any] = {name: table.optional_number(name, low=0.0) for name in names if name.endswith("_sd")}
+    frames = {name: table.integer(name, 0, low=0) for name in names if name.endswith("_frames")}
+    return CalibrationTable(**deviations, **frames, sources=table.texts("sources"))

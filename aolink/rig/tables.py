@@ -23,9 +23,8 @@ _MOST_INPUTS = 10_000
 _MOST_UNMODELLED = 512
 
 
-def read_plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
+def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing) -> Plant:
     """The table ``[plant]``, of matrices or of a mirror that is described. Raises `RigError`."""
-    table = root.table("plant")
     kind = table.choice("kind", ("matrices", "membrane", "tip-tilt"), "matrices")
     if kind == "membrane":
         if optics is None:
@@ -41,7 +40,6 @@ def read_plant(root: Table, optics: Optics | None, timing: Timing) -> Plant:
     if (W < 0).any():
         raise RigError("plant.process_noise has a variance below zero")
     unmodelled = _read_unmodelled(table, len(model.C), timing)
-    table.finish()
     initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
@@ -58,13 +56,12 @@ def _read_unmodelled(table: Table, n_outputs: int, timing: Timing) -> Unmodelled
             f"{table.key('unmodelled')} is for at most {_MOST_UNMODELLED} slopes of one plant, this one has"
             f" {n_outputs}: leave it out"
         )
-    slopes = table.table("unmodelled")
-    unmodelled = UnmodelledSlopes(
-        sd=slopes.number("sd", above=0.0),
-        correlation_steps=slopes.number("correlation_s", above=0.0) / timing.fast_step_s,
-    )
-    slopes.finish()
-    return unmodelled
+    return table.read("unmodelled", _unmodelled, timing.fast_step_s)
+
+
+def _unmodelled(table: Table, fast_step_s: float) -> UnmodelledSlopes:
+    correlation_s = table.number("correlation_s", above=0.0)
+    return UnmodelledSlopes(sd=table.number("sd", above=0.0), correlation_steps=correlation_s / fast_step_s)
 
 
 def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
@@ -94,7 +91,6 @@ def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)
     unmodelled = _read_unmodelled(table, len(C), timing)
-    table.finish()
     return Plant(
         A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes,
         unmodelled=unmodelled,
@@ -126,7 +122,6 @@ def read_timing(table: Table) -> Timing:
     offset_ns = offset * fast_step_s * 1e9
     if abs(offset_ns - round(offset_ns)) > 1e-6:
         raise RigError(f"timing.exposure_offset = {offset!r} of a fast step is not a whole number of nanoseconds")
-    table.finish()
     return Timing(
         fast_step_s=fast_step_s, exposure_steps=steps, frame_period_steps=period, exposure_offset=offset
     )  # fmt: skip
@@ -134,7 +129,7 @@ def read_timing(table: Table) -> Timing:
 
 def read_mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
     """The table ``[mirror]``. Raises `RigError`."""
-    law = read_voltage(table.table("voltage")) if table.has("voltage") else None
+    law = table.read_any("voltage", read_voltage)
     if law and (table.has("input_min") or table.has("input_max")):
         raise RigError("mirror.input_min and mirror.input_max follow from [mirror.voltage]: leave them out")
     low = np.full(n_inputs, law.input_range[0]) if law else table.vector("input_min", n_inputs, "inputs")
@@ -158,7 +153,7 @@ def read_mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
     queue = table.integer("queue_steps", 8 * block, low=1)
     if queue < 2 * block:
         raise RigError(f"mirror.queue_steps = {queue} must hold at least two blocks of mirror.block_steps = {block}")
-    driver = MirrorDriver(
+    return MirrorDriver(
         input_min=low,
         input_max=high,
         park=park,
@@ -169,8 +164,6 @@ def read_mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
         slew_max_per_s=table.number("slew_max_per_s", 0.0, low=0.0),
         voltage=law,
     )
-    table.finish()
-    return driver
 
 
 def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
@@ -188,25 +181,23 @@ def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
             f"the drive changes by up to {fastest:g} in a second, more than mirror.slew_max_per_s ="
             f" {mirror.slew_max_per_s:g}: the mirror would refuse it"
         )
-    table.finish()
     return Drive(kind=kind, amplitude=amplitude, period_s=period, offset=offset)
 
 
 def read_simulation(table: Table) -> Simulation:
     """The table ``[simulation]``. Raises `RigError`."""
-    faults_table = table.table("faults", optional=True)
-    faults = Faults(**{name: faults_table.rate(name) for name in Faults.__dataclass_fields__})
-    faults_table.finish()
-    simulation = Simulation(
+    return Simulation(
         seed=table.integer("seed", 1, low=0),
         light=parse_light(table.text("light", "moving"), table.key("light")),
         clock_offset_s=table.number("clock_offset_s", 0.0),
         clock_drift_ppm=table.number("clock_drift_ppm", 0.0),
         latency_s=table.number("latency_s", 100e-6, low=0.0),
-        faults=faults,
+        faults=table.read("faults", _faults, optional=True),
     )
-    table.finish()
-    return simulation
+
+
+def _faults(table: Table) -> Faults:
+    return Faults(**{name: table.rate(name) for name in Faults.__dataclass_fields__})
 
 
 def parse_light(text: str, name: str) -> tuple[Light, ...]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from aolink.errors import RigError
 
 FloatArray = NDArray[np.float64]
+_Read = TypeVar("_Read")
 
 _KEYS = """
 A actuators amplitude axes B B_w bias_v bit_depth bit_error_rate bit_flip_rate black_level black_level_sd block_steps
@@ -76,24 +77,40 @@ class Table:
     def table(self, name: str, *, optional: bool = False) -> Table:
         return Table(self.get(name, {} if optional else None), self.key(name))
 
-    def tables(self, name: str) -> list[Table]:
-        """A list of tables; empty where it is missing."""
-        values = self.get(name, [])
-        if not isinstance(values, list):
-            raise RigError(f"{self.key(name)}: expected a list of tables, found {shown(values)}")
-        return [Table(value, f"{self.key(name)}[{k}]") for k, value in enumerate(values)]
+    def read(self, name: str, reader: Callable[..., _Read], *others: Any, optional: bool = False) -> _Read:
+        """What a reader makes of a table and of ``others``; it has to ask for all keys that the table has."""
+        table = self.table(name, optional=optional)
+        value = reader(table, *others)
+        table.finish()
+        return value
+
+    def read_any(self, name: str, reader: Callable[..., _Read], *others: Any) -> _Read | None:
+        """As `read`; None where there is no such table."""
+        return self.read(name, reader, *others) if self.has(name) else None
+
+    def read_all(self, name: str, reader: Callable[..., _Read], *others: Any) -> tuple[_Read, ...]:
+        """As `read`, of each table in a list; none where it is missing."""
+        values, found = self.get(name, []), []
+        self._expect(name, values, isinstance(values, list), "a list of tables")
+        for k, value in enumerate(values):
+            table = Table(value, f"{self.key(name)}[{k}]")
+            found.append(reader(table, *others))
+            table.finish()
+        return tuple(found)
+
+    def _expect(self, name: str, value: Any, is_so: bool, what: str) -> None:
+        if not is_so:
+            raise RigError(f"{self.key(name)}: expected {what}, found {shown(value)}")
 
     def flag(self, name: str, default: bool) -> bool:
         value = self.get(name, default)
-        if not isinstance(value, bool):
-            raise RigError(f"{self.key(name)}: expected true or false, found {shown(value)}")
-        return value
+        self._expect(name, value, isinstance(value, bool), "true or false")
+        return bool(value)
 
     def text(self, name: str, default: str | None = None) -> str:
         value = self.get(name, default)
-        if not isinstance(value, str):
-            raise RigError(f"{self.key(name)}: expected text, found {shown(value)}")
-        return value
+        self._expect(name, value, isinstance(value, str), "text")
+        return str(value)
 
     def choice(self, name: str, choices: tuple[str, ...], default: str | None = None) -> Any:
         value = self.text(name, default)
@@ -105,8 +122,8 @@ class Table:
         self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf
     ) -> float:
         value = self.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
-            raise RigError(f"{self.key(name)}: expected a finite number, found {shown(value)}")
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        self._expect(name, value, is_number and abs(value) <= sys.float_info.max, "a finite number")
         if value < low or value <= above:
             bound = f"at least {low:g}" if value < low else f"above {above:g}"
             raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
@@ -117,8 +134,8 @@ class Table:
 
     def texts(self, name: str) -> tuple[str, ...]:
         values = self.get(name, [])
-        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
-            raise RigError(f"{self.key(name)}: expected a list of texts, found {shown(values)}")
+        are_texts = isinstance(values, list) and all(isinstance(value, str) for value in values)
+        self._expect(name, values, are_texts, "a list of texts")
         return tuple(values)
 
     def rate(self, name: str) -> float:
@@ -129,17 +146,15 @@ class Table:
 
     def integer(self, name: str, default: int | None = None, *, low: int, high: int = 2**31) -> int:
         value = self.get(name, default)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise RigError(f"{self.key(name)}: expected a whole number from {low} to {high}, found {shown(value)}")
-        return value
+        is_whole = isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+        self._expect(name, value, is_whole, f"a whole number from {low} to {high}")
+        return int(value)
 
     def integers(self, name: str, size: int, why: str, *, low: int, high: int) -> tuple[int, ...]:
         values = self.get(name)
         whole = isinstance(values, list) and all(isinstance(v, int) and not isinstance(v, bool) for v in values)
-        if not whole or len(values) != size or not all(low <= v <= high for v in values):
-            raise RigError(
-                f"{self.key(name)}: expected {size} whole numbers from {low} to {high} ({why}), found {shown(values)}"
-            )
+        fit = whole and len(values) == size and all(low <= v <= high for v in values)
+        self._expect(name, values, fit, f"{size} whole numbers from {low} to {high} ({why})")
         return tuple(values)
 
     def matrix(self, name: str, shape: tuple[int | None, int | None], why: str) -> FloatArray:

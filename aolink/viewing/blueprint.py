@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import rerun.blueprint as rrb
 
 from aolink.optics.sensor import SpotSensor
+from aolink.recording import topics
 from aolink.rig import Rig
 from aolink.viewing.camera import HISTORY, profile_bounds
 from aolink.viewing.motion import BAND, NIS_COVERAGE
@@ -32,12 +33,9 @@ class Contents:
     truth: bool
     scenes: list[str]
     """Entities of the scene: as it came, restored, at rest; those that there are."""
-    restored_spots: bool
-    commands: bool
-    clock: bool
-    link: bool
-    latency: bool
-    log: bool
+    restored_spots: bool = False
+    topics: frozenset[str] = frozenset()
+    """Those of the devices that have messages."""
 
     @property
     def focus(self) -> str | None:
@@ -174,12 +172,12 @@ def _states(contents: Contents) -> rrb.Container:
 
 def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     views: list[rrb.Container | rrb.View] = []
-    if contents.commands:
+    if contents.topics & {topics.COMMAND, topics.APPLIED}:
         views.append(_lines("Mirror input (mirror's units)", _with_axes(["mirror/command", "mirror/applied"])))
-    if contents.latency:
+    if topics.LATENCY in contents.topics:
         views.append(_lines("Latency since exposure end (ms)", ["latency/**"]))
     health = [_lines("Lost since start (count)", ["link/lost/**"])]
-    if contents.link:
+    if topics.LINK in contents.topics:
         health = [
             _lines("Lost and faulty since start (count)", ["link/lost/**", "link/faults/camera", "link/faults/mirror"]),
             _lines("Link faults by cause (count)", ["link/faults/**"]),
@@ -187,7 +185,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
             _lines("Received (kB/s)", ["link/received/**"]),
         ]
     views.append(rrb.Tabs(contents=health, active_tab=0))
-    if contents.clock:
+    if topics.CLOCK in contents.topics:
         clocks = [
             ("sigma", "Clock offset sd (µs)"),
             ("offset", "Clock offset change (µs)"),
@@ -197,7 +195,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
         views.append(rrb.Tabs(contents=[_lines(title, [f"clock/{name}/**"]) for name, title in clocks], active_tab=0))
     views.append(rrb.StateTimelineView(origin="status", name="Status of estimators and mirror"))
     texts: list[rrb.View] = [rrb.TextDocumentView(origin="session", name="Session")]
-    if contents.log:
+    if topics.LOG in contents.topics:
         texts.append(rrb.TextLogView(origin="log", name="Log"))
     views.append(rrb.Tabs(contents=texts, active_tab=0))
     return views

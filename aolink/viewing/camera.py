@@ -15,12 +15,13 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from aolink.colours import Colour, estimator_colour
 from aolink.estimation.frames.spots import profiles
 from aolink.exposure import Exposure
 from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
-from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH, Colour, estimator_colour
+from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH
 from aolink.viewing.timebase import Timebase
 
 FloatArray = NDArray[np.float64]
@@ -257,7 +258,10 @@ def _log_centroids(
     stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure],
     profiles: FloatArray, shown: range,
 ) -> None:  # fmt: skip
-    x = [(centroid(sensor, p) - sensor.field[0]) / sensor.pixel_width for p in profiles]
+    slopes = [
+        centroid(sensor, p) if e.slopes is None else e.slopes[0] for e, p in zip(exposures, profiles, strict=True)
+    ]
+    x = [(slope - sensor.field[0]) / sensor.pixel_width for slope in slopes]
     points = [[(x[k], row + 0.5) for k, row in _visible(exposures, j)] for j in shown]
     path = "camera/history/centroid"
     stream.log(path, rr.Points2D.from_fields(colors=(235, 235, 235), radii=rr.Radius.ui_points(2.5)), static=True)

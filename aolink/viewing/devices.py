@@ -8,8 +8,9 @@ from typing import Any, Protocol
 import numpy as np
 import rerun as rr
 
+from aolink.colours import estimator_colour
 from aolink.recording import topics
-from aolink.viewing.palette import APPLIED, COMMANDED, estimator_colour, series_colour
+from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
 from aolink.viewing.series import Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
@@ -66,12 +67,8 @@ def log_latency(stream: rr.RecordingStream, timebase: Timebase, records: Sequenc
 
     The lines lie above each other in the order of the steps: the distance between two is one step's time.
     """
-    if not records:
-        return
     latencies = [r.message for r in records]
-    frames = np.array([m.frame_id for m in latencies], dtype=np.int64)
-    starts = timebase.first_step + (frames - timebase.frame_id) * timebase.frame_period_steps
-    times = timebase.at_steps(starts, frames)
+    times = timebase.at_frames([m.frame_id for m in latencies])
     for i, (field, name) in enumerate(LATENCY_STEPS):
         at = [getattr(m, field) for m in latencies]
         milliseconds = [(t - m.exposure_end_ns) / 1e6 if t else np.nan for t, m in zip(at, latencies, strict=True)]
@@ -85,26 +82,20 @@ def log_estimation(stream: rr.RecordingStream, timebase: Timebase, records: Sequ
     """What an estimator had time for: ``/latency/estimation/NAME``, ms for each estimate; ``/status/NAME`` where it
     skipped an exposure.
     """
-    if not records:
-        return
     accounts = [r.message for r in records]
     name = accounts[0].estimator
-    frames = np.array([m.frame_id for m in accounts], dtype=np.int64)
-    starts = timebase.first_step + (frames - timebase.frame_id) * timebase.frame_period_steps
-    made = np.array([not m.skipped for m in accounts])
-    if made.any():
-        took_ms = [m.took_ns / 1e6 for m in accounts if not m.skipped]
+    made, skipped = [m for m in accounts if not m.skipped], [m for m in accounts if m.skipped]
+    if made:
+        times = timebase.at_frames([m.frame_id for m in made])
         style = Style(f"{name} takes", estimator_colour(name))
-        send_line(stream, f"latency/estimation/{name}", timebase.at_steps(starts[made], frames[made]), took_ms, style)
-    if not made.all():
-        times = timebase.at_steps(starts[~made], frames[~made])
-        send_states(stream, f"status/{name}", times, ["SKIPPED"] * int(np.count_nonzero(~made)))
+        send_line(stream, f"latency/estimation/{name}", times, [m.took_ns / 1e6 for m in made], style)
+    if skipped:
+        times = timebase.at_frames([m.frame_id for m in skipped])
+        send_states(stream, f"status/{name}", times, ["SKIPPED"] * len(skipped))
 
 
 def log_drops(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Frames and chunks lost since the start, from ExposureInfo: ``/link/lost/frames``, ``/link/lost/chunks``."""
-    if not records:
-        return
     infos = [r.message for r in records]
     times = timebase.at_steps([m.first_step for m in infos], [m.frame_id for m in infos])
     frames = np.cumsum([m.frames_lost_before for m in infos])
@@ -160,8 +151,6 @@ def log_clock(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[
 
 def log_log(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
     """The session's log: ``/log``."""
-    if not records:
-        return
     times = timebase.at_host([r.log_time_ns for r in records])
     text = [f"{r.message.name}: {r.message.message}" if r.message.name else r.message.message for r in records]
     levels = [_LEVELS.get(r.message.level, "INFO") for r in records]
@@ -178,7 +167,7 @@ LOGS: dict[str, Callable[[rr.RecordingStream, Timebase, Sequence[Timed]], None]]
     topics.CLOCK: log_clock,
     topics.LOG: log_log,
 }
-"""What shows the messages of a topic."""
+"""What shows the messages of a topic, of which there is one at least."""
 
 
 def _send_blocks(

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from aolink.errors import ViewerError
 from aolink.estimation import Estimate
 from aolink.estimation.registry import BASELINE_ESTIMATOR
+from aolink.exporting.plot import PathLines, colour, draw_blur
 from aolink.exposure import Exposure
 from aolink.files import writing
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import Sensor
 from aolink.viewing.camera import density, density_top, first_profiles
 from aolink.viewing.motion import BAND
-from aolink.viewing.palette import by_rank, estimator_colour
+from aolink.viewing.palette import by_rank
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,8 +33,6 @@ FloatArray = NDArray[np.float64]
 _SIZE_IN, _DPI = (16.0, 11.5), 110
 _CLOSE_UPS = 3
 """Exposures whose inside is drawn."""
-_POINTS_OF_PATH = 9
-"""Of a path within its exposure, in the picture of the whole session."""
 _RUNNING = 20
 """The errors are averaged over this share of the session."""
 _STYLE: dict[Any, Any] = {
@@ -119,33 +118,21 @@ def _session(recording: Recording) -> _Session:
     return _Session(sensor.profile, first_profiles(sensor, exposures), (first - first[0]) * step_s, step_s, estimates)
 
 
-def _colour(name: str) -> tuple[float, ...]:
-    """As in the viewer, but for the truth, whose yellow is hard to see on white."""
-    return (0.0, 0.0, 0.0) if name == "truth" else tuple(part / 255 for part in estimator_colour(name))
-
-
 def _draw_intensity(axis: Axes, session: _Session, lines: Sequence[str]) -> None:
     """Every exposure's profile as a column; a lost frame leaves its place empty."""
     sensor, top = session.sensor, density_top(session.sensor, session.exposures)
-    lengths = session.step_s * np.array([each.n_steps for each in session.exposures])
-    edges = np.stack([session.times_s, session.times_s + lengths], axis=1).ravel()
-    seen = np.full((sensor.pixels, len(edges) - 1), np.nan)
-    seen[:, ::2] = np.stack([density(sensor, each) for each in session.exposures], axis=1)
-    axis.pcolormesh(edges, sensor.edges, seen, cmap="Greys", vmin=0, vmax=1.2 * top, rasterized=True)
+    ends = session.times_s + session.step_s * np.array([each.n_steps for each in session.exposures])
+    spans = list(zip(session.times_s, ends, strict=True))
+    draw_blur(axis, sensor, spans, [density(sensor, each) for each in session.exposures], top)
+    paths = PathLines(session.step_s)
     for name in lines:
-        times: list[FloatArray] = []
-        places: list[FloatArray] = []
         for begin, exposure in zip(session.times_s, session.exposures, strict=True):
             if (path := session.path(name, exposure)) is not None:
-                some = np.unique(np.linspace(0, len(path) - 1, _POINTS_OF_PATH).astype(int))
-                times += [begin + some * session.step_s, np.array([np.nan])]
-                places += [path[some], np.array([np.nan])]
-        if times:
-            width = 1.4 if name == "truth" else 0.8
-            axis.plot(np.concatenate(times), np.concatenate(places), color=_colour(name), linewidth=width, label=name)
+                paths.add(name, begin, path)
+    paths.draw(axis, 0.8)
     axis.set(
         title="What the camera saw, and where the spot was", xlabel="time (s)", ylabel="slope units",
-        ylim=sensor.field, xlim=(0, edges[-1]),
+        ylim=sensor.field, xlim=(0, ends[-1]),
     )  # fmt: skip
     axis.legend(loc="upper right", ncols=2)
 
@@ -170,10 +157,10 @@ def _draw_inside(axis: Axes, session: _Session, lines: Sequence[str], exposure: 
             continue
         width = 2.2 if name == "truth" else 1.6
         label = name if name == "truth" else f"{name}, ±{BAND:g} sd"
-        axis.plot(time_ms, path, color=_colour(name), linewidth=width, label=label)
+        axis.plot(time_ms, path, color=colour(name), linewidth=width, label=label)
         if name != "truth":
             sd = session.estimates[name][exposure.frame_id].path_sd[0]
-            axis.fill_between(time_ms, path - BAND * sd, path + BAND * sd, color=_colour(name), alpha=0.2, linewidth=0)
+            axis.fill_between(time_ms, path - BAND * sd, path + BAND * sd, color=colour(name), alpha=0.2, linewidth=0)
     axis.set(title=f"Inside exposure {exposure.frame_id}", xlabel="time in the exposure (ms)", xlim=time_ms[[0, -1]])
     axis.grid(alpha=0.3)
 
@@ -185,7 +172,7 @@ def _draw_profile(axis: Axes, session: _Session, lines: Sequence[str], exposure:
     for name in lines:
         if (path := session.path(name, exposure)) is not None:
             left = exposure_density(sensor.kernel, sensor.edges, path)
-            axis.plot(sensor.centres, left, color=_colour(name), linewidth=1.4)
+            axis.plot(sensor.centres, left, color=colour(name), linewidth=1.4)
     axis.set(xlabel="intensity as measured, and by each path (slope units)", xlim=sensor.field)
 
 
@@ -209,11 +196,11 @@ def _draw_errors(over_time: Axes, whole: Axes, session: _Session) -> None:
         width = max(1, len(squares) // _RUNNING)
         kernel = np.full(width, 1 / width)
         running = np.sqrt(np.convolve(squares, kernel, mode="valid"))
-        over_time.plot(np.convolve(times, kernel, mode="valid"), running, color=_colour(name), label=name)
+        over_time.plot(np.convolve(times, kernel, mode="valid"), running, color=colour(name), label=name)
     over_time.set(yscale="log", xlabel="time (s)", ylabel="RMSE (slope units)", title="Error of the path, running")
     over_time.grid(alpha=0.3, which="both")
     places = np.arange(len(names))[::-1]
-    whole.barh(places, overall, color=[_colour(name) for name in names])
+    whole.barh(places, overall, color=[colour(name) for name in names])
     for place, value in zip(places, overall, strict=True):
         whole.annotate(f" {value:.3g}", (value, place), va="center")
     whole.set_yticks(places, names)

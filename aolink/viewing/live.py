@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
@@ -24,7 +22,7 @@ from aolink.viewing.camera import HISTORY
 from aolink.viewing.palette import by_rank
 from aolink.viewing.save import APPLICATION, send_camera
 from aolink.viewing.timebase import Timebase
-from aolink.viewing.viewer import HOST, free_port, running_rerun, wait_for_server
+from aolink.viewing.viewer import HOST, free_port, has_display, running_rerun, wait_for_server
 
 _FLUSH_S = 5.0
 """For what the viewer has not taken yet at the end."""
@@ -95,7 +93,7 @@ class LiveView:
         if self._true_scene is not None and scene.TRUE_SCENE not in shown:
             scene.log_true_scene(self._stream, sensor, self._true_scene)
             shown.add(scene.TRUE_SCENE)
-        return [path for path in (scene.SCENE, scene.RESTORED_SCENE, scene.TRUE_SCENE) if path in shown]
+        return [path for path in scene.SCENES if path in shown]
 
     def _lay_out(self, exposure: Exposure) -> None:
         contents = Contents(
@@ -105,12 +103,6 @@ class LiveView:
             density_top=self._top or 1.0,
             truth=exposure.truth is not None,
             scenes=self._scenes,
-            restored_spots=False,
-            commands=False,
-            clock=False,
-            link=False,
-            latency=False,
-            log=False,
         )
         self._stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
 
@@ -126,7 +118,7 @@ def live_viewer(
     ViewerError
         There is no display, or the viewer does not start.
     """
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not has_display():
         raise ViewerError("there is no display for --view: record or replay without it, then `aolink view --web`")
     port = free_port()
     with tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process:

@@ -10,10 +10,11 @@ import rerun as rr
 from numpy.typing import NDArray
 from scipy import special
 
+from aolink.colours import estimator_colour
 from aolink.estimation.estimate import Estimate
 from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure, Truth
-from aolink.viewing.palette import TRUTH, estimator_colour
+from aolink.viewing.palette import TRUTH
 from aolink.viewing.series import Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 

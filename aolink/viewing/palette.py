@@ -4,14 +4,9 @@ from __future__ import annotations
 
 import math
 
-from aolink.colours import Colour, estimator_colour
+from aolink.colours import Colour
 from aolink.errors import EstimatorError
 from aolink.estimation import estimator_row
-
-__all__ = [
-    "APPLIED", "COMMANDED", "MEASURED", "MISSING", "NOTHING", "STATUS_COLOURS", "TRUTH",
-    "Colour", "by_rank", "estimator_colour", "series_colour",
-]  # fmt: skip
 
 TRUTH: Colour = (245, 200, 40)
 MEASURED: Colour = (165, 165, 165)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,7 +85,6 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
     true_scene = recording.true_scene
     if rig.scene is not None and true_scene is not None:
         scene.log_true_scene(stream, rig.scene, true_scene)
-    found = _send_devices(stream, recording, timebase)
     stream.log(
         "session", rr.TextDocument(_summary(recording, exposures, estimates), media_type="text/markdown"), static=True
     )
@@ -94,21 +94,9 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
         measuring=[name for name, sequence in estimates.items() if any(e.innovation.shape[1] for e in sequence)],
         density_top=top,
         truth=bool(truths),
-        scenes=[
-            path
-            for path, shown in (
-                (scene.SCENE, scenes),
-                (scene.RESTORED_SCENE, scenes_restored),
-                (scene.TRUE_SCENE, true_scene is not None),
-            )
-            if shown
-        ],
+        scenes=list(compress(scene.SCENES, (scenes, scenes_restored, true_scene is not None))),
         restored_spots=any(each.spots is not None for each in restored),
-        commands=bool(found & {topics.COMMAND, topics.APPLIED}),
-        clock=topics.CLOCK in found,
-        link=topics.LINK in found,
-        latency=topics.LATENCY in found,
-        log=topics.LOG in found,
+        topics=_send_devices(stream, recording, timebase),
     )
 
 
@@ -147,7 +135,7 @@ def send_camera(
     return top
 
 
-def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> set[str]:
+def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> frozenset[str]:
     """Send what does not come from exposures and estimates; the topics that had messages."""
     by_topic: dict[str, list[RecordedMessage]] = {
         topic: [] for topic in recording.counts if topics.named(topic).name in devices.LOGS
@@ -156,9 +144,9 @@ def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Ti
         by_topic[record.topic].append(record)
     for name, log in devices.LOGS.items():
         for topic, records in by_topic.items():
-            if topics.named(topic).name == name:
+            if topics.named(topic).name == name and records:
                 log(stream, timebase, records)
-    return set(by_topic)
+    return frozenset(by_topic)
 
 
 def _summary(recording: Recording, exposures: list[Exposure], estimates: dict[str, list[Estimate]]) -> str:

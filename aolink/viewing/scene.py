@@ -23,6 +23,8 @@ SCENE = "scene/image"
 TRUE_SCENE = "scene/true"
 RESTORED_SCENE = "restored/image"
 RESTORED_SPOTS = "restored/spot"
+SCENES = (SCENE, RESTORED_SCENE, TRUE_SCENE)
+"""What is shown of the scene, in this order."""
 
 
 def log_scenes(

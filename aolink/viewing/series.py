@@ -9,7 +9,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
-from aolink.viewing.palette import STATUS_COLOURS, Colour
+from aolink.colours import Colour
+from aolink.viewing.palette import STATUS_COLOURS
 
 PERCENTILES = (5, 50, 95)
 """What stands for many axes."""

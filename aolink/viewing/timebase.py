@@ -85,6 +85,11 @@ class Timebase:
         frames = self.frame_of_step(steps) if frames is None else np.asarray(frames, dtype=np.int64)
         return [*self.every_step(steps), _sequence(FRAME, frames)]
 
+    def at_frames(self, frames: ArrayLike) -> list[rr.TimeColumn]:
+        """Columns on all three timelines for values that belong to frames: at the start of their exposures."""
+        frames = np.asarray(frames, dtype=np.int64)
+        return self.at_steps(self.first_step + (frames - self.frame_id) * self.frame_period_steps, frames)
+
     def at_host(self, host_ns: ArrayLike) -> list[rr.TimeColumn]:
         """Columns on all three timelines for values that only have a host time."""
         device = self.device_of_host(host_ns)

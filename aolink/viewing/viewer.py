@@ -118,9 +118,9 @@ def headless_viewer(
         try:
             client = _connected(process, port, said)
             client.open(str(path))
-            _until_loaded(client)
+            inside = _step_inside_once_loaded(client)
             client.run_command("ui.toggle_top_panel")
-            client.set_time(FAST_STEP, sequence=_step_inside(client) if step is None else step, play_state="paused")
+            client.set_time(FAST_STEP, sequence=inside if step is None else step, play_state="paused")
             yield client
         except (RuntimeError, ConnectionError, ViewerError) as error:
             # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
@@ -154,9 +154,14 @@ def settled_picture(client: ViewerClient, view_id: str | None = None) -> NDArray
     return pixels
 
 
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
 def check_display() -> None:
     """Raise `ViewerError` where a window cannot be opened."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    if not has_display():
         raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
 
 
@@ -190,7 +195,7 @@ def serve_web(
     options = [str(path), "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
     with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
         for listening in (port, data_port):
-            _wait_for(lambda p=listening: not _is_free(p), process, said)  # type: ignore[misc]
+            wait_for_server(listening, process, said)
         if on_ready is not None:
             on_ready(f"http://{HOST}:{port}/?url={quote(f'rerun+http://{HOST}:{data_port}/proxy', safe='')}")
         if process.wait() != 0:
@@ -283,22 +288,18 @@ def wait_for_server(port: int, process: subprocess.Popen[bytes], said: IO[bytes]
     _wait_for(lambda: not _is_free(port), process, said)
 
 
-def _until_loaded(client: ViewerClient) -> None:
+def _step_inside_once_loaded(client: ViewerClient) -> int:
+    """A fast step at which everything has begun and nothing has ended."""
     deadline = time.monotonic() + _SETTLE_S
     while True:
         state = client.get_state()
-        if not state.loading and any(t.name == FAST_STEP for r in state.recordings for t in r.timelines):
-            return
+        found = [t for r in state.recordings for t in r.timelines if t.name == FAST_STEP]
+        if found and not state.loading:
+            start, end = found[0].start or 0, found[0].end or 0
+            return start + round(0.6 * (end - start))
         if time.monotonic() > deadline:
             raise ViewerError("the viewer shows no recording with fast steps: give a file that aolink wrote")
         time.sleep(_POLL_S)
-
-
-def _step_inside(client: ViewerClient) -> int:
-    """A fast step at which everything has begun and nothing has ended."""
-    timelines = [t for r in client.get_state().recordings for t in r.timelines if t.name == FAST_STEP]
-    start, end = timelines[0].start or 0, timelines[0].end or 0
-    return start + round(0.6 * (end - start))
 
 
 def _is_free(port: int) -> bool:

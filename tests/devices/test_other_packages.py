@@ -194,7 +194,7 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(tmp_path: Path, monk
             2,
             "nothing says what drives the camera: give --camera PORT, or [devices.camera] in the rig file with one",
         ),
-        ('driver = "exmaple"', 4, "there is no camera driver exmaple, there is native, bare, broken, example: install"),
+        ('driver = "exmaple"', 4, "there is no camera driver exmaple, there is native, "),
         ('driver = "broken"', 4, "the camera driver broken of broken (no_such_module:Camera) cannot be loaded: Module"),
         (
             'driver = "bare"',
@@ -223,8 +223,9 @@ def test_a_driver_that_is_not_there_is_one_line(
 
 
 def test_the_drivers_that_there_are_are_listed(aolink: Run, installed: dict[str, str]) -> None:
-    listed = aolink("devices", env=installed).stdout
-    assert "camera drivers: native, bare, broken, example\nmirror drivers: native, example" in listed
+    lines = dict(line.split(": ") for line in aolink("devices", env=installed).stdout.splitlines() if "drivers" in line)
+    assert {"native", "bare", "broken", "example"} <= {*lines["camera drivers"].split(", ")}
+    assert {"native", "example"} <= {*lines["mirror drivers"].split(", ")}
 
 
 def test_native_devices_may_stand_in_the_rig_file(aolink: Run, tmp_path: Path) -> None:

@@ -171,28 +171,44 @@ def write_fits(path: Path, data: NDArray[Any], **header: Any) -> Path:
 
 
 def write_aot(
-    path: Path, frames: NDArray[Any] | None, *, commands: NDArray[Any] | None = None, times_s: list[float] | None = None
-) -> Path:  # fmt: skip
-    """AO telemetry of one Shack-Hartmann sensor and its loop, and of a loop that offloads a mirror to itself."""
+    path: Path,
+    frames: NDArray[Any] | None,
+    *,
+    commands: NDArray[Any] | None = None,
+    more: NDArray[Any] | None = None,
+    command_times_s: list[float] | None = None,
+    framerate: float | None = None,
+    times_s: list[float] | None = None,
+    slopes: NDArray[Any] | None = None,
+) -> Path:
+    """AO telemetry of one Shack-Hartmann sensor and its loops, and of a loop that offloads a mirror to itself."""
     telescope, star = aotpy.MainTelescope(uid="telescope"), aotpy.NaturalGuideStar(uid="star")
     time = aotpy.Time(uid="time", timestamps=times_s) if times_s is not None else None
     detector = None
     if frames is not None:
         pixels = aotpy.Image(name="pixels", data=frames, time=time)
         detector = aotpy.Detector(uid="detector", pixel_intensities=pixels, frame_rate=50.0, integration_time=0.02)
+    slopes = np.zeros((7, 2, 1), np.float32) if slopes is None else slopes
     sensor = aotpy.ShackHartmann(
-        uid="SH", source=star, n_valid_subapertures=1, detector=detector,
+        uid="SH", source=star, n_valid_subapertures=slopes.shape[2], detector=detector,
         subaperture_mask=aotpy.Image(name="mask", data=np.zeros((1, 1))),
-        measurements=aotpy.Image(name="slopes", data=np.zeros((7, 2, 1), np.float32)),
+        measurements=aotpy.Image(name="slopes", data=slopes, time=time, unit="rad"),
     )  # fmt: skip
     mirror = aotpy.DeformableMirror(uid="mirror", telescope=telescope, n_valid_actuators=2)
-    commanded = aotpy.Image(name="commands", data=commands) if commands is not None else None
+    given = {"loop": commands, "more": more}
+    loops = {uid: aotpy.Image(name=uid, data=each) for uid, each in given.items() if each is not None}
     offloaded = aotpy.Image(name="offloaded", data=np.ones((7, 2), np.float32))
     aotpy.AOSystem(
         ao_mode="SCAO", main_telescope=telescope, sources=[star], wavefront_sensors=[sensor],
         wavefront_correctors=[mirror], date_beginning=datetime(2026, 9, 21, 10, 30, tzinfo=UTC),
         loops=[
-            aotpy.ControlLoop(uid="loop", commanded_corrector=mirror, input_sensor=sensor, commands=commanded),
+            *(
+                aotpy.ControlLoop(
+                    uid=uid, commanded_corrector=mirror, input_sensor=sensor, commands=each, framerate=framerate,
+                    time=None if command_times_s is None else aotpy.Time(uid=f"{uid} time", timestamps=command_times_s),
+                )
+                for uid, each in loops.items()
+            ),
             aotpy.OffloadLoop(uid="off", commanded_corrector=mirror, input_corrector=mirror, commands=offloaded),
         ],
     ).write_to_file(str(path))  # fmt: skip

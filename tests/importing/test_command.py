@@ -96,6 +96,23 @@ def test_a_target_is_replaced_only_on_request_and_never_the_source(aolink, rig, 
     assert len(list(Recording(tmp_path / "copy.mcap"))) == 7
 
 
+def test_two_films_with_the_same_name_and_settings_are_two_sessions(aolink, rig, tmp_path):
+    """The same film is the same session, and the same bytes."""
+    sessions = []
+    for k, frames in enumerate((FRAMES, FRAMES, FRAMES[:, ::-1])):
+        others.written_npy(tmp_path, frames)
+        made = aolink("import", "film.npy", "-o", f"{k}.mcap", "--rig", rig, "--rate", "50")
+        assert made.returncode == 0, made.stderr
+        sessions.append(Recording(tmp_path / f"{k}.mcap").metadata["session"])
+    assert sessions[0] == sessions[1] != sessions[2]
+    assert (tmp_path / "0.mcap").read_bytes() == (tmp_path / "1.mcap").read_bytes()
+
+
+def bright(folder: Path) -> Path:
+    """Floating point that is counts."""
+    return others.written_npy(folder, FRAMES.astype(np.float32))
+
+
 def mixed(folder: Path) -> Path:
     """Pictures of two sizes."""
     path = others.write_pictures(folder / "film", FRAMES)
@@ -106,10 +123,6 @@ def mixed(folder: Path) -> Path:
 def of_words(folder: Path) -> Path:
     (folder / "film.mp4").write_text("Dear reader, this is no film.\n")
     return folder / "film.mp4"
-
-
-def of_slopes(folder: Path) -> Path:
-    return others.write_aot(folder / "film.fits", None)
 
 
 def good(folder: Path) -> Path:
@@ -132,9 +145,9 @@ def missing(folder: Path) -> Path:
         (missing, [], 11, "there is no such file or folder"),
         (of_words, [], 11, "film.mp4"),
         (mixed, [], 11, "frame99.png has 6 x 9 pixels of uint8, those before it have 8 x 8 pixels"),
-        (of_slopes, [], 11, "has slopes of SH, but no pictures"),
         (timed, [], 11, "50 frames/s contradict its times, which say 40"),
         (good, ["--rate", "60"], 11, "change its [timing], or give the right --rate"),
+        (bright, ["--rate", "50"], 11, "where 1.0 would be full scale: say with --scale how many counts"),
         (good, ["--rate", "0"], 11, "--rate 0 must be above 0"),
         (good, ["--start", "yesterday"], 11, "--start yesterday is no date: give one such as"),
         (good, ["--at", "here"], 11, "--at here is no place: give X,Y in pixels"),

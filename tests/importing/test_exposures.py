@@ -148,6 +148,8 @@ def test_rates_and_times_that_contradict_each_other_are_refused(tmp_path):
     assert "give --rate 50" in text
     text = refused(tmp_path, film(), None, Settings(rate_hz=60), rate_hz=50.0)
     assert "60 frames/s, and the rig file single-lenslet wants a frame every 0.02 s, 50 frames/s" in text
+    text = refused(tmp_path, film(), small_rig(10, 10), rate_hz=1000.0)
+    assert "give --sum 10 as the rig file has it, change its [timing], or give the right --rate" in text
     assert "50 frames/s" in refused(tmp_path, film(), times_ns=times * 2)
     text = refused(tmp_path, film(), exposure_s=0.02)
     assert "exposed for 0.02 s a frame, the rig file single-lenslet says 0.01 s" in text

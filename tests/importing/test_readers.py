@@ -395,9 +395,19 @@ def test_telemetry_without_times_begins_at_its_date(tmp_path):
     film = open_film(others.write_aot(tmp_path / "a.fits", numbers(np.uint16), commands=np.ones((5, 2), np.float32)))
     assert film.start_ns == 1_789_986_600_000_000_000
     assert film.times_ns is None
-    assert film.inputs is None  # there is no command for each picture
+    assert film.inputs is None
+    assert (
+        "the 5 commands of loop (5 rows) for 7 frames have neither times nor a rate: they are left out" in film.notes[1]
+    )
 
 
-def test_telemetry_of_slopes_only_says_why_it_is_refused(tmp_path):
-    text = refused(others.write_aot(tmp_path / "a.fits", None))
-    assert "has slopes of SH, but no pictures: the blur that estimators read is in the pixels" in text
+def test_commands_of_loops_that_do_not_command_together_are_left_out_and_said(tmp_path):
+    seven, nine = np.ones((7, 2)), np.ones((9, 2))
+    film = open_film(others.write_aot(tmp_path / "a.fits", numbers(np.uint16), commands=seven, more=nine))
+    assert film.inputs is None
+    assert "the loops loop (7 rows) and more (9 rows) do not command together" in film.notes[1]
+
+
+def test_telemetry_with_neither_pictures_nor_slopes_is_refused(tmp_path):
+    text = refused(others.write_aot(tmp_path / "a.fits", None, slopes=np.full((7, 2, 1), np.nan)))
+    assert "has no pictures, and its slopes are all NaN" in text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,10 @@ from aolink.importing.recording import import_film
 from aolink.importing.tracking import find_objects, survey
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
-from tests.importing.synthetic import SpotFilm, random_walk, resonance, spot_film
 from tests.kinds import truth_of
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+from paper_report.spot_films import SpotFilm, random_walk, resonance, spot_film
 
 MIDDLES = np.array([[24.0, 32.0], [70.0, 30.0]])
 K = 8

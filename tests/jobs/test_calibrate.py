@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import subprocess
 import tomllib
@@ -520,3 +521,31 @@ def test_frames_are_recorded_apart_and_marked(aolink: Run, tmp_path: Path) -> No
     assert (
         "plain.mcap is not marked as a recording for calibration: make one with `aolink record --cali" in plain.stderr
     )
+
+
+def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Path) -> None:
+    """Recorded over the wire, and compared with the plant of the rig file, which is that of the simulated rig."""
+    arguments = ("calibrate", "--interaction", "--rig", "tip-tilt", "--poke", "0.05", "--repeats", "1")
+    with simulated_rig("tip-tilt") as (camera, mirror):
+        done = aolink(
+            *arguments, "--camera", camera, "--mirror", mirror, "-o", "matrix.npz", "--keep", "pokes", "--json"
+        )
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    rig = load_rig("tip-tilt")
+    assert (facts["outputs"], facts["inputs"]) == (rig.n_outputs, rig.n_inputs)
+    assert facts["difference_from_plant"] < 0.1
+    with np.load(tmp_path / "matrix.npz") as found:
+        assert found["matrix"].shape == (rig.n_outputs, rig.n_inputs)
+        apart = np.linalg.norm(found["matrix"] - found["plant_matrix"]) / np.linalg.norm(found["matrix"])
+    assert apart == pytest.approx(facts["difference_from_plant"])
+    again = aolink(*arguments, "pokes/pokes.mcap", "-o", "again.npz")
+    assert again.returncode == 0, again.stderr
+    assert "written: again.npz" in again.stdout
+    for wrong, what in (
+        (("--rig", "section-vi", "pokes/pokes.mcap", "-o", "b.npz"), "needs a sensor of kind 'spots'"),
+        (("--rig", "tip-tilt", "pokes/pokes.mcap", "-o", "b.toml"), ".npz"),
+    ):
+        refused = aolink("calibrate", "--interaction", *wrong)
+        assert refused.returncode == 8
+        assert what in refused.stderr

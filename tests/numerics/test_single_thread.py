@@ -24,7 +24,7 @@ def test_products_are_those_of_whole_matrices(n: int, k: int, m: int) -> None:
     np.testing.assert_allclose(single_thread.matmul(a, b), a @ b, atol=1e-12)
     np.testing.assert_allclose(single_thread.matmul(b.T, a.T), b.T @ a.T, atol=1e-12)
     np.testing.assert_allclose(
-        single_thread.matvec(a, b[:, 0] if m else np.zeros(k)), a @ (b[:, 0] if m else np.zeros(k)), atol=1e-12
+        single_thread.matmul(a, b[:, 0] if m else np.zeros(k)), a @ (b[:, 0] if m else np.zeros(k)), atol=1e-12
     )
     gram = single_thread.gram(a)
     np.testing.assert_allclose(gram, a.T @ a, atol=1e-12)
@@ -55,7 +55,6 @@ def test_congruence_by_entries_and_whole(share: float) -> None:
     a, p = random(90, 150) * (np.random.default_rng(1).random((90, 150)) < share), random(150, 150)
     p = p + p.T
     np.testing.assert_allclose(single_thread.congruence(a, p), a @ p @ a.T, atol=1e-11)
-    np.testing.assert_array_equal(single_thread.congruences(a, p[None])[0], single_thread.congruence(a, p))
 
 
 @pytest.mark.parametrize("touched", [0, 60, 149, 150])

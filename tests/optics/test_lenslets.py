@@ -54,11 +54,6 @@ def test_partly_lit_lenslets_average_what_is_lit_and_dark_ones_have_no_slope():
     assert -2 * 0.45 < slopes[0, 4, 1] < -2 * 0.4
 
 
-def test_pixels_and_diffraction_have_their_angles():
-    assert SQUARE.pixels_to_slope(5e-6) == pytest.approx(1e-3)
-    assert SQUARE.diffraction_width(1e-6) == pytest.approx(5e-3)
-
-
 @pytest.mark.parametrize("change", [{"pitch_m": 0.0}, {"grid": (0, 3)}, {"obstruction": 1.0}])
 def test_what_cannot_be_lenslets_is_refused(change):
     with pytest.raises(ValueError, match="not lenslets"):

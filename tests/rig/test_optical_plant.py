@@ -40,7 +40,7 @@ def test_a_pressure_moves_every_spot_as_the_membrane_bends():
 def test_the_window_is_a_lenslet_seen_from_its_focus():
     assert SH.sensor.field == pytest.approx((-0.15 / 45 * 1e3, 0.15 / 45 * 1e3))
     assert SH.sensor.pixel_width * 1e-3 == pytest.approx(
-        must_be(Optics, SH.optics).lenslets.pixels_to_slope(0.3e-3 / 16)
+        0.3e-3 / 16 / must_be(Optics, SH.optics).lenslets.focal_length_m
     )
 
 

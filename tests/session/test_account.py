@@ -11,7 +11,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.cli.tables import recording_facts
+from aolink.cli.tables.recordings import recording_facts
 from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.recording import topics

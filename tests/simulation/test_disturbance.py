@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aolink.errors import RigError
-from aolink.optics.turbulence import Layer, structure_function
+from aolink.optics.turbulence import Layer
 from aolink.rig import load_rig, parse_rig
 from aolink.rig.disturbance import Disturbance
 from aolink.rig.optical_plant import Optics
@@ -14,6 +14,7 @@ from aolink.simulation.disturbance import DisturbancePlayer
 from aolink.simulation.model import RigModel, simulate
 from tests.conftest import without_pupil
 from tests.kinds import must_be, truth_of
+from tests.structure_function import structure_function
 
 SH, TILT = without_pupil(load_rig("sh-8x8")), load_rig("tip-tilt")
 

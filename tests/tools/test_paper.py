@@ -33,6 +33,7 @@ SECTIONS = (
     "How near to the limit",
     "Not worse than o1, anywhere",
     "Blur that nobody here made",
+    "Films whose motion we know",
 )
 NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
 
@@ -119,7 +120,7 @@ def test_a_figure_is_there_and_not_blank(out: Path, name: str) -> None:
 
 
 def test_estimators_have_the_viewers_colours(out: Path) -> None:
-    from aolink.viewing.palette import estimator_colour
+    from aolink.colours import estimator_colour
 
     image = pytest.importorskip("PIL.Image").open(out / "figure-6.png").convert("RGB")
     colours = {tuple(int(c) for c in each) for each in np.unique(np.asarray(image).reshape(-1, 3), axis=0)}

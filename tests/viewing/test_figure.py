@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from aolink.colours import estimator_colour
 from aolink.errors import ViewerError
 from aolink.rig import load_rig
 from aolink.viewing import draw_session
-from aolink.viewing.palette import estimator_colour
 from tests.viewing.stand_in import StandIn, as_recording
 from tests.viewing.test_spots import Simulated
 

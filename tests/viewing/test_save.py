@@ -11,11 +11,12 @@ import pytest
 import rerun as rr
 from scipy import stats
 
+from aolink.colours import estimator_colour
 from aolink.errors import ViewerError
 from aolink.recording.reader import Recording
 from aolink.viewing.camera import HISTORY
 from aolink.viewing.motion import log_estimates, nis_bounds
-from aolink.viewing.palette import MISSING, NOTHING, TRUTH, estimator_colour
+from aolink.viewing.palette import MISSING, NOTHING, TRUTH
 from aolink.viewing.save import save_rrd
 from aolink.viewing.timebase import Timebase
 from tests.conftest import Session

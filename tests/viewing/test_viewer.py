@@ -19,9 +19,10 @@ import pytest
 import rerun as rr
 from PIL import Image
 
+from aolink.colours import estimator_colour
 from aolink.errors import RendererError, ViewerError
 from aolink.viewing import open_viewer, screenshot, serve_web
-from aolink.viewing.palette import TRUTH, estimator_colour
+from aolink.viewing.palette import TRUTH
 from aolink.viewing.save import save_rrd
 from aolink.viewing.viewer import WEB_PORT, free_port, headless_viewer, settled_picture
 from aolink.viewing.vulkan import has_vulkan

@@ -12,12 +12,14 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 from aolink.batch import Settings, estimate_file
 from aolink.jobs import batch
+from aolink.numerics.workers import processes as pool_of
 from bench_rows.recording import record_long
 from bench_rows.row import Effort, Row, median_s, resident_mb, timed
 
@@ -161,7 +163,10 @@ def _serving_s3() -> Iterator[list[int]]:
 
 
 def cluster_workers(effort: Effort) -> Row:
-    """Eight recordings estimated with moments on two workers of a Dask scheduler, against one worker."""
+    """Eight recordings estimated with moments on two workers of a Dask scheduler, against one worker.
+
+    Beside it what this machine can give: the same work by two plain processes against one, in the same rounds.
+    """
     from distributed import Client
 
     from aolink.jobs.cluster import run_on
@@ -197,15 +202,22 @@ def cluster_workers(effort: Effort) -> Row:
             assert not any(each.error for each in done)
             return math.fsum(row["seconds"] for each in done for row in each.rows)
 
+        def plain(pool: ProcessPoolExecutor) -> None:
+            assert not any(each.error for each in pool.map(batch.do, todo))
+
         small, large = cluster(1), cluster(2)
-        median_s(lambda: work(small), 1, lambda: work(large))  # they load what they need
+        alone, pair = (stack.enter_context(pool_of(count)) for count in (1, 2))
+        median_s(lambda: plain(alone), 1, lambda: plain(pair))  # they load what they need
+        median_s(lambda: work(small), 1, lambda: work(large))
         busy: list[float] = []
-        one, two = median_s(lambda: work(small), effort.of(5), lambda: busy.append(work(large)))
+        runs = (lambda: work(small), lambda: busy.append(work(large)), lambda: plain(alone), lambda: plain(pair))
+        rounds = [[timed(run) for run in runs] for _ in range(effort.of(5))]
+        one, two, process, processes = (statistics.median(each) for each in zip(*rounds, strict=True))
     share = statistics.median(busy) / (2 * two)
     return Row(
         "8 recordings on 2 Dask workers",
         f"{two:.1f} s, workers busy {share:.0%}",
-        f"on one {one:.1f} s",
+        f"on one {one:.1f} s; two plain processes {process / processes:.2f} times one",
         one / two,
         1.8,
     )

@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import aolink
+from aolink.colours import estimator_colour
 from aolink.estimation import Estimate, make_estimator, run
 from aolink.estimation.frames.moments import measure_moments
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
 from aolink.rig import Rig
-from aolink.viewing.palette import estimator_colour
 from paper_report.ensemble import Cell, Measured, clean_exposures, errors, side_by_side, with_pixel_noise
 from paper_report.limit import NAMES, Found
 from paper_report.limit import Scene as LimitScene

@@ -17,6 +17,7 @@ from paper_report import numbers as n
 from paper_report.blocks import as_html, as_markdown
 from paper_report.ensemble import Cell, map_cells
 from paper_report.limit import against_o1, limit_table
+from paper_report.made_films import made_films
 from paper_report.page import Results, build
 from paper_report.shake import shake_table
 from paper_report.spheres import film
@@ -66,6 +67,8 @@ def compute(effort: n.Effort) -> Results:
         limit, over_o1 = limit_table(effort), against_o1(effort)
     with _timed("spheres"):
         spheres = film(effort)
+    with _timed("made films"):
+        made = made_films(effort)
     with _timed("map"):
         mechanism = n.mechanism(lively, effort)
         cells = map_cells(
@@ -75,7 +78,7 @@ def compute(effort: n.Effort) -> Results:
     return Results(
         printed=printed, lively=lively, effort=effort, rows=rows, norms=norms, errors=errors, forms=forms,
         remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, over_o1=over_o1, film=spheres,
-        cells=cells,
+        made=made, cells=cells,
     )  # fmt: skip
 
 

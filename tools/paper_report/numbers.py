@@ -48,6 +48,10 @@ class Effort:
     film_frames: tuple[int, ...] = (8, 12, 24)
     film_exposures: int | None = None
     """Of each length, so many; all that the film has if None."""
+    made_kinds: tuple[int, int] = (0, 11)
+    """Which kinds of made films, from the first to before the second."""
+    made_seeds: int = 5
+    made_exposures: int = 14
     particles: int = 1500
     """Of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -61,6 +65,7 @@ FULL = Effort()
 QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
     limit_runs=2, limit_exposures=4, limit_skip=1, o1_runs=4, o1_exposures=4, particles=150, film_exposures=3,
+    made_kinds=(2, 4), made_seeds=1, made_exposures=6,
     offsets=(0.0, 0.5), densities=(0.1, 0.01), process_noises=(0.1, 10.0), frequencies=100, dpi=70,
 )  # fmt: skip
 

@@ -15,6 +15,7 @@ from paper_report import figures
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
 from paper_report.ensemble import Cell, Measured
 from paper_report.limit import Scene, against_o1_section, limit_section
+from paper_report.made_films import MadeFilm, made_section
 from paper_report.numbers import (
     Effort,
     ErrorRow,
@@ -52,6 +53,7 @@ class Results:
     limit: list[Scene]
     over_o1: list[tuple[str, dict[str, Measured]]]
     film: list[Film]
+    made: list[MadeFilm]
     cells: list[Cell]
 
 
@@ -88,6 +90,7 @@ def build(results: Results) -> list[Block]:
         *limit_section(results.limit, results.effort, _picture("limit.png")),
         *against_o1_section(results.over_o1, results.effort),
         *film_section(results.film),
+        *made_section(results.made, results.effort),
     ]
 
 

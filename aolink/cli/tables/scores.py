@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -12,30 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from aolink.cli.tables.json import without_nan
-from aolink.estimation import Estimate
-from aolink.estimation.score import Consistency, Score, Scorer
-from aolink.recording.reader import Recording
+from aolink.estimation.score import Consistency, Score
 
 _MOST_REASONS = 3
 """How many reasons of one estimator the table shows."""
-
-
-def score_all(recording: Recording, estimates: Mapping[str, Iterable[Estimate]]) -> dict[str, Score]:
-    """Score estimates against the truth in their recording, by estimator; one exposure at a time is in memory.
-
-    Estimates come in the order of their exposures, and there may be none of an exposure that the session skipped.
-    """
-    if not estimates:
-        return {}
-    scorers = {name: Scorer() for name in estimates}
-    series = {name: iter(each) for name, each in estimates.items()}
-    ahead = {name: next(each, None) for name, each in series.items()}
-    for exposure in recording.exposures():
-        for name, estimate in ahead.items():
-            if estimate is not None and estimate.frame_id == exposure.frame_id:
-                scorers[name].add(exposure, estimate)
-                ahead[name] = next(series[name], None)
-    return {name: scorer.result() for name, scorer in scorers.items()}
 
 
 def scores(by_name: Mapping[str, Score]) -> Table:

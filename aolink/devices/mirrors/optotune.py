@@ -77,7 +77,9 @@ class OptotuneMirror:
             opened.pop_all()
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        xy = np.round(np.tan(self._unit_rad * u) / _LIMIT, _DECIMALS)
+        steps = 10**_DECIMALS
+        # Towards zero, so never beyond the circle.
+        xy: NDArray[np.float64] = np.trunc(np.tan(self._unit_rad * u) / _LIMIT * steps) / steps
         request = ";".join(f"{each:.{_DECIMALS}f}" for each in xy)
         if (answer := self._ask(f"XY={request}")) != "OK":
             raise DeviceError(

@@ -8,13 +8,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.compiled.small import compiled, compiled_sums
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-Indices = NDArray[np.intp]
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
 # A product of variance ratios is replaced by its logarithm when it exceeds this.
 _LARGE = 1e200

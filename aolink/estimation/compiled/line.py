@@ -10,12 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.compiled.small import compiled, inlined
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from aolink.numerics.arrays import BoolArray, FloatArray
 
 # A product of variance ratios is replaced by its logarithm when it exceeds this.
 _LARGE = 1e200

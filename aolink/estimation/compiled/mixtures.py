@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.compiled.line import Line, expected_light, log_likelihood_of
 from aolink.estimation.compiled.small import cholesky, compiled, compiled_sums, decay, lower_inverse
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 _LOG_2PI = math.log(2 * math.pi)
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.compiled.line import Line, fisher_information, linearised_light, path_of
 from aolink.estimation.compiled.small import cholesky, compiled, eigh, inlined, lower_inverse, lower_solve, solve, times
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray, Indices
 
 # A search ends where its squared distance from a known mode, in that mode's standard deviations, is below this.
 _NEXT_TO = 0.25
@@ -92,7 +90,7 @@ def innovations(
 
 @compiled
 def find_modes(
-    line: Line, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: NDArray[np.intp], whole: int,
+    line: Line, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: Indices, whole: int,
     reversed_precision: float, passes: int, first_damping: float, largest_damping: float, free_damping: float,
     converged: float, out_mean: FloatArray, out_covariance: FloatArray, out_evidence: FloatArray,
     out_distance: FloatArray, out_objective: FloatArray,

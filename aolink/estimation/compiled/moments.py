@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.compiled.line import Line, path_of
 from aolink.estimation.compiled.small import cholesky, compiled, solve, times
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 _ORDERS = 4  # of `WindowedMoments` as `broad` uses them: u^0 to u^3
 

@@ -7,10 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
-import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 def compiled(function: Callable[..., Any]) -> Any:

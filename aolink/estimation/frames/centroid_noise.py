@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.frames.moments import known_flux_covariance, noise_integrals
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import BaseSensor, SpotSensor
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 
 def centroid_covariance(rig: Rig) -> FloatArray:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 Flux = Literal["known", "measured"]
 
 HALF = 0.5
@@ -51,48 +48,43 @@ class Measurement:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Profile:
-    """Densities of one row of pixels for each axis; for each output of each axis, where an axis has several."""
+class Densities:
+    """Densities of the pixels of each axis."""
 
     density: FloatArray
-    """One over slope units, (axes, pixels)."""
+    """(axes, ...)"""
     mask: BoolArray
-    """True where the pixel can be used, (axes, pixels)."""
+    """True where the pixel can be used, shape of ``density``."""
     light: FloatArray | None = None
-    """Light of each spot as a share of a whole one's, which densities are divided by, (axes,); one where None."""
+    """Light of each spot as a share of a whole one's, which densities are divided by; one where None."""
     usable: BoolArray | None = None
     """False for axes of which nothing was measured, (axes,); None if all were measured."""
 
-    def part(self, axes: slice) -> Profile:
-        """The part of these axes."""
+    def part(self, axes: slice | Indices) -> Self:
+        """The part of these axes, all of which were measured."""
         light = None if self.light is None else self.light[axes]
-        return Profile(density=self.density[axes], mask=self.mask[axes], light=light)
+        return replace(self, density=self.density[axes], mask=self.mask[axes], light=light, usable=None)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SpotWindows:
-    """Densities of the pixels about each spot of each copy of the plant."""
+class Profile(Densities):
+    """Densities of one row of pixels for each axis; for each output of each axis, where an axis has several.
 
-    density: FloatArray
-    """One over slope units squared, zero where the mask is, (axes, spots, rows, columns)."""
-    mask: BoolArray
-    """True where the pixel can be used, (axes, spots, rows, columns)."""
-    light: FloatArray | None = None
-    """Light of each spot as a share of a whole one's, which densities are divided by, (axes, spots); one where None."""
-    usable: BoolArray | None = None
-    """False for axes of which nothing was measured, (axes,); None if all were measured."""
+    One over slope units, (axes, pixels); light (axes,).
+    """
+
+
+class SpotWindows(Densities):
+    """Densities of the pixels about each spot of each copy of the plant.
+
+    One over slope units squared, zero where the mask is, (axes, spots, rows, columns); light (axes, spots).
+    """
 
     def per_light(self, light: FloatArray | None) -> SpotWindows:
         """The same with densities divided by the light of each spot in the rig's order, (axes * spots,)."""
         if light is None:
             return self
         light = light.reshape(self.density.shape[:2])
-        return SpotWindows(density=self.density / light[..., None, None], mask=self.mask, light=light)
-
-    def part(self, axes: slice) -> SpotWindows:
-        """The part of these axes."""
-        light = None if self.light is None else self.light[axes]
-        return SpotWindows(density=self.density[axes], mask=self.mask[axes], light=light)
+        return replace(self, density=self.density / light[..., None, None], light=light)
 
 
 FrameData = Measurement | Profile | SpotWindows

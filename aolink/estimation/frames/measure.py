@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from aolink.errors import EstimatorError
+from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile
 from aolink.estimation.frames.moments import least_significance, measure_moments, spot_significance
 from aolink.estimation.frames.spots import measure_spots
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.rig import Rig
 
-FloatArray = NDArray[np.float64]
 Measured = tuple[FrameData | None, str]
 """What was measured of an exposure, or None; and a remark about what could not be used, or an empty text."""
 
@@ -65,6 +66,8 @@ def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:
     """What an estimator needs of an exposure, or None; and a remark about what could not be used."""
     if needs is None:
         return None, ""
+    if exposure.slopes is not None:
+        return _measured_slopes(rig, exposure.frame_id, exposure.slopes, needs)
     sensor, pixels = rig.sensor, exposure.pixels
     if pixels.shape != sensor.shape:
         return None, f"the frame has {pixels.shape} pixels, the rig's sensor {sensor.shape}"
@@ -90,6 +93,29 @@ def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:
         return Profile(density=density.reshape(rows), mask=usable.reshape(rows)), remark
     moments = measure_moments(sensor, pixels.reshape(rows), needs.orders, needs.flux)
     return (None, moments) if isinstance(moments, str) else (moments, "")
+
+
+def _measured_slopes(rig: Rig, frame_id: int, slopes: FloatArray, needs: Needs) -> Measured:
+    """Slopes that came without pixels, with the noise that the rig's sensor has in a centroid.
+
+    Raises EstimatorError for an estimator that needs more of a frame than its centroids.
+    """
+    if needs.what != "moments" or needs.orders != (1,):
+        raise EstimatorError(
+            f"exposure {frame_id} holds slopes only, no pixels: o1 and open-loop can use it, no other estimator"
+        )
+    value = slopes.reshape(rig.plant.axes, -1) if slopes.size == rig.n_outputs else None
+    if value is None:
+        return None, f"there are {slopes.size} slopes, the rig has {rig.n_outputs}"
+    usable: BoolArray = np.asarray(np.isfinite(value).all(axis=1))
+    if not usable.any():
+        return None, "no slope was measured"
+    noise = centroid_covariance(rig)
+    return Measurement(
+        value=np.where(usable[:, None], value, 0.0),
+        covariance=np.broadcast_to(noise, (len(value), *noise.shape[1:])),
+        usable=None if usable.all() else usable,
+    ), ("" if usable.all() else f"slopes of {int((~usable).sum())} of {len(usable)} axes are missing")
 
 
 def _least_significance(sensor: SpotSensor) -> FloatArray:

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import Flux, Measurement
 from aolink.numerics import batched
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import kernel_moments
 from aolink.optics.sensor import Sensor
 
-FloatArray = NDArray[np.float64]
 Counts = NDArray[np.uint16] | FloatArray
 
 # Where the flux is measured, its sd must be this many times smaller: a ratio's variance is not finite otherwise.
@@ -146,7 +146,7 @@ def with_shot_noise(
     return noise
 
 
-def _is_covariance(noise: FloatArray) -> NDArray[np.bool_]:
+def _is_covariance(noise: FloatArray) -> BoolArray:
     """Whether the matrices with entries noise[p + q] are positive definite, (axes, 2 highest + 1) -> (axes,)."""
     size = noise.shape[1] // 2 + 1
     left = [[noise[:, p + q] for q in range(size)] for p in range(size)]

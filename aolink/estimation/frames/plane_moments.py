@@ -10,18 +10,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import Flux, Measurement
 from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.numerics import batched
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.plane import kernel_moments_2d
 
-FloatArray = NDArray[np.float64]
 Order = tuple[int, int]
-
-PLANE_ORDERS: tuple[Order, ...] = ((1, 0), (2, 0), (0, 1), (0, 2), (1, 1))
-"""First and second moments, in the order of `PathMoments` for two outputs with cross moments."""
 
 
 def measure_moments_2d(
@@ -30,7 +26,7 @@ def measure_moments_2d(
     y_edges: FloatArray,
     kernel: FloatArray,
     noise_density: float,
-    orders: Sequence[Order] = PLANE_ORDERS,
+    orders: Sequence[Order],
     flux: Flux = "known",
     light: FloatArray | None = None,
     photoelectrons: float = 0.0,

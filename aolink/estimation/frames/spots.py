@@ -22,13 +22,11 @@ from aolink.estimation.frames.moments import (
     spot_significance,
 )
 from aolink.estimation.frames.plane_moments import measure_moments_2d
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
 from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.estimate import Status
@@ -17,17 +16,16 @@ from aolink.estimation.kalman import two_states
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.estimation.kalman.path_moments import Observation
 from aolink.estimation.kalman.predict import Noise, Predict, added_noise, predict, predicted_mean
-from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
+from aolink.estimation.model.base import ExposureModel, InputResponse, over_steps
 from aolink.numerics import batched
-from aolink.plant.lifting import input_response, lift
+from aolink.numerics.arrays import BoolArray, FloatArray, IntArray
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
 
 # A measurement that chi-square makes less likely than this is not used. It is wide: the paper's filters leave the
 # process noise inside an exposure out, and have every right to innovations larger than they expect.
 _GATE_PROBABILITY = 1e-9
-_PATIENCE = 3
+PATIENCE = 3
+"""After so many gated measurements in a row a filter starts again from the prediction without any."""
 # Relative change of a covariance that is rounding.
 _SETTLED = 1e-13
 
@@ -39,7 +37,7 @@ class Posterior:
     coefficients: Gaussian
     """Coefficients of the exposure basis; the start state comes first."""
     end: Gaussian
-    status: NDArray[np.int64]
+    status: IntArray
     """`Status` of each axis, (axes,)."""
     innovation: FloatArray
     """(axes, n_measurements)"""
@@ -47,7 +45,7 @@ class Posterior:
     """(axes, n_measurements, n_measurements), or its diagonal for many measurements, (axes, n_measurements)."""
     nis: FloatArray
     """(axes,)"""
-    several: NDArray[np.bool_] | None = None
+    several: BoolArray | None = None
     """Whether several modes of the posterior were found (the blur has more than one reading), (axes,); None where they
     are not searched."""
 
@@ -122,18 +120,17 @@ class BlurFilter(Filter):
 
     def bridge(self, inputs: FloatArray) -> None:
         if len(inputs):
-            transition, noise = lift(self.plant, len(inputs))
-            _, kick = input_response(self.plant, by_axis(self.plant, inputs))
-            self.prior = self._predict(self.prior, transition, noise, kick)
-            self._predict_unseen(transition, noise, kick)
+            over = over_steps(self.plant, inputs)
+            self.prior = self._predict(self.prior, *over)
+            self._predict_unseen(*over)
 
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
         axes, looks = self.plant.axes, self.observation
-        lost = self._missed >= _PATIENCE
+        lost = self._missed >= PATIENCE
         prior = _where(lost, self._unseen, self.prior)
         with_noise = looks is None or looks.models_noise
         if with_noise:
-            prior = _with_noise(prior, model.n_coefficients)
+            prior = prior.with_noise(model.n_coefficients)
         if measured is None or looks is None:
             done = Update(prior, np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes))
             status = np.full(axes, Status.PREDICTED if looks is None else Status.INPUT_INVALID, dtype=np.int64)
@@ -169,27 +166,41 @@ class BlurFilter(Filter):
         self._settled_under = transition if settled else None
 
     def _trusted(
-        self, prior: Gaussian, done: Update, lost: NDArray[np.bool_], usable: NDArray[np.bool_] | None
-    ) -> tuple[Gaussian, NDArray[np.int64]]:
+        self, prior: Gaussian, done: Update, lost: BoolArray, usable: BoolArray | None
+    ) -> tuple[Gaussian, IntArray]:
         """The updated Gaussian where it is finite and not gated, otherwise the prior; and the status of each axis."""
-        after, missed = done.posterior, self._missed
+        after = done.posterior
         used = done.nis <= self._gate
         # Sums are finite where all is; those that overflow are checked again, axis by axis.
         if not (_has_finite_sum(after.mean) and _has_finite_sum(after.covariance)):
             used &= np.isfinite(after.mean).all(axis=1) & np.isfinite(after.covariance).all(axis=(1, 2))
         if usable is None and used.all() and not self._missed.any():
             return after, np.full(len(used), int(Status.OK), dtype=np.int64)
-        refused = ~used
-        self._missed = np.where(used, 0, np.where(lost, 1, self._missed + 1))
-        status = np.full(len(used), int(Status.OK), dtype=np.int64)
-        status[lost & used] = Status.REINITIALISED
-        status[refused] = Status.GATED
-        status[refused & (self._missed >= _PATIENCE)] = Status.DIVERGED
+        status, missed = gate_status(used, lost, self._missed)
         if usable is not None:
-            refused |= ~usable
+            used &= usable
             status[~usable] = Status.INPUT_INVALID
-            self._missed = np.where(usable, self._missed, missed)
-        return _where(refused, prior, after), status
+            missed = np.where(usable, missed, self._missed)
+        self._missed = missed
+        return _where(~used, prior, after), status
+
+
+def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[IntArray, IntArray]:
+    """The `Status` of measured axes, and how many of their measurements in a row were gated, all (axes,).
+
+    Parameters
+    ----------
+    used:
+        Whether the measurement passed the gate.
+    lost:
+        Whether so many before it were gated that the filter started again.
+    missed:
+        How many in a row before it were gated.
+    """
+    now = np.where(used, 0, np.where(lost, 1, missed + 1))
+    passed = np.where(lost, Status.REINITIALISED, Status.OK)
+    refused = np.where(now >= PATIENCE, Status.DIVERGED, Status.GATED)
+    return np.where(used, passed, refused).astype(np.int64), now
 
 
 class TwoStateFilter(BlurFilter):
@@ -230,7 +241,7 @@ class TwoStateFilter(BlurFilter):
         return done
 
 
-def _without(done: Update, usable: NDArray[np.bool_] | None) -> Update:
+def _without(done: Update, usable: BoolArray | None) -> Update:
     """Innovations, their covariance and NIS of zero for axes of which nothing was measured."""
     if usable is None:
         return done
@@ -247,14 +258,6 @@ def _kept(covariance: FloatArray) -> FloatArray:
     return covariance
 
 
-def _with_noise(state: Gaussian, count: int) -> Gaussian:
-    """The start state and the noise coefficients, which nothing is known of before the exposure: N(0, I)."""
-    axes, n = state.mean.shape
-    mean, covariance = np.zeros((axes, count)), np.tile(np.eye(count), (axes, 1, 1))
-    mean[:, :n], covariance[:, :n, :n] = state.mean, state.covariance
-    return Gaussian(mean, covariance)
-
-
 def _numbers(values: FloatArray) -> FloatArray:
     """Zero for what is not a number, the largest one for what is too large."""
     return values if _has_finite_sum(values) else np.nan_to_num(values)
@@ -264,7 +267,7 @@ def _has_finite_sum(values: FloatArray) -> bool:
     return math.isfinite(np.add.reduce(values, axis=None))
 
 
-def _where(chosen: NDArray[np.bool_], first: Gaussian, second: Gaussian) -> Gaussian:
+def _where(chosen: BoolArray, first: Gaussian, second: Gaussian) -> Gaussian:
     """Axis by axis, the first Gaussian where chosen."""
     which = np.flatnonzero(chosen)
     if not len(which):

@@ -8,15 +8,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.path_moments import PathMoments, predicted_moments
 from aolink.estimation.model.base import ExposureModel, InputResponse
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 class FilterpyMoments(PathMoments):

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-
+from aolink.numerics.arrays import FloatArray, Indices
 
 MOST_COVARIANCES = 32
 """Most measurements for which an estimate keeps the whole innovation covariance; for more it keeps the diagonal."""
@@ -22,6 +20,18 @@ class Gaussian:
     """(axes, n)"""
     covariance: FloatArray
     """(axes, n, n)"""
+
+    def part(self, axes: slice | Indices) -> Gaussian:
+        """Those of some axes."""
+        return Gaussian(self.mean[axes], self.covariance[axes])
+
+    def with_noise(self, size: int) -> Gaussian:
+        """With noise coefficients N(0, I) after these, ``size`` in all; leading axes as they come."""
+        *lead, n = self.mean.shape
+        mean, covariance = np.zeros((*lead, size)), np.empty((*lead, size, size))
+        mean[..., :n], covariance[...] = self.mean, np.eye(size)
+        covariance[..., :n, :n] = self.covariance
+        return Gaussian(mean, covariance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,10 @@ measurements times measurements. All products are those of `aolink.numerics.sing
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.numerics import single_thread
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.information import information, inverse_root
-
-FloatArray = NDArray[np.float64]
 
 # A gain settles within this many exposures, or there is none; relative changes of a covariance below this are rounding.
 _MOST_EXPOSURES = 1000
@@ -39,13 +37,13 @@ def update(
     H_white = (white @ H.reshape(blocks, size, n)).reshape(m, n)
     y_white = (white @ y.reshape(blocks, size, 1)).ravel()
     W = inverse_root(information(P) + single_thread.gram(H_white))
-    score = single_thread.matvec(H_white.T, y_white)
+    score = single_thread.matmul(H_white.T, y_white)
     covariance = single_thread.gram(W)
-    moved = single_thread.matvec(covariance, score)
+    moved = single_thread.matmul(covariance, score)
     nis = np.asarray(y_white @ y_white - score @ moved)
     S = (single_thread.matmul(H, P) * H).sum(axis=1) + np.einsum("bss->bs", R).ravel()
     if gain is not None:
-        moved = single_thread.matvec(gain, y)
+        moved = single_thread.matmul(gain, y)
         keep = np.eye(n) - single_thread.matmul(gain, H)
         told = (gain.reshape(n, blocks, size).swapaxes(0, 1) @ R).swapaxes(0, 1).reshape(n, m)
         covariance = single_thread.congruence(keep, P) + single_thread.matmul(told, np.ascontiguousarray(gain.T))

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Callable, Sequence
 from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
 from aolink.estimation.kalman.gaussian import Gaussian, Update
@@ -21,11 +18,11 @@ from aolink.estimation.kalman.update import (
 )
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics import batched, entrywise
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.entrywise import Entry
 from aolink.plant.alike import MANY_STATES
 from aolink.rig import Plant
 
-FloatArray = NDArray[np.float64]
 Form = Callable[[ExposureModel, InputResponse, Gaussian, Measurement], Update]
 
 
@@ -55,8 +52,6 @@ class PathMoments:
         Moments, of 1 and 2.
     gain:
         A constant gain (n_states, n_measurements) instead of the optimal one.
-    crosses:
-        Whether the cross moments of each two outputs follow, y_11 of a lenslet's x and y.
     flux:
         As in `Needs`.
     """
@@ -64,18 +59,17 @@ class PathMoments:
     models_noise = False
 
     def __init__(
-        self, plant: Plant, orders: Sequence[int], gain: FloatArray | None = None, *, crosses: bool = False,
-        flux: Flux = "known",
-    ) -> None:  # fmt: skip
-        self.orders, self.gain, self.crosses = tuple(orders), gain, crosses
+        self, plant: Plant, orders: Sequence[int], gain: FloatArray | None = None, *, flux: Flux = "known"
+    ) -> None:
+        self.orders, self.gain = tuple(orders), gain
         self.needs = Needs(what="moments", orders=self.orders, flux=flux)
-        self.n_measurements = plant.n_outputs * len(self.orders) + crosses * math.comb(plant.n_outputs, 2)
+        self.n_measurements = plant.n_outputs * len(self.orders)
         self._form = self._chosen_form(plant)
 
     def _chosen_form(self, plant: Plant) -> Form:
         """The form of the update for these numbers of states and measurements."""
-        if plant.n_outputs > 2 and not self.crosses:  # many spots, of which each has noise of its own
-            return self._many if plant.n_states > MANY_STATES else self._blocked
+        if plant.n_outputs > 2:  # many spots, of which each has noise of its own
+            return self._many
         if max(self.n_measurements, plant.n_states) > entrywise.MOST_ROWS:
             return self._in_matrices
         if self.gain is None and self.n_measurements == plant.n_states == 2:
@@ -88,16 +82,13 @@ class PathMoments:
 
     def _many(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
         expected, slope = many_moments(model, response, prior.mean, self.orders)
-        return information_update(prior, measured.value - expected, slope, measured.covariance, self.gain)
-
-    def _blocked(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
-        expected, slope = many_moments(model, response, prior.mean, self.orders)
-        return blocked_update(prior, measured.value - expected, slope, measured.covariance, self.gain)
+        update = information_update if model.plant.n_states > MANY_STATES else blocked_update
+        return update(prior, measured.value - expected, slope, measured.covariance, self.gain)
 
     def _in_matrices(
         self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
     ) -> Update:
-        h, H = predicted_moments(model, response, prior.mean, self.orders, crosses=self.crosses)
+        h, H = predicted_moments(model, response, prior.mean, self.orders)
         return joseph_update(prior, measured.value - h, H, self._noise(measured), self.gain)
 
     def _small(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement) -> Update:
@@ -113,7 +104,7 @@ class PathMoments:
     def _entries(
         self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: Measurement
     ) -> tuple[list[Entry], entrywise.Matrix]:
-        h, H = _moment_entries(model, response, prior.mean, self.orders, crosses=self.crosses)
+        h, H = _moment_entries(model, response, prior.mean, self.orders)
         return [y - expected for y, expected in zip(entrywise.columns(measured.value), h, strict=True)], H
 
     def _noise(self, measured: Measurement) -> FloatArray:
@@ -123,7 +114,7 @@ class PathMoments:
 
 
 def predicted_moments(
-    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int], *, crosses: bool = False
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
     """Moments of the path without process noise, and their Jacobian by the start state.
 
@@ -139,14 +130,14 @@ def predicted_moments(
 
     Returns
     -------
-    h (axes, m) and H (axes, m, n_states); an output's orders are together, cross moments come last.
+    h (axes, m) and H (axes, m, n_states); an output's orders are together.
     """
-    h, H = _moment_entries(model, response, state, orders, crosses=crosses)
+    h, H = _moment_entries(model, response, state, orders)
     return entrywise.pack_vector(h, len(state)), entrywise.pack(H, len(state))
 
 
 def _moment_entries(
-    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int], *, crosses: bool = False
+    model: ExposureModel, response: InputResponse, state: FloatArray, orders: Sequence[int]
 ) -> tuple[list[Entry], entrywise.Matrix]:
     """`predicted_moments`, entry by entry."""
     x = entrywise.columns(state)
@@ -162,13 +153,6 @@ def _moment_entries(
             half = entrywise.add(_times_state(model.quadratic[o], state), slope)
             moments.append(entrywise.dot(x, entrywise.add(half, slope)) + entrywise.columns(response.square)[o])
             slopes.append([2 * each for each in half])
-    for o, p in itertools.combinations(range(model.plant.n_outputs), 2) if crosses else ():
-        # mean (a'x + c)(b'x + d) = x'M_ab x + (b_ad + b_bc)'x + s_cd
-        mixed = _times_state(model.cross_quadratic(o, p), state)
-        both, square = model.cross_response(response, o, p)
-        slope = entrywise.columns(both)
-        moments.append(entrywise.dot(x, entrywise.add(mixed, slope)) + square)
-        slopes.append([2 * a + b for a, b in zip(mixed, slope, strict=True)])
     return moments, slopes
 
 

@@ -6,14 +6,13 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
 from aolink.numerics import batched, entrywise, single_thread
+from aolink.numerics.arrays import FloatArray
 from aolink.plant.alike import MANY_STATES
 
-FloatArray = NDArray[np.float64]
 Noise = Literal["lifted", "printed"]
 Predict = Callable[[Gaussian, FloatArray, FloatArray, FloatArray], Gaussian]
 
@@ -35,9 +34,11 @@ def predict(state: Gaussian, transition: FloatArray, noise: FloatArray, kick: Fl
         d, the state's response to the inputs, (axes, n_states).
     """
     mean = predicted_mean(state.mean, transition, kick)
+    if max(transition.shape) > MANY_STATES:
+        each = [single_thread.congruence(transition, P) for P in state.covariance]
+        return Gaussian(mean, batched.symmetric(np.stack(each) + noise))
     if max(transition.shape) > entrywise.MOST_ROWS:
-        spread = single_thread.congruences if max(transition.shape) > MANY_STATES else batched.congruence
-        return Gaussian(mean, batched.symmetric(spread(transition, state.covariance) + noise))
+        return Gaussian(mean, batched.symmetric(batched.congruence(transition, state.covariance) + noise))
     P, Q = entrywise.unpack(state.covariance), entrywise.unpack(noise)
     covariance = entrywise.congruence_by_numbers(transition.tolist(), P, Q)
     return Gaussian(mean, entrywise.pack(covariance, len(state.covariance)))

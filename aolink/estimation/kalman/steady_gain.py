@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.estimation.kalman import information_form
 from aolink.estimation.model.base import ExposureModel
+from aolink.numerics.arrays import FloatArray
 from aolink.plant.alike import MANY_STATES
-
-FloatArray = NDArray[np.float64]
 
 
 def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArray | None:

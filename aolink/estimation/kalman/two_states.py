@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.entrywise import Entry, reciprocal
 
-FloatArray = NDArray[np.float64]
 Weights = tuple[float, float, float]
 
 

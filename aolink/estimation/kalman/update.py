@@ -6,14 +6,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.kalman import information_form, two_states
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.numerics import batched, entrywise
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.entrywise import Entry
-
-FloatArray = NDArray[np.float64]
 
 
 def joseph_update(

@@ -25,13 +25,11 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.numerics import batched
-from aolink.plant.lifting import lift
+from aolink.numerics.arrays import FloatArray
+from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -178,24 +176,11 @@ class ExposureModel(ABC):
         """c_N, response of the outputs in the step after the last to that of the end state, (axes, n_outputs)."""
         return batched.matvec(self.plant.C, end)
 
-    def cross_quadratic(self, first: int, second: int) -> FloatArray:
-        """Symmetric M with mean(theta_1 theta_2) = x'Mx for two outputs without inputs, (n_states, n_states)."""
-        product = self.state_rows[first].T @ self.state_rows[second] / self.n_steps
-        if self.moved:
-            C, last = self.plant.C, self.last_rows
-            product = product + self.moved * (np.outer(last[first], last[second]) - np.outer(C[first], C[second]))
-        return np.asarray((product + product.T) / 2)
 
-    def cross_response(self, response: InputResponse, first: int, second: int) -> tuple[FloatArray, FloatArray]:
-        """Inputs add slope' x + constant to the mean product of two outputs: (axes, n_states) and (axes,)."""
-        c, rows = response.path, self.state_rows
-        both = c[:, first, None] * rows[second].T + c[:, second, None] * rows[first].T
-        slope, product = batched.mean_over_path(both), batched.mean_over_path(c[:, first] * c[:, second])
-        if self.moved:
-            late, last = self.last_response(response.end), self.last_rows
-            mixed = late[:, first, None] * last[second] + late[:, second, None] * last[first]
-            slope, product = slope + self.moved * mixed, product + self.moved * late[:, first] * late[:, second]
-        return slope, product
+def over_steps(plant: Plant, inputs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Transition, noise and response of the states over one or more steps with these inputs, (k, axes * n_inputs)."""
+    _, kick = input_response(plant, by_axis(plant, inputs))
+    return *lift(plant, len(inputs)), kick
 
 
 def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:

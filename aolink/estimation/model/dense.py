@@ -6,15 +6,13 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
 from aolink.numerics import batched
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.plant.lifting import input_response, output_rows
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
 
 # Most cosines for each noise channel, of 0, 1, 2, ... half periods in an exposure; fewer where fewer do.
 _MOST_NOISE_MODES = 24

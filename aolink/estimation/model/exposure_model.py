@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import numpy as np
-from numpy.typing import NDArray
-
 from aolink.estimation.model.base import ExposureModel, by_axis
 from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
+from aolink.numerics.arrays import FloatArray
 from aolink.plant.alike import alike_systems
 from aolink.plant.lifting import input_response
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
 
 
 def exposure_model(plant: Plant, n_steps: int, offset: float = 0.0) -> ExposureModel:

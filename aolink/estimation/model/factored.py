@@ -14,21 +14,17 @@ takes 2 MB.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
 from aolink.numerics import batched, single_thread
+from aolink.numerics.arrays import FloatArray, Indices
 from aolink.plant.alike import AlikeSystems
 from aolink.plant.lifting import input_response, lift, output_rows
 from aolink.rig import Plant
-
-FloatArray = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 NOISE_LEFT_OUT = 0.05
 """Largest share of the noise path (rms) that a factored basis leaves out."""
@@ -171,13 +167,6 @@ class FactoredModel(ExposureModel):
         own[self.systems.order] = np.arange(each)
         still = np.full(self.n_unmodelled, each)
         return np.concatenate([own, still, each + min(self.n_unmodelled, 1) + self.noise.course_of])
-
-    @property
-    def noise_left_out(self) -> float:
-        """Share of the noise path that the basis leaves out, rms over outputs and steps."""
-        kept = float((self.noise.patterns**2 @ (self.noise.courses**2).mean(axis=0)[self.noise.course_of]).sum())
-        missing = float(self.noise.left_out.sum())
-        return math.sqrt(missing / (kept + missing)) if missing else 0.0
 
     @property
     def end_remainder(self) -> FloatArray:

@@ -17,17 +17,15 @@ from itertools import pairwise
 from types import ModuleType
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.model.base import InputResponse
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.quadrature import QuadraturePaths, QuadratureRule, Resolution, resolution
 from aolink.numerics import information, single_thread
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.optics.sensor import SpotSensor
-
-FloatArray = NDArray[np.float64]
 
 # Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
 # out, for many spots tell a displacement of all of them more finely.
@@ -149,14 +147,14 @@ class JointPaths:
         return out
 
     def spread(self, covariance: FloatArray) -> FloatArray:
-        """Covariance of the shares of each spot, from that of the coefficients, (spots, 2, m, 2, m)."""
+        """Covariance of the shares of each spot, x before y, from that of the coefficients, (spots, 2 m, 2 m)."""
         m = len(self.groups)
         out = np.empty((self.spots, 2, m, 2, m))
         by_course = self._sorted(covariance)
         for c, own in enumerate(self._slices):
             left = single_thread.matmul(self._patterns[:, own], by_course[own, : own.stop])
             compiled_loops().spread_of(left, self._patterns, self._starts, c, out)
-        return out
+        return out.reshape(self.spots, 2 * m, 2 * m)
 
     def _sorted(self, matrix: FloatArray) -> FloatArray:
         """Rows and columns (size, size) in the order of courses."""
@@ -173,15 +171,6 @@ class JointPaths:
             basis=basis.reshape(2, nodes, 2 * m), weights=self.weights,
             inputs=self.inputs.reshape(self.spots, 2, nodes), widening=self.model.unmodelled_rest,
         )  # fmt: skip
-
-    def shares_of_spots(self, t: FloatArray) -> FloatArray:
-        """`shares` of each spot, (spots, 2 m)."""
-        return self.shares(t).reshape(self.spots, -1)
-
-    def spread_of_spots(self, covariance: FloatArray) -> FloatArray:
-        """`spread`, (spots, 2 m, 2 m)."""
-        m = len(self.groups)
-        return self.spread(covariance).reshape(self.spots, 2 * m, 2 * m)
 
     def rms_spread(self, state_covariance: FloatArray) -> float:
         """Standard deviation of the paths before the exposure, rms over outputs and nodes."""
@@ -200,10 +189,7 @@ class JointPaths:
 
     def prior_information(self, state_covariance: FloatArray) -> FloatArray:
         """Inverse of the coefficients' covariance before the exposure, (size, size)."""
-        n = len(state_covariance)
-        out = np.eye(self.size)
-        out[:n, :n] = information.information(state_covariance)
-        return out
+        return self.prior_covariance(information.information(state_covariance))
 
 
 @lru_cache(maxsize=1)
@@ -214,7 +200,5 @@ def compiled_loops() -> ModuleType:
     return joint
 
 
-@lru_cache(maxsize=16)
-def joint_paths(model: FactoredModel, sensor: SpotSensor) -> JointPaths:
-    """`JointPaths`, made once."""
-    return JointPaths(model, sensor)
+joint_paths = lru_cache(maxsize=16)(JointPaths)
+"""`JointPaths`, made once."""

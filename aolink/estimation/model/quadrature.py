@@ -15,15 +15,13 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics import batched
+from aolink.numerics.arrays import FloatArray, Indices
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import gaussian_below
 from aolink.optics.sensor import Sensor
-
-FloatArray = NDArray[np.float64]
 
 # Largest rms difference between the light of a path at the nodes and at all steps, in standard deviations of noise.
 _WRONG = 0.05
@@ -91,7 +89,7 @@ class QuadraturePaths:
     widening: float = 0.0
     """Variance of the slopes about each node that no coefficient has, slope units squared."""
 
-    def part(self, axes: slice) -> QuadraturePaths:
+    def part(self, axes: slice | Indices) -> QuadraturePaths:
         """The part of these axes."""
         return replace(self, inputs=self.inputs[axes])
 
@@ -119,7 +117,7 @@ class Resolution:
     stride: float
     """Longest way of a path from node to node, slope units."""
 
-    def of(self, path: FloatArray) -> NDArray[np.intp]:
+    def of(self, path: FloatArray) -> Indices:
         """The level of each axis for its predicted path, (axes, n_outputs, n_steps) -> (axes,)."""
         level = np.zeros(len(path), dtype=np.intp)
         far = np.arange(len(path))

@@ -9,10 +9,10 @@ path RMSE 0.119 here and 0.121 there, NEES 73 and 74 for 72 states.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
 from aolink.estimation.frames.moments import LEAST_FLUX
@@ -23,37 +23,25 @@ from aolink.estimation.model.joint_paths import JointPaths, joint_paths
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import NOT_BELIEVED, PASSES, Basis, Regression, error_memory, slowest
 from aolink.numerics import batched, information, single_thread
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
-
-FloatArray = NDArray[np.float64]
 
 # A window without a pixel that can be used has neither moments nor noise.
 _NO_NOISE = 1e-14
 
 
-class JointMoments:
-    """The estimator `moments` of a plant with hundreds of states, as an observation of `BlurFilter`.
-
-    Parameters
-    ----------
-    orders, basis, flux:
-        As in `WindowedSpots`.
-    """
+class JointObservation(ABC):
+    """All spots of a plant with hundreds of states, as an observation of `BlurFilter`: copy by copy of the plant."""
 
     needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
     models_noise = True
 
-    def __init__(
-        self, sensor: SpotSensor, n_outputs: int, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
-        flux: Flux = "known",
-    ) -> None:  # fmt: skip
-        self.sensor = sensor
-        self._spot = WindowedSpots(sensor, 1, orders, basis=basis, flux=flux)
-        self.n_measurements = self._spot.n_measurements * (n_outputs // 2)
+    def __init__(self, sensor: SpotSensor, n_measurements: int) -> None:
+        self.sensor, self.n_measurements = sensor, n_measurements
 
     @single_thread.by_one_thread
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
-        """Iterated statistical linearisation, copy by copy of the plant."""
+        """The prior updated with the pixels; coefficients that move no spot visibly keep theirs."""
         assert isinstance(model, FactoredModel)
         paths, n = joint_paths(model, self.sensor), model.plant.n_states
         mean, covariance, rest = prior.mean.copy(), prior.covariance.copy(), []
@@ -61,14 +49,15 @@ class JointMoments:
             some = slice(0, paths.size)
             before = Gaussian(mean[axis, some], covariance[axis, :n, :n])
             windows = by_spot(measured, axis)
-            t, P, *told = self.corrected(model, paths.foreseen(mean[axis, some], response, axis), before, windows)
+            t, P, *told = self.corrected(paths.foreseen(mean[axis, some], response, axis), before, windows)
             mean[axis, some], covariance[axis, some, some] = t, P
             rest.append(told)
         new, S, nis = (np.stack(each) for each in zip(*rest, strict=True))
         return Update(Gaussian(mean, covariance), new, S, nis)
 
+    @abstractmethod
     def corrected(
-        self, model: FactoredModel, paths: JointPaths, prior: Gaussian, windows: SpotWindows
+        self, paths: JointPaths, prior: Gaussian, windows: SpotWindows
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """The update of one copy; the prior has the mean of all coefficients and the covariance of the state alone.
 
@@ -76,26 +65,51 @@ class JointMoments:
         -------
         Mean and covariance of the coefficients, innovation, its variance, and the NIS.
         """
+
+
+class JointMoments(JointObservation):
+    """The estimator `moments` of a plant with hundreds of states: iterated statistical linearisation.
+
+    Parameters
+    ----------
+    orders, basis, flux:
+        As in `WindowedSpots`.
+    """
+
+    def __init__(
+        self, sensor: SpotSensor, n_outputs: int, orders: Sequence[int] = (0, 1, 2, 3), *, basis: Basis = "monomial",
+        flux: Flux = "known",
+    ) -> None:  # fmt: skip
+        self._spot = WindowedSpots(sensor, 1, orders, basis=basis, flux=flux)
+        super().__init__(sensor, self._spot.n_measurements * (n_outputs // 2))
+
+    def corrected(
+        self, paths: JointPaths, prior: Gaussian, windows: SpotWindows
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        def of_spots(t: FloatArray) -> FloatArray:
+            """The courses' shares in the paths of each spot, (spots, 2 m)."""
+            return paths.shares(t).reshape(paths.spots, -1)
+
         nodes = paths.of_one_spot()
         precision = paths.prior_information(prior.covariance)
         wide = paths.prior_covariance(prior.covariance)
         # Frames say hardly anything about some of hundreds of states, whose errors last as long as the plant remembers.
-        memory = error_memory(slowest(model.transition_of_one[None]))[0]
+        memory = error_memory(slowest(paths.model.transition_of_one[None]))[0]
         t, P, lit = prior.mean, wide, windows.mask.any(axis=(1, 2, 3))
-        spread = first = paths.spread_of_spots(wide)
+        spread = first = paths.spread(wide)
         for to_come in reversed(range(PASSES)):
-            y, noise, fit = self._spot.look(nodes, Gaussian(paths.shares_of_spots(t), spread), windows)
+            y, noise, fit = self._spot.look(nodes, Gaussian(of_spots(t), spread), windows)
             noise = noise + _NO_NOISE * np.eye(noise.shape[-1])
             light = None
             if self._spot.flux == "measured":
                 light = (y[lit] / np.sqrt(np.einsum("skk->sk", noise[lit])))[:, 0].min()
                 y, noise, fit = self._spot.ratios(y, noise, fit)
-            new = y - fit.expected - batched.matvec(fit.slope, paths.shares_of_spots(prior.mean - t))
+            new = y - fit.expected - batched.matvec(fit.slope, of_spots(prior.mean - t))
             H, score = _told(paths, fit, noise + memory * fit.remainder, new)
             P = information.covariance(precision + H)
-            t = prior.mean + single_thread.matvec(P, score)
+            t = prior.mean + single_thread.matmul(P, score)
             if to_come:
-                spread = paths.spread_of_spots(P)
+                spread = paths.spread(P)
         # The covariance of this one innovation is without the memory.
         own = noise + fit.remainder
         H, score = _told(paths, fit, own, new)

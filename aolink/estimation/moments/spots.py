@@ -16,17 +16,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.frames.frame_data import HALF, Flux, Needs, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import QuadraturePaths
 from aolink.estimation.moments.windowed import Basis, Regression, Windowed, expected_response, weighted_sums
 from aolink.numerics import batched
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.sensor import SpotSensor
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 # Covariances are between every two nodes, directions and spots: so there are fewer nodes than for a line sensor.
 _MOST_NODES = 40

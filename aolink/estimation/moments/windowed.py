@@ -24,23 +24,22 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Literal, Protocol, Self, TypeVar
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from aolink.estimation.frames.frame_data import HALF, Flux, Needs, Profile
+from aolink.estimation.frames.frame_data import HALF, Densities, Flux, Needs, Profile
 from aolink.estimation.frames.moments import LEAST_FLUX
 from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.quadrature import QuadraturePaths, blocks, quadrature_paths
 from aolink.numerics import batched
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import effective_noise_density
 from aolink.optics.kernel import gaussian_below
 from aolink.optics.sensor import BaseSensor, Sensor
 
-FloatArray = NDArray[np.float64]
 Basis = Literal["monomial", "legendre", "fourier"]
 
 PASSES = 3
@@ -56,14 +55,7 @@ _AT_ONCE = 8
 NOT_BELIEVED = 1e12
 
 
-class Seen(Protocol):
-    """The data of all axes of an exposure, of which a part can be taken."""
-
-    def part(self: Self, axes: slice) -> Self:
-        """The part of these axes."""
-
-
-Data = TypeVar("Data", bound=Seen)
+Data = TypeVar("Data", bound=Densities)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +99,7 @@ class Windowed(ABC, Generic[Data]):
         """Iterated statistical linearisation, from the prior to the posterior."""
         nodes = quadrature_paths(model, response, blocks(model.n_steps, self.most_nodes))
         parts = [
-            self._update(model, nodes.part(s), Gaussian(prior.mean[s], prior.covariance[s]), measured.part(s))
+            self._update(model, nodes.part(s), prior.part(s), measured.part(s))
             for s in (slice(k, k + _AT_ONCE) for k in range(0, len(prior.mean), _AT_ONCE))
         ]
         if len(parts) == 1:
@@ -144,8 +136,8 @@ class Windowed(ABC, Generic[Data]):
         """The sums (axes, sums), their noise (axes, sums, sums), and their regression on the coefficients."""
 
     def window(
-        self, sensor: Sensor, kernel: float, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]
-    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        self, sensor: Sensor, kernel: float, mean: FloatArray, variance: FloatArray, mask: BoolArray
+    ) -> tuple[FloatArray, BoolArray]:
         """u in [-1, 1] across the window about a path, and the pixels that are in it, both (axes, pixels).
 
         Parameters
@@ -230,7 +222,7 @@ class WindowedMoments(Windowed[Profile]):
         y, noise = self.measured(W, measured.density, measured.light)
         return y, noise, self.regression(W, mean, spread, basis, nodes.weights, nodes.widening)
 
-    def window_weights(self, mean: FloatArray, variance: FloatArray, mask: NDArray[np.bool_]) -> FloatArray:
+    def window_weights(self, mean: FloatArray, variance: FloatArray, mask: BoolArray) -> FloatArray:
         """Weights of the pixels about a path, (axes, sums, pixels), from its mean and variance, both (axes, nodes)."""
         u, inside = self.window(self.sensor, self.sensor.kernel.variance, mean, variance, mask)
         return np.stack([self.function(p, u) * inside for p in self.orders], axis=1)

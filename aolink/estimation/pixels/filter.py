@@ -7,7 +7,7 @@ leaves the prediction, and after several of them the filter starts again from th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,23 +16,19 @@ from numpy.typing import NDArray
 from aolink.estimation.compiled.modes import drop_repeats
 from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
-from aolink.estimation.kalman.filter import Filter, Posterior
+from aolink.estimation.kalman.filter import PATIENCE, Filter, Posterior, gate_status
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.predict import predict
-from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
+from aolink.estimation.model.base import ExposureModel, InputResponse, over_steps
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, single
 from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.numerics import batched
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.workers import in_threads, thread_count
 from aolink.optics.sensor import BaseSensor
-from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
-_PATIENCE = 3
 # Largest variance of the prediction without measurements, relative to that of the plant's prior and noise.
 _WIDEST = 1e6
 # Chunks of axes: what NumPy computes for them together fits into the cache; compiled code has fewer calls to pay for.
@@ -93,12 +89,9 @@ class MixtureFilter(Filter):
 
     def __init__(self, plant: Plant, sensor: BaseSensor, updater: MixtureUpdater, *, gate: bool = True) -> None:
         self.plant, self.sensor, self._updater, self._gate = plant, sensor, updater, gate
-        n, axes = plant.n_states, plant.axes
+        axes = plant.axes
         self.prior = single(
-            Gaussian(
-                np.broadcast_to(plant.initial_mean, (axes, n)).copy(),
-                np.broadcast_to(plant.initial_covariance, (axes, n, n)).copy(),
-            )
+            Gaussian(np.tile(plant.initial_mean, (axes, 1)), np.tile(plant.initial_covariance, (axes, 1, 1)))
         )
         # The prediction without any measurement.
         self._unseen = self.prior.gaussian
@@ -118,7 +111,7 @@ class MixtureFilter(Filter):
         dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
-        updater.update(view.part(one), self.prior.part(one), _part(self._unseen, one), 0)
+        updater.update(view.part(one), self.prior.part(one), self._unseen.part(one), 0)
         view.log_likelihoods(np.zeros((1, 1, view.reduced.size)))
 
     @property
@@ -127,10 +120,8 @@ class MixtureFilter(Filter):
 
     def bridge(self, inputs: FloatArray) -> None:
         if len(inputs):
-            transition, noise = lift(self.plant, len(inputs))
-            _, kick = input_response(self.plant, by_axis(self.plant, inputs))
-            self.prior = _moved(self.prior, transition, noise, kick)
-            self._unseen = self._unwatched(transition, noise, kick)
+            over = over_steps(self.plant, inputs)
+            self.prior, self._unseen = _moved(self.prior, *over), self._unwatched(*over)
 
     def _unwatched(self, transition: FloatArray, noise: FloatArray, kick: FloatArray) -> Gaussian:
         """The prediction of `_unseen`; on an unstable plant it stops where it is so wide that it says nothing."""
@@ -145,10 +136,10 @@ class MixtureFilter(Filter):
     def step(self, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows | None) -> Posterior:
         axes = self.plant.axes
         reduced = self._updater.reduction(model, self.sensor)
-        lost = self._missed >= _PATIENCE
+        lost = self._missed >= PATIENCE
         prior = _chosen(lost, single(self._unseen), self.prior)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
-        new = Innovation(np.zeros((axes, 0)), np.zeros((axes, 0, 0)), np.zeros(axes), np.ones(axes, dtype=bool))
+        new = _spread([], np.zeros(0, dtype=np.intp), axes)
         several = np.zeros(axes, dtype=bool)
         done: list[MixtureUpdate] = []
         took = np.zeros(0, dtype=np.intp)
@@ -160,23 +151,21 @@ class MixtureFilter(Filter):
             for k in np.unique(level[usable]).tolist():
                 views[k] = PixelView(self.sensor, model, response, measured, reduced, k)
                 alike = usable[level[usable] == k]
-                at_once = _AT_ONCE_COMPILED if views[k].compiled else _AT_ONCE
+                at_once = _AT_ONCE_COMPILED if views[k].on_line else _AT_ONCE
                 at_once = min(at_once, -(-len(alike) // thread_count()))
                 parts += [alike[j : j + at_once] for j in range(0, len(alike), at_once)]
             seen = np.concatenate([usable[:0], *parts])
 
-            def updated(p: NDArray[np.intp]) -> MixtureUpdate:
+            def updated(p: Indices) -> MixtureUpdate:
                 view = views[int(level[p[0]])].part(p)
-                u = self._updater.update(view, prior.part(p), _part(self._unseen, p), self._number)
+                u = self._updater.update(view, prior.part(p), self._unseen.part(p), self._number)
                 return replace(u, coefficients=reduced.coefficients(u.coefficients))
 
             done = in_threads(updated, parts)
             new = _spread([each.innovation for each in done], seen, axes)
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
-            self._missed[seen] = np.where(trusted, 0, np.where(lost[seen], 1, self._missed[seen] + 1))
-            status[seen] = np.where(trusted, np.where(lost[seen], Status.REINITIALISED, Status.OK), Status.GATED)
-            status[seen[~trusted & (self._missed[seen] >= _PATIENCE)]] = Status.DIVERGED
+            status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
         if not np.array_equal(took, np.arange(axes)):
             coefficients = reduced.coefficients(reduced.prior(prior.gaussian))
             end = _moved(prior, model.transition, model.process_noise, response.end)
@@ -201,24 +190,17 @@ class MixtureFilter(Filter):
         )  # fmt: skip
 
 
-def _part(gaussian: Gaussian, axes: slice | NDArray[np.intp]) -> Gaussian:
-    return Gaussian(gaussian.mean[axes], gaussian.covariance[axes])
-
-
 def _arrays(done: MixtureUpdate, components: int) -> tuple[NDArray[Any], ...]:
     e, c = done.end.with_components(components), done.coefficients
     return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several)
 
 
-def _spread(parts: Sequence[Innovation], seen: NDArray[np.intp], axes: int) -> Innovation:
+def _spread(parts: Sequence[Innovation], seen: Indices, axes: int) -> Innovation:
     """Innovations of these axes in their places; zero, with a covariance of zero, for the others."""
     k = parts[0].value.shape[1] if parts else 0
     out = Innovation(np.zeros((axes, k)), np.zeros((axes, k, k)), np.zeros(axes), np.zeros(axes, dtype=bool))
-    if parts:
-        out.value[seen] = np.concatenate([each.value for each in parts])
-        out.covariance[seen] = np.concatenate([each.covariance for each in parts])
-        out.nis[seen] = np.concatenate([each.nis for each in parts])
-        out.believed[seen] = np.concatenate([each.believed for each in parts])
+    for field in fields(Innovation) if parts else ():
+        getattr(out, field.name)[seen] = np.concatenate([getattr(each, field.name) for each in parts])
     return out
 
 

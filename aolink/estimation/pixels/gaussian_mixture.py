@@ -7,14 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.numerics import batched
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from aolink.numerics.arrays import FloatArray, Indices
 
 # Relative to each variance; what a prior knows for certain stays certain to this.
 _JITTER = 1e-10
@@ -31,9 +28,13 @@ class GaussianMixture:
     covariance: FloatArray
     """(axes, components, n, n)"""
 
-    def part(self, axes: slice | NDArray[np.intp]) -> GaussianMixture:
+    def part(self, axes: slice | Indices) -> GaussianMixture:
         """The part of these axes."""
         return GaussianMixture(self.log_weight[axes], self.mean[axes], self.covariance[axes])
+
+    def copy(self) -> GaussianMixture:
+        """A copy, each of whose arrays is contiguous in memory."""
+        return GaussianMixture(*(np.array(each, order="C") for each in (self.log_weight, self.mean, self.covariance)))
 
     @property
     def gaussian(self) -> Gaussian:
@@ -82,7 +83,7 @@ class GaussianMixture:
         Kullback-Leibler divergence, in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach
         to Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
         """
-        merged = GaussianMixture(self.log_weight.copy(), self.mean.copy(), self.covariance.copy())
+        merged = self.copy()
         compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
@@ -98,11 +99,11 @@ class GaussianMixture:
         )
         return GaussianMixture(log_weight, mean, covariance)
 
-    def replaced(self, axes: NDArray[np.intp], by: GaussianMixture) -> GaussianMixture:
+    def replaced(self, axes: Indices, by: GaussianMixture) -> GaussianMixture:
         """The same with these axes' mixtures replaced."""
         count = max(self.mean.shape[1], by.mean.shape[1])
         old, new = self.with_components(count), by.with_components(count)
-        out = GaussianMixture(old.log_weight.copy(), old.mean.copy(), old.covariance.copy())
+        out = old.copy()
         out.log_weight[axes], out.mean[axes], out.covariance[axes] = new.log_weight, new.mean, new.covariance
         return out
 
@@ -169,9 +170,3 @@ def cholesky(covariance: FloatArray) -> FloatArray:
 def lower_inverse(root: FloatArray) -> FloatArray:
     """Inverse of lower triangular matrices."""
     return np.asarray(np.linalg.solve(root, np.broadcast_to(np.eye(root.shape[-1]), root.shape)))
-
-
-def log_determinant(covariance: FloatArray) -> FloatArray:
-    """log |P|"""
-    root = cholesky(covariance)
-    return np.asarray(2 * np.add.reduce(np.log(np.einsum("...ii->...i", root)), axis=-1))

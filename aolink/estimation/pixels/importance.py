@@ -18,7 +18,6 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.compiled import mixtures as compiled_mixtures
@@ -34,9 +33,7 @@ from aolink.estimation.pixels.gaussian_mixture import (
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.numerics import batched
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from aolink.numerics.arrays import BoolArray, FloatArray
 
 # Most rounds, and the effective sample size that is enough.
 _ROUNDS = 4
@@ -93,13 +90,9 @@ def posterior(
     few = np.flatnonzero(believed & ~(effective >= share * _ENOUGH))
     if not len(few):
         return fit
+    some = view.part(few)
+    points = tempered_points(some, prior.part(few), _TEMPERED, [(number, axis) for axis in some.axes.tolist()])
     rows = view.reduced.end_rows
-    points = (
-        tempered_points(
-            view.part(few[k : k + 1]), prior.part(few[k : k + 1]), _TEMPERED, (number, int(view.axes[few[k]]))
-        )
-        for k in range(len(few))
-    )
     return fit.replaced(few, stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points]))
 
 
@@ -111,9 +104,7 @@ def importance_corrected(
     points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
     if (line := view.line) is not None:
         numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]
-        fit = GaussianMixture(
-            *(np.array(each, order="C") for each in (proposal.log_weight, proposal.mean, proposal.covariance))
-        )
+        fit = proposal.copy()
         effective = np.empty(len(prior.mean))
         compiled_mixtures.importance_corrected(
             line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
@@ -135,21 +126,14 @@ def importance_corrected(
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
         tempered = _tempered(log_weight, _LEAST_EFFECTIVE)
         loosened = replace(proposal, covariance=proposal.covariance * (_LOOSENED if k else 1.0))
-        fit = _where(going_on, _refitted(proposal, t, tempered, loosened, n * _LAST_PRIOR_POINTS), fit)
+        last = _refitted(proposal, t, tempered, loosened, n * _LAST_PRIOR_POINTS)
+        some = np.flatnonzero(going_on)
+        fit = fit.replaced(some, last.part(some))
         going_on &= effective < enough
         if not going_on.any():
             break
         proposal = _refitted(proposal, t, tempered, proposal, n * _PRIOR_POINTS)
     return fit, effective
-
-
-def _where(which: NDArray[np.bool_], first: GaussianMixture, second: GaussianMixture) -> GaussianMixture:
-    """The first in these axes, the second in the others."""
-    return GaussianMixture(
-        np.where(which[:, None], first.log_weight, second.log_weight),
-        np.where(which[:, None, None], first.mean, second.mean),
-        np.where(which[:, None, None, None], first.covariance, second.covariance),
-    )
 
 
 def _tempered(log_weight: FloatArray, least: float) -> FloatArray:

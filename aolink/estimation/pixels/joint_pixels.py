@@ -21,22 +21,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from aolink.estimation.frames.frame_data import HALF, Needs, SpotWindows
-from aolink.estimation.kalman.gaussian import Gaussian, Update
-from aolink.estimation.model.base import ExposureModel, InputResponse
-from aolink.estimation.model.factored import FactoredModel
-from aolink.estimation.model.joint_paths import JointPaths, compiled_loops, joint_paths
-from aolink.estimation.moments.joint_moments import JointMoments, by_spot
-from aolink.estimation.pixels.levenberg_marquardt import Indices, Points, minimise
-from aolink.estimation.pixels.likelihood import mehler_series
+from aolink.estimation.frames.frame_data import SpotWindows
+from aolink.estimation.kalman.gaussian import Gaussian
+from aolink.estimation.model.joint_paths import JointPaths, compiled_loops
+from aolink.estimation.moments.joint_moments import JointMoments, JointObservation
+from aolink.estimation.pixels.levenberg_marquardt import Points, minimise
 from aolink.numerics import information, single_thread
+from aolink.numerics.arrays import FloatArray, Indices
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import pixel_masses
+from aolink.optics.plane import mehler_series
 from aolink.optics.sensor import SpotSensor
-
-FloatArray = NDArray[np.float64]
 
 _PASSES = 12
 # The objective, which is of hundreds of coefficients, changes by less than this at a mode.
@@ -52,22 +48,18 @@ class JointPixels:
 
     Parameters
     ----------
-    density, mask, light:
-        Data of one copy of the plant: (spots, rows, columns) twice, and (spots,) or None, as in `SpotWindows`.
+    windows:
+        Spots of one copy of the plant, as `by_spot` gives them.
     """
 
-    def __init__(
-        self, sensor: SpotSensor, paths: JointPaths, density: FloatArray, mask: NDArray[np.bool_],
-        light: FloatArray | None,
-    ) -> None:  # fmt: skip
+    def __init__(self, sensor: SpotSensor, paths: JointPaths, windows: SpotWindows) -> None:
         self.paths, self._edges, self._area = paths, sensor.profile.edges, sensor.pixel_size
-        self.y, self.mask = (np.ascontiguousarray(each.reshape(len(each), -1)) for each in (density, mask))
-        share = 1.0 if light is None else light
-        spots = np.ones(len(density))
-        self._read, self._gain = (
-            effective_noise_density(sensor) / self._area / share**2 * spots,
-            shot_gain(sensor) / share * spots,
+        self.y, self.mask = (
+            np.ascontiguousarray(each.reshape(len(each), -1)) for each in (windows.density, windows.mask)
         )
+        share = np.ones(paths.spots) if windows.light is None else windows.light[:, 0]
+        self._read = effective_noise_density(sensor) / self._area / share**2
+        self._gain = shot_gain(sensor) / share
         self._kernel = sensor.kernel.covariance + paths.widening * np.eye(2)
         self._terms = mehler_series(self._kernel)
 
@@ -127,8 +119,6 @@ class Mode:
     """(size, size)"""
     objective: float
     """-log p(t, y) up to a constant."""
-    passes: int
-    """How often the pixels were linearised on the way."""
     at: Linearised
 
 
@@ -140,7 +130,7 @@ def find_mode(
 
     def at(t: FloatArray, _: Indices) -> Points:
         near = view.at(t[0])
-        pull = single_thread.matvec(precision, t[0] - mean)
+        pull = single_thread.matmul(precision, t[0] - mean)
         objective = 0.5 * float((t[0] - mean) @ pull) - near.log_likelihood
         kept = np.empty(1, dtype=object)
         kept[0] = near
@@ -148,51 +138,37 @@ def find_mode(
         return Points(np.array([objective]), (paths.score(near.score) - pull)[None], H[None], kept)
 
     # What a step would gain says when it is at a mode, before the pixels are linearised again.
-    (t,), found, asked = minimise(at, start[None], passes - 1, _CONVERGED, foreseen=_CONVERGED, solve=_solve)
+    (t,), found = minimise(at, start[None], passes - 1, _CONVERGED, foreseen=_CONVERGED, solve=_solve)
     assert found.linearised is not None
-    return Mode(t, found.hessian[0], float(found.objective[0]), asked, found.linearised[0])
+    return Mode(t, found.hessian[0], float(found.objective[0]), found.linearised[0])
 
 
 def _solve(a: FloatArray, x: FloatArray) -> FloatArray:
     return np.stack([information.solve(*each) for each in zip(a, x, strict=True)])
 
 
-class JointProfile:
-    """The estimator `profile` of a plant with hundreds of states, as an observation of `BlurFilter`.
+class JointProfile(JointObservation):
+    """The estimator `profile` of a plant with hundreds of states: the mode of the posterior.
 
     Its innovation is each spot's displacement from its prediction, as the pixels linearised at the mode give it: one
     number for each output. Its NIS is chi-square distributed where model and covariances are right.
     """
 
-    needs = Needs(what="windows", least_usable=HALF, least_spots=HALF)
-    models_noise = True
-
     def __init__(self, sensor: SpotSensor, n_outputs: int) -> None:
-        self.sensor, self.n_measurements = sensor, n_outputs
+        super().__init__(sensor, n_outputs)
         self._moments = JointMoments(sensor, n_outputs)
 
-    @single_thread.by_one_thread
-    def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
-        """The mode of the posterior, copy by copy of the plant."""
-        assert isinstance(model, FactoredModel)
-        paths, n = joint_paths(model, self.sensor), model.plant.n_states
-        mean, covariance = prior.mean.copy(), prior.covariance.copy()
-        found = []
-        for axis in range(len(mean)):
-            light = None if measured.light is None else measured.light[axis]
-            before, P = prior.mean[axis, : paths.size], prior.covariance[axis, :n, :n]
-            foreseen = paths.foreseen(before, response, axis)
-            view = JointPixels(self.sensor, foreseen, measured.density[axis], measured.mask[axis], light)
-            if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
-                mode = find_mode(view, before, paths.prior_information(P), before)
-                t, after, at = mode.t, information.covariance(mode.precision), mode.at
-            else:
-                t, after, *_ = self._moments.corrected(model, view.paths, Gaussian(before, P), by_spot(measured, axis))
-                at = view.at(t)
-            mean[axis, : paths.size], covariance[axis, : paths.size, : paths.size] = t, after
-            found.append(innovation(view.paths, before, P, t, at))
-        new, S, nis = (np.stack(each) for each in zip(*found, strict=True))
-        return Update(Gaussian(mean, covariance), new, S, nis)
+    def corrected(
+        self, paths: JointPaths, prior: Gaussian, windows: SpotWindows
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        before, P, view = prior.mean, prior.covariance, JointPixels(self.sensor, paths, windows)
+        if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
+            mode = find_mode(view, before, paths.prior_information(P), before)
+            t, after, at = mode.t, information.covariance(mode.precision), mode.at
+        else:
+            t, after, *_ = self._moments.corrected(paths, prior, windows)
+            at = view.at(t)
+        return t, after, *innovation(paths, before, P, t, at)
 
 
 def innovation(
@@ -215,7 +191,7 @@ def innovation(
     patterns = paths.patterns.reshape(spots, 1, 2, -1)
     H = by_share[:, :, 0, paths.course_of] * patterns[:, :, 0] + by_share[:, :, 1, paths.course_of] * patterns[:, :, 1]
     H = H.reshape(2 * spots, -1)
-    new = (noise @ at.displacement_score[..., None]).ravel() + single_thread.matvec(H, t - mean)
+    new = (noise @ at.displacement_score[..., None]).ravel() + single_thread.matmul(H, t - mean)
     S = single_thread.matmul(single_thread.matmul(H[:, :n], state_covariance), H[:, :n].T)
     S += single_thread.gram(H[:, n:].T)
     for s in range(spots):

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-Indices = NDArray[np.intp]
+from aolink.numerics.arrays import FloatArray, Indices
 
 FIRST_DAMPING = 0.01
 LARGEST_DAMPING = 1e6
@@ -46,7 +45,7 @@ def solve(a: FloatArray, x: FloatArray) -> FloatArray:
 def minimise(
     at: Callable[[FloatArray, Indices], Points], starts: FloatArray, passes: int, converged: float, *,
     foreseen: float = 0.0, solve: Callable[[FloatArray, FloatArray], FloatArray] = solve,
-) -> tuple[FloatArray, Points, int]:  # fmt: skip
+) -> tuple[FloatArray, Points]:  # fmt: skip
     """Where each of many starts leads; each one's way does not depend on the others.
 
     Parameters
@@ -66,9 +65,9 @@ def minimise(
 
     Returns
     -------
-    The points (starts, n), what is known about them, and how often ``at`` was asked.
+    The points (starts, n), and what is known about them.
     """
-    x, active, asked = starts.copy(), np.arange(len(starts)), 1
+    x, active = starts.copy(), np.arange(len(starts))
     here = at(x, active)
     damping = np.full(len(x), FIRST_DAMPING)
     for _ in range(passes):
@@ -83,7 +82,7 @@ def minimise(
         active, step, slope, free, before = (each[going_on] for each in (active, step, slope, free, before))
         if not len(active):
             break
-        there, asked = at(x[active] + step, active), asked + 1
+        there = at(x[active] + step, active)
         gain = here.objective[active] - there.objective
         better = gain > 0
         took = active[better]
@@ -97,4 +96,4 @@ def minimise(
         active = active[~(settled | (damping[active] > LARGEST_DAMPING))]
         if not len(active):
             break
-    return x, here, asked
+    return x, here

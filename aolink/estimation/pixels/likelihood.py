@@ -15,38 +15,29 @@ import math
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from aolink.estimation.compiled.line import Line, log_likelihoods
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.estimation.model.exposure_model import exposure_model
-from aolink.estimation.model.quadrature import QuadraturePaths
 from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import Regression, Windowed, WindowedMoments
+from aolink.estimation.moments.windowed import Regression
 from aolink.numerics import batched
+from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import pixel_masses
-from aolink.optics.sensor import BaseSensor
-
-if TYPE_CHECKING:
-    from aolink.estimation.compiled.line import Line
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from aolink.optics.plane import mehler_series
+from aolink.optics.sensor import BaseSensor, SpotSensor
 
 # Rms of the noise path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.1
 # Random paths from which the number of nodes is found.
 _PATHS = 64
-# Mehler's series of a kernel that couples the two directions is cut where its terms are below this.
-_SERIES = 1e-6
-_MOST_TERMS = 30
 # The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
 _POINTS = 16
 _REACH = 5.0
@@ -75,12 +66,7 @@ class Reduction:
 
     def prior(self, state: Gaussian) -> Gaussian:
         """The prior of t, from that of the start state; leading axes as they come."""
-        *lead, states = state.mean.shape
-        mean, covariance = np.zeros((*lead, self.size)), np.zeros((*lead, self.size, self.size))
-        mean[..., :states] = state.mean
-        covariance[...] = np.eye(self.size)
-        covariance[..., :states, :states] = state.covariance
-        return Gaussian(mean, covariance)
+        return state.with_noise(self.size)
 
     def end(self, t: Gaussian) -> Gaussian:
         """The Gaussian of the end state, without the response to the inputs; leading axes as they come."""
@@ -93,8 +79,9 @@ class Reduction:
         return Gaussian(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
 
 
+@lru_cache(maxsize=16)
 def reduction(
-    model: ExposureModel, sensor: BaseSensor, *, left_out: float | None = None, all_steps: bool = False
+    model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LEFT_OUT, all_steps: bool = False
 ) -> Reduction:
     """The reduction for a sensor, made once.
 
@@ -105,11 +92,6 @@ def reduction(
     all_steps:
         Whether all fast steps are nodes.
     """
-    return _reduction(model, sensor, _LEFT_OUT if left_out is None else left_out, all_steps)
-
-
-@lru_cache(maxsize=16)
-def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_steps: bool) -> Reduction:
     n = model.plant.n_states
     variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
     noise = model.basis[..., n:]
@@ -128,7 +110,7 @@ def _reduction(model: ExposureModel, sensor: BaseSensor, left_out: float, all_st
     if all_steps:
         seen = quadrature.all_steps(model.n_steps)
     elif model.moved:  # it is the same whenever in a step an exposure starts
-        seen = _reduction(exposure_model(model.plant, model.n_steps), sensor, left_out, all_steps).resolution
+        seen = reduction(exposure_model(model.plant, model.n_steps), sensor).resolution
     else:
         seen = quadrature.resolution(_paths(model, expand), variance, sensor.profile)
     return Reduction(
@@ -148,6 +130,8 @@ def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:
 class PixelView:
     """The pixels of one frame as a function of the reduced coefficients t of each axis: prediction and likelihood.
 
+    What compiled code does for a line sensor is here for spots on a plane only.
+
     Points of each axis lie along the second dimension of every argument, (axes, k, ...). ``level`` is that
     of the reduction's resolution.
     """
@@ -156,131 +140,105 @@ class PixelView:
         self, sensor: BaseSensor, model: ExposureModel, response: InputResponse, measured: Profile | SpotWindows,
         reduced: Reduction, level: int = 0,
     ) -> None:  # fmt: skip
-        self.sensor, self.reduced = sensor, reduced
-        line = isinstance(measured, Profile)
-        self._optics = sensor.profile if line else sensor
+        self.sensor, self.reduced, self.measured = sensor, reduced, measured
+        self.on_line = isinstance(measured, Profile)
+        """Whether it is a line sensor, whose pixels are left to compiled code; spots on a plane are not."""
+        self.optics = sensor.profile if self.on_line else sensor
         at = quadrature.quadrature_paths(model, response, reduced.resolution.levels[level])
-        self._basis = at.basis @ reduced.expand
-        self._weights = at.weights
-        self._inputs = at.inputs
+        self.nodes = replace(at, basis=at.basis @ reduced.expand, widening=0.0)
+        """Paths of t at the quadrature's nodes; what t leaves out widens the kernel instead."""
         axes = len(measured.density)
         self.y = measured.density.reshape(axes, -1)
         """Densities of all pixels of an axis, (axes, pixels)."""
         self.mask = measured.mask.reshape(axes, -1)
         self.axes = np.arange(axes)
         """Which axes of the plant these are, (axes,)."""
-        self.read_noise = effective_noise_density(self._optics) / self._optics.pixel_size
-        self.gain = shot_gain(self._optics)
-        self._line = line
-        self.compiled = line
-        """Whether compiled code is used where there is some; NumPy can do all."""
-        self._kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
-        self._measured, self._windowed = measured, _windowed(sensor, line, model.plant.n_outputs)
+        self.read_noise = effective_noise_density(self.optics) / self.optics.pixel_size
+        self.gain = shot_gain(self.optics)
+        self.kernel = sensor.kernel.covariance + reduced.widening * np.eye(2)
+        """Covariance of the kernel with that widening, slope units squared, (2, 2)."""
 
-    def part(self, axes: slice | NDArray[np.intp]) -> PixelView:
+    def part(self, axes: slice | Indices) -> PixelView:
         """The part of these axes."""
         view = copy(self)
-        view.y, view.mask, view._inputs = self.y[axes], self.mask[axes], self._inputs[axes]
-        view._measured = replace(self._measured, density=self._measured.density[axes], mask=self._measured.mask[axes])
-        view.axes = self.axes[axes]
+        view.y, view.mask, view.axes = self.y[axes], self.mask[axes], self.axes[axes]
+        view.nodes, view.measured = self.nodes.part(axes), self.measured.part(axes)
         return view
 
     @property
     def outputs(self) -> int:
         """Outputs of one axis."""
-        return int(self._basis.shape[0])
+        return int(self.nodes.basis.shape[0])
 
     @property
     def whole_nodes(self) -> int:
         """Nodes inside the exposure's fast steps; two that correct for where it starts and ends come after them."""
-        return len(self._weights) - (2 if self._weights.min() < 0 else 0)
-
-    @property
-    def weights(self) -> FloatArray:
-        """Each node's share of the exposure, (nodes,)."""
-        return self._weights
+        return len(self.nodes.weights) - (2 if self.nodes.weights.min() < 0 else 0)
 
     @property
     def kernel_variance(self) -> float:
         """Variance of the kernel in its narrowest direction, slope units squared."""
-        return float(np.linalg.eigvalsh(self._kernel)[0])
+        return float(np.linalg.eigvalsh(self.kernel)[0])
 
     @property
     def rows(self) -> FloatArray:
         """Path at the nodes of the coefficients, (n_outputs * nodes, n)."""
-        return self._basis.reshape(-1, self._basis.shape[2])
+        return self.nodes.basis.reshape(-1, self.reduced.size)
 
     @property
     def gram(self) -> FloatArray:
         """R'R for these rows R, as a mean over the exposure and a sum over outputs, (n, n)."""
-        return np.asarray((self.rows * np.tile(self._weights, self.outputs)[:, None]).T @ self.rows)
+        return np.asarray((self.rows * np.tile(self.nodes.weights, self.outputs)[:, None]).T @ self.rows)
 
     def moments(self, about: Gaussian) -> tuple[FloatArray, FloatArray, Regression]:
         """Windowed moments about a Gaussian of t, their noise and regression, as `Windowed.look`; of all axes."""
-        at = QuadraturePaths(basis=self._basis, weights=self._weights, inputs=self._inputs)
-        return self._windowed.look(at, about, self._measured)
+        assert isinstance(self.sensor, SpotSensor)
+        assert isinstance(self.measured, SpotWindows)
+        return WindowedSpots(self.sensor, self.outputs // 2).look(self.nodes, about, self.measured)
 
     def paths(self, t: FloatArray) -> FloatArray:
         """Outputs at the nodes, (axes, k, n_outputs, nodes)."""
-        outputs, nodes, size = self._basis.shape
-        rows = self._basis.reshape(-1, size)
-        flat = batched.long_matmul(t, rows.T)
-        return np.asarray(flat.reshape(*t.shape[:2], outputs, nodes) + self._inputs[:, None])
+        flat = batched.long_matmul(t, self.rows.T)
+        return np.asarray(flat.reshape(*t.shape[:2], self.outputs, -1) + self.nodes.inputs[:, None])
 
     def predicted(self, t: FloatArray) -> FloatArray:
         """Densities of the pixels without noise, (axes, k, pixels)."""
-        path, w = self.paths(t), self._weights
-        edges = self._optics.profile.edges
-        if self._line:
-            (mass,) = pixel_masses(self._kernel[0, 0], edges, path[:, :, 0], 0)
-            return batched.matmul(w[None], mass)[..., 0, :] / self._optics.pixel_size
-        spots, terms = path.shape[2] // 2, self._terms()
-        path = path.reshape(*path.shape[:2], spots, 2, -1)
-        X, Y = (pixel_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
+        w, edges, terms = self.nodes.weights, self.optics.profile.edges, mehler_series(self.kernel)
+        path = self.paths(t).reshape(*t.shape[:2], self.outputs // 2, 2, -1)
+        X, Y = (pixel_masses(self.kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
         light = sum(c * batched.long_matmul(batched.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms))
-        return np.asarray(light).reshape(*t.shape[:2], -1) / self._optics.pixel_size
+        return np.asarray(light).reshape(*t.shape[:2], -1) / self.optics.pixel_size
 
     def log_likelihoods(self, t: FloatArray) -> FloatArray:
         """Log-likelihoods of many points (axes, points, n), (axes, points)."""
-        line = self.line
-        if line is None:
+        if (line := self.line) is None:
             return self.log_likelihood(self.predicted(t))
-        from aolink.estimation.compiled.line import log_likelihoods
-
         out = np.empty(t.shape[:2])
         log_likelihoods(line, np.ascontiguousarray(t), out)
         return out
 
     @property
     def line(self) -> Line | None:
-        """The frame of a line sensor for compiled code; None where that is not used."""
-        if not self.compiled:
+        """The frame of a line sensor for compiled code; None for spots on a plane."""
+        if not self.on_line:
             return None
-        from aolink.estimation.compiled.line import Line
-
-        edges, variance = self._optics.profile.edges, float(self._kernel[0, 0])
+        edges, nodes = self.optics.profile.edges, self.nodes
+        pixel, variance = self.optics.pixel_size, float(self.kernel[0, 0])
         return Line(
             y=np.ascontiguousarray(self.y), usable=np.ascontiguousarray(self.mask),
-            inputs=np.ascontiguousarray(self._inputs[:, 0]), basis=np.ascontiguousarray(self._basis[0].T),
-            weights=self._weights, table=_light_table(variance, self._optics.pixel_size), low=float(edges[0]),
-            high=float(edges[-1]), pixel=self._optics.pixel_size, per_unit=1 / self._optics.pixel_size,
-            read_noise=self.read_noise, gain=self.gain, kernel_variance=self.sensor.kernel.variance,
+            inputs=np.ascontiguousarray(nodes.inputs[:, 0]), basis=np.ascontiguousarray(nodes.basis[0].T),
+            weights=nodes.weights, table=_light_table(variance, pixel), low=float(edges[0]), high=float(edges[-1]),
+            pixel=pixel, per_unit=1 / pixel, read_noise=self.read_noise, gain=self.gain,
+            kernel_variance=self.sensor.kernel.variance,
         )  # fmt: skip
 
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """`predicted`, and its Jacobian (axes, k, pixels, n)."""
-        path, w = self.paths(t), self._weights[:, None]
-        edges, D = self._optics.profile.edges, self._optics.pixel_size
-        lead, size = t.shape[:2], t.shape[2]
-        if self._line:
-            mass, slope = pixel_masses(self._kernel[0, 0], edges, path[:, :, 0], 1)
-            f = batched.matmul(self._weights[None], mass)[..., 0, :] / D
-            J = batched.long_matmul(batched.transpose(slope * w), self._basis[0]) / D
-            return f, J
-        spots, terms = path.shape[2] // 2, self._terms()
-        path = path.reshape(*lead, spots, 2, -1)
-        X, Y = (pixel_masses(self._kernel[d, d], edges, path[:, :, :, d], len(terms)) for d in (0, 1))
-        along, across = (self._basis.reshape(spots, 2, -1, size)[:, d] for d in (0, 1))
+        w, edges, D = self.nodes.weights[:, None], self.optics.profile.edges, self.optics.pixel_size
+        lead, size, spots, terms = t.shape[:2], t.shape[2], self.outputs // 2, mehler_series(self.kernel)
+        path = self.paths(t).reshape(*lead, spots, 2, -1)
+        X, Y = (pixel_masses(self.kernel[d, d], edges, path[:, :, :, d], len(terms)) for d in (0, 1))
+        along, across = (self.nodes.basis.reshape(spots, 2, -1, size)[:, d] for d in (0, 1))
         light: FloatArray = np.zeros(())
         slopes: FloatArray = np.zeros(())
         for j, c in enumerate(terms):
@@ -323,22 +281,6 @@ class PixelView:
 
     def _variance(self, f: FloatArray) -> FloatArray:
         return self.read_noise + self.gain * np.maximum(f, 0.0)
-
-    def _terms(self) -> list[float]:
-        return mehler_series(self._kernel)
-
-
-def mehler_series(kernel: FloatArray) -> list[float]:
-    """Terms c^j / j! of Mehler's series that matter, c the covariance of the two directions in ``kernel`` (2, 2)."""
-    (xx, xy), (_, yy) = kernel
-    rho = abs(xy) / math.sqrt(xx * yy)
-    count = 1 if rho == 0 else min(_MOST_TERMS, math.ceil(math.log(_SERIES) / math.log(rho)))
-    return [xy**j / math.factorial(j) for j in range(count)]
-
-
-@lru_cache(maxsize=16)
-def _windowed(sensor: BaseSensor, line: bool, outputs: int) -> Windowed[Any]:
-    return WindowedMoments(sensor.profile) if line else WindowedSpots(sensor, outputs // 2)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=16)

@@ -12,10 +12,9 @@ the kernel is wide a mode is not Gaussian, so mean and covariance are those of p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.compiled import modes as compiled_modes
@@ -30,15 +29,12 @@ from aolink.estimation.pixels.levenberg_marquardt import (
     FIRST_DAMPING,
     FREE_DAMPING,
     LARGEST_DAMPING,
-    Indices,
     Points,
     minimise,
 )
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from aolink.numerics.arrays import FloatArray, Indices
 
 _PASSES = 16
 _BROAD_PASSES = 2
@@ -74,8 +70,19 @@ class Modes:
     objective: FloatArray
     """-log p(s, y) up to a constant, (axes, starts)."""
 
+    @classmethod
+    def none(cls, axes: int, count: int, n: int) -> Modes:
+        """Room for so many modes, none of which is there."""
+        nothing, never = np.zeros((axes, count)), np.full((axes, count), np.inf)
+        return cls(np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), -never, nothing, never)
+
     @property
-    def best(self) -> NDArray[np.intp]:
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """The five, in this order."""
+        return self.mean, self.covariance, self.log_evidence, self.distance, self.objective
+
+    @property
+    def best(self) -> Indices:
         """Index of the mode of least objective, (axes,)."""
         return np.asarray(np.argmin(self.objective, axis=1))
 
@@ -105,7 +112,7 @@ def find_modes(
     def at(s: FloatArray, which: Indices) -> Points:
         return _at(rows.part(which), m[which], L[which], s)
 
-    s, found, _ = minimise(at, starts.reshape(-1, n), passes, converged)
+    s, found = minimise(at, starts.reshape(-1, n), passes, converged)
     covariance = batched.congruence(L, batched.symmetric(np.asarray(np.linalg.inv(found.hessian), dtype=np.float64)))
     _, log_H = np.linalg.slogdet(found.hessian)
     evidence = -found.objective - 0.5 * log_H
@@ -118,19 +125,16 @@ def find_modes(
 
 
 def _found_compiled(
-    line: Line, prior: Gaussian, starts: FloatArray, of_axis: NDArray[np.intp], whole: int, reversed_precision: float,
+    line: Line, prior: Gaussian, starts: FloatArray, of_axis: Indices, whole: int, reversed_precision: float,
     passes: int = _PASSES, converged: float = _CONVERGED,
 ) -> Modes:  # fmt: skip
     axes, count, n = starts.shape
     count += 3 if reversed_precision else 0
-    found = Modes(
-        np.zeros((axes, count, n)), np.zeros((axes, count, n, n)), np.full((axes, count), -np.inf),
-        np.zeros((axes, count)), np.full((axes, count), np.inf),
-    )  # fmt: skip
+    found = Modes.none(axes, count, n)
     compiled_modes.find_modes(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
         of_axis, whole, reversed_precision, passes, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, converged,
-        found.mean, found.covariance, found.log_evidence, found.distance, found.objective,
+        *found.arrays,
     )  # fmt: skip
     return found
 
@@ -148,9 +152,9 @@ def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
         return _found_compiled(line, prior, starts, of_axis, view.whole_nodes, _reversed_precision(view))
     found = find_modes(view, prior, starts[:, :3])
     if len(some := np.flatnonzero(many)):
-        of_some = Gaussian(prior.mean[some], prior.covariance[some])
-        found = with_more(found, some, find_modes(view.part(some), of_some, starts[some, 3:]))
-    return with_reversals(view, prior, found)
+        found = with_more(found, some, find_modes(view.part(some), prior.part(some), starts[some, 3:]))
+    back = reversed_starts(view, prior, found.mean[np.arange(len(found.mean)), found.best][:, None])
+    return with_more(found, slice(None), find_modes(view, prior, back))
 
 
 def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
@@ -165,9 +169,8 @@ def _at(rows: PixelView, m: FloatArray, L: FloatArray, s: FloatArray) -> Points:
 
 def without_repeats(modes: Modes) -> Modes:
     """The same without modes that an earlier start has led to; modes that remain come first."""
-    kept = [getattr(modes, f.name).copy() for f in fields(Modes)]
-    mean, covariance, evidence, distance, objective = kept
-    most = compiled_modes.drop_repeats(mean, covariance, _APART, evidence, distance, objective)
+    mean, covariance, *rest = kept = [each.copy() for each in modes.arrays]
+    most = compiled_modes.drop_repeats(mean, covariance, _APART, *rest)
     return Modes(*(each[:, : max(most, 1)] for each in kept))
 
 
@@ -200,7 +203,7 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
     (axes, n).
     """
     axes, n = wide.mean.shape
-    if view.compiled:
+    if view.on_line:
         starts, squares = np.empty((axes, 1 + 2 * min(_DIRECTIONS, n), n)), np.empty((axes, n))
         compiled_modes.spread_starts(
             *(np.ascontiguousarray(each) for each in (prior.mean, prior.covariance, wide.mean, wide.covariance)),
@@ -229,7 +232,7 @@ def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> Flo
     L, m = cholesky(prior.covariance), prior.mean
     nodes, outputs = view.whole_nodes, view.outputs
     rows = view.rows.reshape(outputs, -1, view.reduced.size)[:, :nodes].reshape(outputs * nodes, -1)
-    weights = view.weights[:nodes] / view.weights[:nodes].sum()
+    weights = view.nodes.weights[:nodes] / view.nodes.weights[:nodes].sum()
     precision = np.tile(weights, outputs) * _reversed_precision(view)
     B = batched.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
     path = view.paths(points)[..., :nodes]
@@ -243,24 +246,12 @@ def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> Flo
     return np.asarray(np.linalg.solve(H, batched.transpose(right)).swapaxes(-1, -2))
 
 
-def with_reversals(view: PixelView, prior: Gaussian, modes: Modes) -> Modes:
-    """The same modes, and those that the reversal of the best one and its mirror images lead to."""
-    back = reversed_starts(view, prior, modes.mean[np.arange(len(modes.mean)), modes.best][:, None])
-    more = find_modes(view, prior, back)
-    return with_more(modes, slice(None), more)
-
-
-def with_more(modes: Modes, axes: slice | NDArray[np.intp], more: Modes) -> Modes:
+def with_more(modes: Modes, axes: slice | Indices, more: Modes) -> Modes:
     """The same modes, and after them those that more starts of some axes led to."""
-    nothing = {"mean": 0.0, "covariance": 0.0, "log_evidence": -np.inf, "distance": 0.0, "objective": np.inf}
-
-    def both(name: str) -> FloatArray:
-        old, new = getattr(modes, name), getattr(more, name)
-        spread = np.full((len(old), *new.shape[1:]), nothing[name])
-        spread[axes] = new
-        return np.concatenate([old, spread], axis=1)
-
-    return Modes(*(both(f.name) for f in fields(Modes)))
+    spread = Modes.none(len(modes.mean), *more.mean.shape[1:])
+    for room, new in zip(spread.arrays, more.arrays, strict=True):
+        room[axes] = new
+    return Modes(*(np.concatenate(each, axis=1) for each in zip(modes.arrays, spread.arrays, strict=True)))
 
 
 def whitened(prior: Gaussian, points: FloatArray) -> FloatArray:

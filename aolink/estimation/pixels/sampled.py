@@ -7,9 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import MixtureUpdate
@@ -19,9 +16,8 @@ from aolink.estimation.pixels.modes import innovation
 from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.estimation.pixels.updates import explored, has_several
 from aolink.numerics import batched
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import BaseSensor
-
-FloatArray = NDArray[np.float64]
 
 # Rms of the path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.05
@@ -62,11 +58,5 @@ class TemperedUpdater:
         number:
             Number of the exposure: with the estimator's seed and the axis it seeds the random numbers.
         """
-        each = [np.array([axis]) for axis in range(len(prior.mean))]
-        keys = [(self.seed, number, int(axis)) for axis in view.axes]
-        return np.stack(
-            [
-                tempered_points(view.part(a), prior.part(a), self.particles, key)
-                for a, key in zip(each, keys, strict=True)
-            ]
-        )
+        keys = [(self.seed, number, axis) for axis in view.axes.tolist()]
+        return tempered_points(view, prior, self.particles, keys)

@@ -11,15 +11,14 @@ Del Moral, Doucet, Jasra, Sequential Monte Carlo samplers, J. R. Stat. Soc. B 68
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
 from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray, Indices
 
 _MOVES = 16
 _EFFECTIVE = 0.5
@@ -30,19 +29,27 @@ _LEAST_SPREAD = 1e-3
 _WHOLE = 4
 
 
-def tempered_points(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...]) -> FloatArray:
-    """Equally likely points of the posterior of one axis, (count, n).
+def tempered_points(
+    view: PixelView, prior: GaussianMixture, count: int, keys: Sequence[tuple[int, ...]]
+) -> FloatArray:  # fmt: skip
+    """Equally likely points of the posterior, (axes, count, n).
 
     Parameters
     ----------
     prior:
         Prior of the start state; the noise coefficients have N(0, I).
-    key:
-        Seed: the same key gives the same points.
+    keys:
+        Seed of each axis: the same key gives the same points.
     """
+    each = (np.array([axis]) for axis in range(len(keys)))
+    return np.stack([_of_axis(view.part(a), prior.part(a), count, key) for a, key in zip(each, keys, strict=True)])
+
+
+def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int, ...]) -> FloatArray:
+    """`tempered_points` of one axis, (count, n)."""
     rng, n = np.random.default_rng(key), view.reduced.size
     t = _drawn(prior, rng, count, n)
-    log_prior, log_likelihood = _log_prior(prior, t), _log_likelihood(view, t)
+    log_prior, log_likelihood = with_noise(prior, t[None])[0], view.log_likelihoods(t[None])[0]
     power = 0.0
     while power < 1.0:
         power, before = _next_power(log_likelihood, power), power
@@ -58,7 +65,7 @@ def tempered_points(view: PixelView, prior: GaussianMixture, count: int, key: tu
                 length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * size
                 step = length * (t[first] - t[second]) + 0.01 * rng.standard_normal((count, n)) @ root.T
             there = t + step
-            its_prior, its_likelihood = _log_prior(prior, there), _log_likelihood(view, there)
+            its_prior, its_likelihood = with_noise(prior, there[None])[0], view.log_likelihoods(there[None])[0]
             gain = its_prior - log_prior + power * (its_likelihood - log_likelihood)
             taken = np.log(rng.random(count)) < gain
             t[taken], log_prior[taken], log_likelihood[taken] = there[taken], its_prior[taken], its_likelihood[taken]
@@ -126,14 +133,6 @@ def _drawn(prior: GaussianMixture, rng: np.random.Generator, count: int, n: int)
     return t
 
 
-def _log_prior(prior: GaussianMixture, t: FloatArray) -> FloatArray:
-    return np.asarray(with_noise(prior, t[None])[0])
-
-
-def _log_likelihood(view: PixelView, t: FloatArray) -> FloatArray:
-    return np.asarray(view.log_likelihoods(t[None])[0])
-
-
 def _next_power(log_likelihood: FloatArray, power: float) -> float:
     """The largest power up to 1 that leaves the effective sample size that is wanted."""
     away = log_likelihood - log_likelihood.max()
@@ -147,7 +146,7 @@ def _next_power(log_likelihood: FloatArray, power: float) -> float:
     return power + float(optimize.brentq(excess, 0.0, 1.0 - power, xtol=1e-300, rtol=1e-6))
 
 
-def _resampled(weights: FloatArray, rng: np.random.Generator) -> NDArray[np.intp]:
+def _resampled(weights: FloatArray, rng: np.random.Generator) -> Indices:
     """Systematic resampling."""
     count = len(weights)
     places = (rng.random() + np.arange(count)) / count

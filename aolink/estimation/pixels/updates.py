@@ -14,7 +14,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from aolink.estimation.kalman.gaussian import Gaussian
@@ -24,9 +23,8 @@ from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, l
 from aolink.estimation.pixels.importance import posterior, proposed
 from aolink.estimation.pixels.likelihood import PixelView, Reduction, reduction
 from aolink.estimation.pixels.modes import Modes, broad, innovation, modes_of, without_repeats
+from aolink.numerics.arrays import BoolArray
 from aolink.optics.sensor import BaseSensor
-
-FloatArray = NDArray[np.float64]
 
 # Share of the prior that is the prediction without any measurement; and how rarely chance makes it searched.
 _DOUBT = 1e-3
@@ -59,14 +57,12 @@ class ImportanceUpdater:
         new = innovation(view, reduced.prior(prior.gaussian), modes)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
         if len(doubted):
-            _, more = explored(view.part(doubted), single(Gaussian(unseen.mean[doubted], unseen.covariance[doubted])))
+            _, more = explored(view.part(doubted), single(unseen.part(doubted)))
             proposal = proposal.replaced(doubted, joined(proposal.part(doubted), more))
-        rest = GaussianMixture(prior.log_weight + math.log1p(-_DOUBT), prior.mean, prior.covariance)
-        wide = GaussianMixture(
-            np.full((len(unseen.mean), 1), math.log(_DOUBT)), unseen.mean[:, None], unseen.covariance[:, None]
-        )
+        rest = replace(prior, log_weight=prior.log_weight + math.log1p(-_DOUBT))
+        doubt = replace(single(unseen), log_weight=np.full((len(unseen.mean), 1), math.log(_DOUBT)))
         several = has_several(modes, _LEAST_DOUBTED_SHARE)
-        after = posterior(view, joined(rest, wide), proposal, number, new.believed, self.share, several)
+        after = posterior(view, joined(rest, doubt), proposal, number, new.believed, self.share, several)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
         return MixtureUpdate(after.gaussian, carried, new, has_several(modes))
 
@@ -75,7 +71,7 @@ PROFILE = ImportanceUpdater(carried=3, free=0.1, share=0.25)
 MIXTURE = ImportanceUpdater(carried=6, free=1e-3, share=1.0)
 
 
-def has_several(modes: Modes, least: float = _LEAST_SHARE) -> NDArray[np.bool_]:
+def has_several(modes: Modes, least: float = _LEAST_SHARE) -> BoolArray:
     """Whether a second mode has at least this share of the posterior, (axes,)."""
     share = np.exp(modes.log_evidence - log_sum(modes.log_evidence, axis=1)[:, None])
     return np.asarray((share > least).sum(axis=1) > 1)
@@ -89,23 +85,14 @@ def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMi
     before = view.reduced.prior(Gaussian(prior.mean, prior.covariance))
     axes, count, _ = before.mean.shape
     there = np.nonzero(np.isfinite(prior.log_weight))
-    rows, each = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
-    wide = broad(rows, each)
-    found = modes_of(rows, each, wide)
-    of_each = found.mean.shape[1]
+    rows, own = view.part(there[0]), Gaussian(before.mean[there], before.covariance[there])
+    wide = broad(rows, own)
+    found = modes_of(rows, own, wide)
     found = replace(found, log_evidence=found.log_evidence + prior.log_weight[there][:, None])
-
-    def placed(values: FloatArray, empty: float) -> FloatArray:
-        out = np.full((axes, count, *values.shape[1:]), empty)
-        out[there] = values
-        return out.reshape(axes, count * of_each, *values.shape[2:])
-
-    modes = without_repeats(
-        Modes(
-            placed(found.mean, 0.0), placed(found.covariance, 0.0), placed(found.log_evidence, -math.inf),
-            placed(found.distance, 0.0), placed(found.objective, math.inf),
-        )
-    )  # fmt: skip
+    modes = Modes.none(axes, count * found.mean.shape[1], found.mean.shape[2])
+    for room, each in zip(modes.arrays, found.arrays, strict=True):
+        room.reshape(axes, count, *each.shape[1:])[there] = each
+    modes = without_repeats(modes)
     flat = Gaussian(np.zeros_like(before.mean), np.zeros_like(before.covariance))
     flat.mean[there], flat.covariance[there] = wide.mean, wide.covariance
     return modes, proposed(modes.log_evidence, Gaussian(modes.mean, modes.covariance), prior.log_weight, flat)

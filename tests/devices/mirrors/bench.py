@@ -22,7 +22,7 @@ _CHANGES = (
     ("process_noise = 3e-4", "process_noise = 1e-6"),
     ("dac_bits = 16", "dac_bits = 16\nwatchdog_s = 30.0"),
     ("block_steps = 50", "block_steps = 10"),
-    ("period_s = 2.0", "period_s = 1.0"),
+    ("period_s = 2.0", "period_s = 4.0"),
 )
 
 

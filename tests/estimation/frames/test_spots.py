@@ -19,7 +19,6 @@ from aolink.estimation.score import score
 from aolink.exposure import Exposure
 from aolink.optics.camera import effective_noise_density, to_counts, to_density
 from aolink.optics.frame import frame_density, spot_windows
-from aolink.optics.plane import kernel_covariance
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Plant, Rig, load_rig
 from aolink.simulation.model import simulate
@@ -98,7 +97,7 @@ def test_moments_of_spots_are_those_of_the_plane_without_its_cross_terms(exposur
     measured, _ = measured_of(SENSOR, RIG.plant, exposures[0].pixels, (1, 2), flux)
     edges, orders = SENSOR.profile.edges, [(1, 0), (2, 0), (0, 1), (0, 2)]
     density = spot_windows(SENSOR, to_density(SENSOR, exposures[0].pixels))
-    kernel, noise = kernel_covariance(SENSOR.kernel.sigma * np.eye(2)), effective_noise_density(SENSOR)
+    kernel, noise = SENSOR.kernel.covariance, effective_noise_density(SENSOR)
     theirs = must_be(Measurement, measure_moments_2d(density, edges, edges, kernel, noise, orders, flux))
     np.testing.assert_allclose(measured.value.reshape(16, 4), theirs.value, atol=1e-12)
     for direction, block in enumerate((slice(0, 2), slice(2, 4))):

@@ -122,7 +122,6 @@ def test_noise_path_is_that_of_the_fast_steps_to_the_share_that_is_stated(plant,
     missing = whole - ours @ ours.T
     assert np.linalg.eigvalsh(missing).min() > -1e-9 * np.linalg.eigvalsh(whole).max()
     share = np.sqrt(np.trace(missing) / np.trace(whole))
-    assert share == pytest.approx(model.noise_left_out, rel=1e-6)
     assert share <= NOISE_LEFT_OUT
     by_output = np.diag(missing).reshape(32, N).mean(axis=1)
     np.testing.assert_allclose(model.noise.left_out, by_output, atol=1e-9 * by_output.max())

@@ -15,7 +15,7 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import blocks, quadrature_paths
 from aolink.estimation.moments import windowed
 from aolink.estimation.moments.spots import WindowedSpots
-from aolink.optics.camera import pixel_noise_variance
+from aolink.optics.camera import pixel_noise_sd, shot_gain
 from aolink.optics.plane import exposure_density_2d, pixel_mass_2d
 from aolink.optics.sensor import Kernel, SpotSensor
 from aolink.rig import Plant, Rig, load_rig
@@ -177,7 +177,7 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
     rig = tip_tilt(photoelectrons=photoelectrons)
     edges = rig.sensor.profile.edges
     clean = exposure_density_2d(rig.sensor.kernel.covariance, edges, edges, np.full((1, 1, 2), [0.3, -0.2]))
-    sd = np.sqrt(pixel_noise_variance(rig.sensor, clean))
+    sd = np.sqrt(pixel_noise_sd(rig.sensor) ** 2 + shot_gain(rig.sensor) * clean)
     observation = WindowedSpots(spots_of(rig), 1)
     mask = np.ones((1, *clean.shape), dtype=bool)
     windows = observation.window_functions(np.full((1, 1, 1, 2), [0.3, -0.2]), np.full((1, 1, 1, 2), 0.01), mask)

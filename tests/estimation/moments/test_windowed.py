@@ -13,7 +13,7 @@ from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.quadrature import blocks, quadrature_paths
 from aolink.estimation.moments.windowed import WindowedMoments
-from aolink.optics.camera import pixel_noise_variance, to_counts
+from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.kernel import exposure_density, pixel_mass
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
@@ -137,7 +137,7 @@ def test_noise_of_the_sums_is_that_of_many_frames(photoelectrons):
     clean = exposure_density(SENSOR.kernel, SENSOR.edges, path)
     rng = np.random.default_rng(3)
     sensor = dataclasses.replace(SENSOR, photoelectrons=photoelectrons)
-    sd = np.sqrt(pixel_noise_variance(sensor, clean))
+    sd = np.sqrt(pixel_noise_sd(sensor) ** 2 + shot_gain(sensor) * clean)
     observation = WindowedMoments(sensor)
     W = observation.window_weights(path[None], np.full((1, 200), 0.001), np.ones((1, 40), bool))
     _, noise = observation.measured(W, clean[None])

@@ -24,7 +24,7 @@ from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths
 from aolink.estimation.model.quadrature import Resolution
 from aolink.estimation.moments import windowed
-from aolink.estimation.moments.joint_moments import JointMoments
+from aolink.estimation.moments.joint_moments import JointMoments, by_spot
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import Regression
 from aolink.estimation.pixels import joint_pixels
@@ -93,10 +93,7 @@ def foreseen(frame: Frame, paths: JointPaths) -> JointPaths:
 
 
 def joint_view(rig: Rig, frame: Frame, paths: JointPaths) -> JointPixels:
-    seen = frame.windows
-    return JointPixels(
-        spots_of(rig), paths.foreseen(np.zeros(paths.size), frame.response, 0), seen.density[0], seen.mask[0], None
-    )
+    return JointPixels(spots_of(rig), foreseen(frame, paths), by_spot(frame.windows, 0))
 
 
 def whole_prior(frame: Frame, size: int) -> Gaussian:

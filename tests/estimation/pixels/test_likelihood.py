@@ -17,6 +17,7 @@ from aolink.optics.plane import exposure_density_2d
 from aolink.optics.sensor import Kernel
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.estimation.pixels.plain import PlainView
 
 LINE = load_rig("section-vi-lively")
 PLANE = load_rig("single-lenslet")
@@ -50,7 +51,8 @@ def view_of(rig, *, photoelectrons=0.0, seed=1, **how):
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor, **how)
     assert isinstance(measured, SpotWindows if spots else Profile)
-    return likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced), model
+    view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
+    return view if spots else PlainView.of(view), model
 
 
 def some_points(view, count=3, seed=2):

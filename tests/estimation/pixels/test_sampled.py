@@ -18,6 +18,7 @@ from aolink.estimation.pixels.sampled import TemperedUpdater
 from aolink.estimation.pixels.tempering import fitted
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.estimation.pixels.plain import PlainView
 from tests.kinds import must_be, truth_of
 
 RIG = load_rig("section-vi-lively")
@@ -95,7 +96,7 @@ def ranks(count, particles, seed=5):
         t = (before.mean[0] + root @ rng.standard_normal(reduced.size))[None, None]
         dark = Profile(density=np.zeros((1, 40)), mask=np.ones((1, 40), bool))
         view = likelihood.PixelView(rig.sensor, MODEL, MODEL.response(np.zeros((200, 1))), dark, reduced)
-        view.y = view.predicted(t)[:, 0] + np.sqrt(view.read_noise) * rng.standard_normal((1, 40))
+        view.y = PlainView.of(view).predicted(t)[:, 0] + np.sqrt(view.read_noise) * rng.standard_normal((1, 40))
         drawn = TemperedUpdater(particles).sample(view, single(PRIOR), number)[0]
 
         thin = drawn[rng.permutation(particles)[:99]]

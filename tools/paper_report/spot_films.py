@@ -29,10 +29,11 @@ def random_walk(rng: np.random.Generator, frames: int, spots: int, step: float, 
 
 
 def resonance(
-    rng: np.random.Generator, frames: int, spots: int, rms: float, period: float, fine: int = 8
+    rng: np.random.Generator, frames: int, spots: int, rms: float, period: float, lasts: float = 50.0, fine: int = 8
 ) -> FloatArray:
-    """A vibration that lasts for some fifty periods, of so many frames each; as `random_walk`."""
-    a = np.exp((-0.02 + 2j * np.pi) / (period * fine))
+    """A vibration with periods of so many frames, whose amplitude is forgotten after ``lasts`` periods (to 1/e); as
+    `random_walk`."""
+    a = np.exp((-1 / lasts + 2j * np.pi) / (period * fine))
     x = np.zeros((frames * fine, spots, 2), dtype=np.complex128)
     state = rms * (rng.normal(size=(spots, 2)) + 1j * rng.normal(size=(spots, 2)))
     kick = rms * np.sqrt(1 - abs(a) ** 2)

@@ -1,0 +1,11 @@
+"""Short names for arrays of one type of number."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+Indices = NDArray[np.intp]
