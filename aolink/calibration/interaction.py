@@ -33,6 +33,9 @@ class Interaction:
     """Singular values of the matrix, from large to small."""
     residual_rms: float
     """Rms of the slopes that the matrix does not explain, slope units."""
+    sd: FloatArray
+    """Standard deviation of the matrix's numbers by these residuals, the same for all slopes, (n_inputs,); NaN where
+    there are no more exposures than unknowns."""
     exposures: int
     """Number of exposures used."""
 
@@ -102,12 +105,15 @@ def measure_interaction(
             f"{len(u)} exposures at rest do not tell {rig.n_inputs} inputs apart: poke each of them alone"
         )
     solution, *_ = np.linalg.lstsq(design, y, rcond=None)
-    matrix = solution[:-1].T
+    matrix, residual = solution[:-1].T, y - design @ solution
+    freedom = (len(u) - design.shape[1]) * y.shape[1]
+    noise = float(np.sqrt((residual**2).sum() / freedom)) if freedom else float("nan")
     return Interaction(
         matrix=matrix,
         offset=solution[-1],
         singular_values=np.linalg.svd(matrix, compute_uv=False),
-        residual_rms=float(np.sqrt(np.mean((y - design @ solution) ** 2))),
+        residual_rms=float(np.sqrt(np.mean(residual**2))),
+        sd=noise * np.sqrt(np.diag(np.linalg.inv(design.T @ design))[:-1]),
         exposures=len(u),
     )
 

@@ -572,7 +572,8 @@ def _write_interaction(loaded: Rig, paths: Sequence[Path], output: Path, *, over
     with writing(output, overwrite=overwrite, sources=paths) as unfinished, unfinished.open("wb") as file:
         np.savez(
             file, matrix=measured.matrix, offset=measured.offset, singular_values=measured.singular_values,
-            residual_rms=measured.residual_rms, exposures=measured.exposures, plant_matrix=found.modelled.matrix,
+            sd=measured.sd, residual_rms=measured.residual_rms, exposures=measured.exposures,
+            plant_matrix=found.modelled.matrix,
         )  # fmt: skip
     facts = {
         "outputs": len(measured.matrix),
@@ -582,14 +583,16 @@ def _write_interaction(loaded: Rig, paths: Sequence[Path], output: Path, *, over
         "condition": measured.condition,
         "residual_rms": measured.residual_rms,
         "difference_from_plant": found.difference,
+        "noise": None if np.isnan(found.noise) else found.noise,
     }
     if as_json:
         print(json.dumps(facts))
         return
     largest, smallest = measured.singular_values[0], measured.singular_values[-1]
+    off = ": a sign, the order of the inputs or a scale is wrong" if found.difference > 0.3 + 3 * found.noise else ""
     stdout.print(
         f"{facts['outputs']} slopes for {facts['inputs']} inputs from {measured.exposures} exposures; singular values"
         f" {largest:.4g} to {smallest:.4g}, condition {measured.condition:.3g}; residual {measured.residual_rms:.3g}"
-        f" slope units (rms)\nthe rig file's plant leaves {100 * found.difference:.3g} % of the matrix unexplained"
-        f"{': a sign, an order of inputs or a scale may be wrong' if found.difference > 0.5 else ''}"
+        f" slope units (rms)\nthe rig file's plant is off by {100 * found.difference:.3g} % of the matrix, noise"
+        f" explains {100 * found.noise:.3g} %{off}"
     )

@@ -21,8 +21,8 @@ from aolink.devices.arrival import Arrivals
 from aolink.devices.clock import ClockExchange, ClockRegression
 from aolink.devices.drivers import calling
 from aolink.devices.gate import CommandLimits, converter_margin, printable
-from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Mirror
-from aolink.devices.simple import Held, Lacks, SimpleCamera, SimpleFrame, SimpleMirror
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Mirror, lacks_of
+from aolink.devices.simple import Held, SimpleCamera, SimpleFrame, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
 from aolink.rig.device_tables import Delay
@@ -45,7 +45,7 @@ class _Adapted:
     def __init__(self, name: str, driver: SimpleCamera | SimpleMirror, delay: Delay, now_ns: Callable[[], int]) -> None:
         self.name = name
         self.description = printable(driver.description)
-        self.lacks = [Lacks(each) for each in getattr(driver, "lacks", ())]
+        self.lacks = lacks_of(driver)
         self.clock = ClockRegression()
         self._now_ns, self._delay_ns, self._delay_sd_ns = now_ns, round(delay.mean_s * 1e9), delay.sd_s * 1e9
         self._events: list[Event] = []

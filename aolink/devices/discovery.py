@@ -10,7 +10,7 @@ from serial.tools import list_ports as serial_ports
 
 from aolink.devices.drivers import KINDS, NATIVE, Kind, driver_names, load_driver
 from aolink.devices.identity import identify
-from aolink.devices.simple import Lacks
+from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
@@ -67,7 +67,7 @@ def _find(kind: Kind, name: str) -> DriverFound:
         driver = load_driver(kind, name)
     except AolinkError as error:
         return DriverFound(kind=kind, name=name, problem=str(error))
-    lacks = [str(Lacks(each)) for each in getattr(driver, "lacks", ())]
+    lacks = [str(each) for each in lacks_of(driver)]
     discover = getattr(sys.modules.get(getattr(driver, "__module__", "")), "discover", None)
     try:
         devices = [(str(address), str(text)) for address, text in discover()] if discover else []

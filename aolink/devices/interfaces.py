@@ -61,6 +61,12 @@ class Lacks(StrEnum):
     STOP = "cannot empty its queue: parking waits for what is queued"
 
 
+def lacks_of(driver: Any) -> list[Lacks]:
+    """What a driver, or its class, says that its devices lack; a direct mirror lacks a queue."""
+    own = [Lacks(each) for each in getattr(driver, "lacks", ())]
+    return list(dict.fromkeys([*own, Lacks.QUEUE] if hasattr(driver, "put") else own))
+
+
 class Device(Protocol):
     """What camera and mirror have in common."""
 

@@ -9,7 +9,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.devices.simple import DirectMirror, Held, Lacks
+from aolink.devices.interfaces import lacks_of
+from aolink.devices.simple import DirectMirror, Held
 from aolink.rig import Rig
 
 _LATE = 0.5
@@ -26,7 +27,7 @@ class PacedMirror:
 
     def __init__(self, rig: Rig, driver: DirectMirror) -> None:
         self.description = driver.description
-        self.lacks = tuple(dict.fromkeys((*getattr(driver, "lacks", ()), Lacks.QUEUE)))
+        self.lacks = lacks_of(driver)
         self._driver, self._park, self._step_ns = driver, rig.mirror.park, rig.timing.fast_step_ns
         self._zero_ns = time.monotonic_ns()
         self._queue: dict[int, NDArray[np.float64]] = {}

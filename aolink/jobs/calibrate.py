@@ -167,6 +167,12 @@ class Poked:
     modelled: Interaction
 
     @property
+    def noise(self) -> float:
+        """Rms of the measured matrix's error to be expected, as a share of its rms."""
+        error = np.sqrt(len(self.measured.matrix) * (self.measured.sd**2).sum())
+        return float(error / max(np.linalg.norm(self.measured.matrix), 1e-300))
+
+    @property
     def difference(self) -> float:
         """Rms of what the plant leaves unexplained of the measured matrix, as a share of its rms."""
         apart = self.measured.matrix - self.modelled.matrix

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.drivers import KINDS, NATIVE, check_driver
+from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.estimation.frames.moments import least_significance, spot_significance
 from aolink.optics.camera import effective_noise_density, shot_gain
@@ -96,7 +97,7 @@ def _check_devices(rig: Rig) -> Iterator[Finding]:
             except AolinkError as error:
                 yield _error(key, str(error))
                 continue
-            lacks = "; ".join(getattr(driver, "lacks", ())) or "nothing"
+            lacks = "; ".join(lacks_of(driver)) or "nothing"
             yield _info(key, f"the driver {table.driver}; what its device lacks: {lacks}")
         elif table.delay is not None:
             yield _error(key, f"the driver {NATIVE} tells its time: delay_s and delay_sd_s are for others")

@@ -67,7 +67,7 @@ def reports(mirror: PacedMirror, end: int) -> list[tuple[float, bool]]:
 
 def test_each_step_gets_its_input_or_is_late(rig: Rig) -> None:
     mirror = PacedMirror(rig, device := Device())
-    assert mirror.lacks == (Lacks.READ_BACK, Lacks.QUEUE)
+    assert mirror.lacks == [Lacks.READ_BACK, Lacks.QUEUE]
     wanted = np.linspace(0.0101, 0.0211, 12)
     first = mirror.time_ns() // rig.timing.fast_step_ns + 4
     assert mirror.send(first, wanted[:, None]) == 0

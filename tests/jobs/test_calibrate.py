@@ -525,7 +525,7 @@ def test_frames_are_recorded_apart_and_marked(aolink: Run, tmp_path: Path) -> No
 
 def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Path) -> None:
     """Recorded over the wire, and compared with the plant of the rig file, which is that of the simulated rig."""
-    arguments = ("calibrate", "--interaction", "--rig", "tip-tilt", "--poke", "0.05", "--repeats", "1")
+    arguments = ("calibrate", "--interaction", "--rig", "tip-tilt", "--poke", "0.25", "--repeats", "6")
     with simulated_rig("tip-tilt") as (camera, mirror):
         done = aolink(
             *arguments, "--camera", camera, "--mirror", mirror, "-o", "matrix.npz", "--keep", "pokes", "--json"
@@ -534,7 +534,7 @@ def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Pat
     facts = json.loads(done.stdout)
     rig = load_rig("tip-tilt")
     assert (facts["outputs"], facts["inputs"]) == (rig.n_outputs, rig.n_inputs)
-    assert facts["difference_from_plant"] < 0.1
+    assert facts["difference_from_plant"] < 2 * facts["noise"] < 0.5
     with np.load(tmp_path / "matrix.npz") as found:
         assert found["matrix"].shape == (rig.n_outputs, rig.n_inputs)
         apart = np.linalg.norm(found["matrix"] - found["plant_matrix"]) / np.linalg.norm(found["matrix"])
