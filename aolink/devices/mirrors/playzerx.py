@@ -133,6 +133,8 @@ class PlayzerX:
         self._ahead = round(ahead_s * rate)
         _check(rig, laser, self._ahead)
         self._park = codes_of(rig.mirror.park[None])
+        self._laser: list[int] = []
+        """Levels of its colours, once it is known how many it has."""
         self._line = Line("the PlayzerX", text("port", port), BAUD_RATE)
         try:
             self.description, data_format = self._identify()
@@ -168,6 +170,9 @@ class PlayzerX:
                 time.sleep(next(self._pauses))
             self._clock.settle()
         except BaseException:
+            if self._laser:
+                with suppress(AolinkError):
+                    self._leave_safe()
             self._line.close()
             raise
         self._thread = threading.Thread(target=self._run, name="aolink-playzerx", daemon=True)
@@ -206,13 +211,16 @@ class PlayzerX:
         self._closing.set()
         self._thread.join()
         try:
-            self._line.tell(CLEAR + samples(self._park, [0] * len(self._laser)))
-            self._count()
+            self._leave_safe()
         except AolinkError:
             if self._failed is None:  # else the session has heard of it
                 raise
         finally:
             self._line.close()
+
+    def _leave_safe(self) -> None:
+        self._line.tell(CLEAR + samples(self._park, [0] * len(self._laser)))
+        self._count()
 
     def _identify(self) -> tuple[str, str]:
         """Description and data format. Raises DeviceError."""

@@ -277,5 +277,13 @@ def test_what_the_device_cannot_do_is_refused_before_it_is_opened(
         PlayzerX(rig_with(**changes), port="/dev/no-such-port", **keys)
 
 
+def test_a_device_that_fails_while_it_is_opened_is_left_with_its_laser_off() -> None:
+    with simulators.PlayzerX(slowest=700) as device:
+        with pytest.raises(DeviceError, match="does not play 500 samples a second"):
+            opened(device, laser=200)
+        with device.lock:
+            assert device.output == (*simulators.ORIGIN, (0,))
+
+
 def test_what_it_lacks_is_declared() -> None:
     assert PlayzerX.lacks == (Lacks.READ_BACK, Lacks.WATCHDOG, Lacks.STOP)
