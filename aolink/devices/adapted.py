@@ -137,6 +137,12 @@ class AdaptedCamera(_Adapted):
     def flush(self) -> list[Frame]:
         return []
 
+    def statistics(self) -> dict[str, int]:
+        if not hasattr(self._driver, "statistics"):
+            return {}
+        with calling(self.name, "when it was asked for its counts"):
+            return dict(self._driver.statistics())
+
     def close(self) -> None:
         """Give the device back."""
         with calling(self.name, "when it was closed"):

@@ -44,7 +44,8 @@ class SimpleCamera(Protocol):
     """A camera. The entry point is called with the rig and, by keyword, the driver's own keys of the rig file.
 
     It raises `aolink.errors.DeviceError`, with the reason, where the device cannot do what the rig file says. A class
-    attribute ``lacks`` may list what the device cannot do, some of `Lacks`.
+    attribute ``lacks`` may list what the device cannot do, some of `Lacks`. A method ``statistics`` may give the counts
+    of its line by the fields of the recording's ``LinkStatistics``; they are recorded once a second.
     """
 
     description: str

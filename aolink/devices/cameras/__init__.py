@@ -1,0 +1,1 @@
+"""Drivers of cameras, one module each; `aolink.devices.simple` has their interface."""

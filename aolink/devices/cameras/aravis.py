@@ -1,0 +1,386 @@
+"""GenICam cameras, GigE Vision above all, by the library Aravis 0.8.
+
+Aravis takes a camera's packets on a thread of its own and puts them together in memory that this driver gives it. A
+picture whose counts take two bytes goes to the session as it lies there, without a copy.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+from aolink.devices.cameras.aravis_library import Aravis, Refused
+from aolink.devices.cameras.aravis_stream import Picture, PictureStream
+from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
+from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.errors import DeviceError, RigError
+from aolink.rig import Rig
+
+_PACKET_OVERHEAD, _PACKET_OVERHEAD_EXTENDED = 36, 48
+"""Bytes of a packet that are not of the picture, with frame ids of 16 and of 64 bits: headers of IP, UDP and GVSP."""
+_ID_PERIOD = 65535
+"""A 16-bit frame id goes from 65535 to 1: 0 is not valid."""
+_RATE_TOLERANCE = 0.01
+_TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, _TIMESTAMP_VALUE = 0x0944, 2, 0x0948
+"""Registers that GigE Vision lays down: what is written to latch the clock, and where its latched value lies."""
+_UNSURE_S = 1.0
+"""How much later than others a frame may come whose arrival stands for its time."""
+_RELEASE_S = 2.0
+
+
+def discover() -> list[tuple[str, str]]:
+    """The cameras that answer on this machine's networks and buses: (address, description). It takes a second.
+
+    None is opened. Raises DeviceError where Aravis is missing.
+    """
+    aravis = Aravis()
+    aravis("arv_update_device_list")
+    found = []
+    for k in range(aravis("arv_get_n_devices")):
+        vendor, model, serial, protocol = (
+            (aravis(f"arv_get_device_{what}", k) or b"?").decode(errors="replace")
+            for what in ("vendor", "model", "serial_nbr", "protocol")
+        )
+        address = aravis("arv_get_device_address" if protocol == "GigEVision" else "arv_get_device_id", k)
+        found.append((address.decode(errors="replace"), f"{vendor} {model}, serial number {serial}, {protocol}"))
+    return found
+
+
+class AravisCamera:
+    """A camera that speaks GigE Vision (or USB3 Vision, which nobody has tried).
+
+    Parameters
+    ----------
+    address:
+        Its IP address, its name as Aravis has it (``Vendor-Model-Serial``), or empty for the only camera that answers.
+    pixel_format:
+        By GenICam's name; empty for one of as many bits as the rig file's sensor has, packed if the camera can.
+    trigger:
+        The camera's input whose rising edge starts each exposure, such as ``Line1``; empty: it runs freely, at the rig
+        file's rate.
+    stamp_at:
+        What the camera's time stamp marks of an exposure, its ``start`` or its ``end``: its manual says which.
+    offset:
+        Left column and upper row of the picture on the camera's sensor; None for the middle.
+    resend:
+        Whether packets that were lost are asked for again. A frame that stays incomplete then comes a tenth of a
+        second late, and without it when the next one begins.
+    packet_size:
+        Bytes of a packet, headers included; 0 for what the camera has, or fewer where the network cannot carry those.
+    features:
+        Other GenICam features to set, before all else.
+
+    Raises
+    ------
+    DeviceError
+        The library or the camera is missing, another program has the camera, or it cannot do what the rig file says.
+    RigError
+        A key has a value that means nothing.
+    """
+
+    lacks: tuple[Lacks, ...] = (Lacks.TRIGGER,)
+
+    def __init__(
+        self, rig: Rig, *, address: str = "", pixel_format: str = "", trigger: str = "", stamp_at: str = "start",
+        offset: list[int] | None = None, resend: bool = True, packet_size: int = 0,
+        features: dict[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        for key, value, kind, called in (
+            ("address", address, str, "a text"), ("pixel_format", pixel_format, str, "a text"),
+            ("trigger", trigger, str, "a text"), ("resend", resend, bool, "true or false"),
+            ("packet_size", packet_size, int, "a number of bytes"), ("features", features or {}, dict, "a table"),
+        ):  # fmt: skip
+            if not isinstance(value, kind):
+                raise RigError(f"devices.camera.{key} is {value!r}, expected {called}")
+        if stamp_at not in ("start", "end"):
+            raise RigError(f"devices.camera.stamp_at is {stamp_at!r}, expected 'start' or 'end'")
+        whole = isinstance(offset, list) and all(isinstance(each, int) and each >= 0 for each in offset)
+        if offset is not None and not (whole and len(offset) == 2):
+            raise RigError(f"devices.camera.offset is {offset!r}, expected [column, row]")
+        self._rig, self._shape, self._stamp_at = rig, rig.sensor.shape, stamp_at
+        timing = rig.timing
+        self._period_ns = timing.frame_period_steps * timing.fast_step_ns
+        self._aravis = Aravis()
+        self._address = address or self._only_camera()
+        self._camera = None
+        self._running = False
+        self._start_ns = 0
+        self._before: tuple[int, int, int] | None = None
+        """Of the frame before: its id as the camera has it, its number without wrapping, and its time, ns."""
+        try:
+            self._camera = self._do("arv_camera_new", self._address.encode(), to="be opened")
+            self._device = self._aravis("arv_camera_get_device", self._camera)
+            self._is_gige = bool(self._aravis("arv_camera_is_gv_device", self._camera))
+            self._check_control("is used by another program: end that, or wait some seconds for the camera to notice")
+            for what in ("access", "range"):  # else Aravis sends whatever it is given
+                self._aravis(f"arv_camera_set_{what}_check_policy", self._camera, 1)
+            for feature, value in (features or {}).items():
+                self._set_feature(feature, value)
+            self._format = self._set_format(pixel_format)
+            self._set_region(offset)
+            self._exposure_ns = self._set_timing(trigger)
+            self.description = self._describe()
+            self._stream = self._open_stream(resend, packet_size)
+            self._latch = self._find_latch()
+        except BaseException:
+            self.close()
+            raise
+        self.lacks = (*([] if self._latch else [Lacks.TIME]), *([] if trigger else [Lacks.TRIGGER]))
+
+    def time_ns(self) -> int | None:
+        """The camera's clock, latched now; None where it has no latch, so that nothing compares it with the host's."""
+        return self._latched_ns(self._latch) if self._latch else None
+
+    def start(self, start_ns: int, exposures: int) -> None:
+        for _ in self._stream.pictures():
+            pass  # what is left from before
+        self._start_ns, self._before = start_ns, None
+        self._do("arv_camera_start_acquisition", self._camera, to="be started")
+        self._running = True
+
+    def frames(self) -> Iterator[SimpleFrame]:
+        for picture in self._stream.pictures():
+            frame = self._frame(picture)
+            if frame is not None:
+                yield frame
+        self._check_control("no longer answers, or another program has taken it: is it connected, is its power on?")
+
+    def stop(self) -> None:
+        if self._running:
+            self._running = False
+            self._do("arv_camera_stop_acquisition", self._camera, to="be stopped")
+
+    def statistics(self) -> dict[str, int]:
+        """Counts of its packets by the fields of ``LinkStatistics``, empty for a camera that is not on a network.
+
+        ``sequence_gaps`` are the packets of pictures that are missing in the frames that came.
+        """
+        return self._stream.counts() if self._is_gige else {}
+
+    def close(self) -> None:
+        camera, running = self._camera, self._running
+        self._camera, self._running = None, False
+
+        def release() -> None:
+            if running:
+                with suppress(Refused):
+                    self._aravis("arv_camera_stop_acquisition", camera)
+            if hasattr(self, "_stream"):
+                self._stream.release()
+            self._aravis("g_object_unref", camera)
+
+        if camera:  # one that no longer answers is asked again for many seconds, which nobody need wait for
+            releasing = threading.Thread(target=release, name="aolink-aravis-release", daemon=True)
+            releasing.start()
+            releasing.join(_RELEASE_S)
+
+    # Opening
+
+    def _do(self, name: str, *arguments: Any, to: str) -> Any:
+        """Call a function of Aravis that may fail. Raises DeviceError with ``to``, what the camera was asked to do."""
+        try:
+            return self._aravis(name, *arguments)
+        except Refused as refused:
+            raise DeviceError(f"the camera {self._address} cannot {to}: {refused}") from None
+
+    def _set(self, name: str, *arguments: Any, to: str) -> None:
+        self._do(f"arv_camera_{name}", self._camera, *arguments, to=to)
+
+    def _get(self, name: str, *arguments: Any) -> Any:
+        return self._do(f"arv_camera_{name}", self._camera, *arguments, to=f"be asked ({name})")
+
+    def _only_camera(self) -> str:
+        found = discover()
+        if len(found) != 1:
+            raise DeviceError(
+                "no GenICam camera answers: are its power and cable in, is it in the same network as this machine?"
+                if not found
+                else f"there are {len(found)} cameras, set devices.camera.address to one of them:"
+                f" {'; '.join(f'{address} ({text})' for address, text in found)}"
+            )
+        return found[0][0]
+
+    def _check_control(self, otherwise: str) -> None:
+        if self._is_gige and not self._aravis("arv_gv_device_is_controller", self._device):
+            raise DeviceError(f"the camera {self._address} {otherwise}")
+
+    def _set_feature(self, name: str, value: Any) -> None:
+        node = self._aravis("arv_device_get_feature", self._device, name.encode())
+        if not node:
+            raise DeviceError(f"the camera {self._address} has no feature {name}: correct devices.camera.features")
+        text = str(value).lower() if isinstance(value, bool) else str(value)
+        self._do("arv_gc_feature_node_set_value_from_string", node, text.encode(), to=f"set {name} to {text}")
+
+    def _set_format(self, wanted: str) -> PixelFormat:
+        count = ctypes.c_uint()
+        names = self._get("dup_available_pixel_formats_as_strings", ctypes.byref(count))
+        offered = [names[k].decode() for k in range(count.value)]
+        self._aravis("g_free", names)
+        bits = self._rig.sensor.bit_depth
+        chosen = next(
+            (
+                each
+                for each in PIXEL_FORMATS.values()
+                if each.name in offered and (each.name == wanted if wanted else each.bits == bits)
+            ),
+            None,
+        )
+        if chosen is None:
+            raise DeviceError(
+                f"the camera {self._address} has the pixel formats {', '.join(offered)}, aolink reads"
+                f" {', '.join(PIXEL_FORMATS)}; {wanted or f'one of {bits} bits'} is asked for: correct"
+                " sensor.bit_depth or devices.camera.pixel_format"
+            )
+        self._set("set_pixel_format_from_string", chosen.name.encode(), to=f"give {chosen.name}")
+        return chosen
+
+    def _set_region(self, offset: list[int] | None) -> None:
+        rows, columns = self._shape
+        x, y = offset or (0, 0)
+        if offset is None and self._get("is_region_offset_available"):
+            sensor = [ctypes.c_int(), ctypes.c_int()]
+            self._get("get_sensor_size", *map(ctypes.byref, sensor))
+            steps = self._get("get_x_offset_increment"), self._get("get_y_offset_increment")
+            x, y = (
+                max(whole.value - size, 0) // 2 // max(step, 1) * max(step, 1)
+                for whole, size, step in zip(sensor, (columns, rows), steps, strict=True)
+            )
+        self._set("set_region", x, y, columns, rows, to=f"give {columns} x {rows} pixels at ({x}, {y})")
+        region = [ctypes.c_int() for _ in range(4)]
+        self._get("get_region", *map(ctypes.byref, region))
+        if (got := [each.value for each in region]) != [x, y, columns, rows]:
+            raise DeviceError(
+                f"the camera {self._address} gives {got[2]} x {got[3]} pixels at ({got[0]}, {got[1]}), the rig file"
+                f" asks for {columns} x {rows} at ({x}, {y}): correct [sensor] or devices.camera.offset"
+            )
+
+    def _set_timing(self, trigger: str) -> int:
+        """Exposure time, frame rate or trigger; gives the exposure time that the camera has, ns."""
+        timing = self._rig.timing
+        wanted_ns, rate = timing.exposure_steps * timing.fast_step_ns, 1e9 / self._period_ns
+        for what in ("exposure", "gain"):
+            if self._get(f"is_{what}_auto_available"):
+                self._set("set_exposure_time_auto" if what == "exposure" else "set_gain_auto", 0, to=f"fix its {what}")
+        if self._get("are_chunks_available"):
+            self._set("set_chunk_mode", 0, to="leave out chunks")
+        self._set("set_acquisition_mode", 0, to="go on taking frames")
+        self._set("clear_triggers", to="run freely")
+        if not trigger:
+            self._set("set_frame_rate", rate, to=f"take {rate:g} frames a second")
+        self._set("set_exposure_time", wanted_ns / 1e3, to=f"expose for {wanted_ns / 1e9:g} s")
+        exposure_ns = round(float(self._get("get_exposure_time")) * 1e3)
+        if abs(exposure_ns - wanted_ns) > timing.fast_step_ns / 2:
+            raise DeviceError(
+                f"the camera {self._address} can expose for {exposure_ns / 1e9:g} s, the rig file asks for"
+                f" {wanted_ns / 1e9:g} s: correct timing.exposure_steps"
+            )
+        if trigger:
+            self._set("set_trigger", trigger.encode(), to=f"be triggered by {trigger}")
+        elif abs((has := self._get("get_frame_rate")) / rate - 1) > _RATE_TOLERANCE:
+            raise DeviceError(
+                f"the camera {self._address} can take {has:g} frames a second, the rig file asks for {rate:g}: correct"
+                " timing.frame_period_steps"
+            )
+        return exposure_ns
+
+    def _describe(self) -> str:
+        def said(name: str, *arguments: Any) -> str:
+            try:
+                return (self._aravis(name, self._camera, *arguments) or b"?").decode(errors="replace")
+            except Refused:
+                return "?"
+
+        firmware = next(
+            (each for each in (b"DeviceFirmwareVersion", b"DeviceVersion")
+             if self._get("is_feature_available", each)), None,
+        )  # fmt: skip
+        version = f", firmware {said('arv_camera_get_string', firmware)}" if firmware else ""
+        vendor, model = said("arv_camera_get_vendor_name"), said("arv_camera_get_model_name")
+        serial = said("arv_camera_get_device_serial_number")
+        return f"{vendor} {model}, serial number {serial}{version}, {self._format.name} from {self._address} by Aravis"
+
+    # Frames
+
+    def _open_stream(self, resend: bool, packet_size: int) -> PictureStream:
+        block = 0
+        if self._is_gige:
+            # Packet sockets need privileges, and nothing here needs their speed.
+            self._aravis("arv_camera_gv_set_stream_options", self._camera, 1)
+            if packet_size:
+                self._set("gv_set_packet_size", packet_size, to=f"send packets of {packet_size} bytes")
+        stream = self._do("arv_camera_create_stream", self._camera, None, None, to="be read")
+        if self._is_gige:
+            has = int(self._get("gv_get_packet_size"))
+            block = has - (_PACKET_OVERHEAD_EXTENDED if self._extended_ids() else _PACKET_OVERHEAD)
+        pictures = PictureStream(
+            self._aravis, stream, name=self._address, shape=self._shape, pixel_format=self._format,
+            payload=int(self._get("get_payload")), block=block, period_s=self._period_ns / 1e9,
+        )  # fmt: skip
+        if self._is_gige:
+            pictures.set_resend(resend)
+        return pictures
+
+    def _extended_ids(self) -> bool:
+        feature = b"GevGVSPExtendedIDMode"
+        return bool(self._get("is_feature_available", feature)) and self._get("get_string", feature) == b"On"
+
+    def _frame(self, picture: Picture) -> SimpleFrame | None:
+        """The frame of a picture; None for one from before the session."""
+        # A camera without a latch is timed by the arrival of its pictures, on the clock of SimpleFrame.arrived_ns.
+        arrived_ns = time.monotonic_ns() - (time.time_ns() - picture.leader_ns)
+        number = self._number(picture.frame_id, picture.stamp_ns if self._latch else arrived_ns)
+        since_start_ns = self._exposure_ns if self._stamp_at == "end" else 0
+        start_ns = picture.stamp_ns - since_start_ns if self._latch else None
+        if (arrived_ns - self._exposure_ns if start_ns is None else start_ns) < self._start_ns:
+            return None
+        return SimpleFrame(
+            pixels=picture.pixels, exposure_ns=self._exposure_ns, start_ns=start_ns, arrived_ns=arrived_ns,
+            number=number, mask=picture.mask, chunks_lost=picture.chunks_lost,
+        )  # fmt: skip
+
+    def _number(self, frame_id: int, at_ns: int) -> int:
+        """A frame's number without wrapping. Raises DeviceError where the camera has begun to count anew."""
+        if self._before is None:
+            number = frame_id
+        else:
+            before_id, number, before_ns = self._before
+            further = frame_id - before_id
+            if further < 0 and before_id <= _ID_PERIOD:
+                further += _ID_PERIOD
+            if not 0 <= (further - 1) * self._period_ns <= 2 * (at_ns - before_ns) + _UNSURE_S * 1e9:
+                raise DeviceError(
+                    f"the camera {self._address} numbers a frame {frame_id} that came {(at_ns - before_ns) / 1e9:.3f} s"
+                    f" after number {before_id}: it was started anew, or gives a frame twice"
+                )
+            number += further
+        self._before = frame_id, number, at_ns
+        return number
+
+    # Clock
+
+    def _find_latch(self) -> str:
+        """How the camera's clock is latched: ``registers`` of GigE Vision, a ``feature``, or empty for not at all."""
+        self._ticks_hz = 0
+        if self._is_gige:
+            self._ticks_hz = self._do("arv_gv_device_get_timestamp_tick_frequency", self._device, to="tell the time")
+        feature = self._get("is_feature_available", b"TimestampLatch")
+        for how in [*(["registers"] if self._ticks_hz else []), *(["feature"] if feature else [])]:
+            try:
+                if 0 < self._latched_ns(how) < self._latched_ns(how):
+                    return how
+            except DeviceError:
+                continue
+        return ""
+
+    def _latched_ns(self, how: str) -> int:
+        if how == "feature":
+            self._set("execute_command", b"TimestampLatch", to="latch its clock")
+            return int(self._get("get_integer", b"TimestampLatchValue"))
+        value, to = ctypes.create_string_buffer(8), "tell the time"
+        self._do("arv_device_write_register", self._device, _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, to=to)
+        self._do("arv_device_read_memory", self._device, _TIMESTAMP_VALUE, 8, value, to=to)
+        return int.from_bytes(value.raw, "big") * 10**9 // self._ticks_hz

@@ -1,0 +1,46 @@
+"""GigE cameras that are not there, are taken or cannot do what is asked: one line says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS
+from aolink.errors import AolinkError, DeviceError, RigError
+from aolink.rig import Rig
+from tests.devices.cameras.gige import fast_rig, need_aravis, noise, opened, packed
+from tests.devices.simulators.gige import FAKE, gige_camera
+
+need_aravis()
+
+
+def test_what_cannot_be_opened_is_said_in_one_line(tmp_path: Path) -> None:
+    rig = fast_rig()
+    refused: list[tuple[Rig, dict[str, Any], type[AolinkError], str]] = [
+        (rig, {"address": "127.0.0.9"}, DeviceError, "cannot be opened: Can't connect to device at address"),
+        (rig, {"pixel_format": "Mono12"}, DeviceError, "has the pixel formats .* Mono12 is asked for: correct"),
+        (fast_rig(10), {}, DeviceError, "has the pixel formats .*; one of 10 bits is asked for: correct sensor"),
+        (fast_rig(period_steps=5), {}, DeviceError, "can take 1000 frames a second, the rig file asks for 2000"),
+        (rig, {"offset": [4000, 0]}, DeviceError, r"cannot give 16 x 16 pixels at \(4000, 0\)"),
+        (
+            rig,
+            {"packet_size": 100_000},
+            DeviceError,
+            "cannot send packets of 100000 bytes",
+        ),
+        (rig, {"features": {"GainRav": 3}}, DeviceError, "has no feature GainRav: correct devices.camera.features"),
+        (rig, {"features": {"GainRaw": 300}}, DeviceError, "cannot set GainRaw to 300"),
+        (rig, {"trigger": "Line7"}, DeviceError, "cannot be triggered by Line7"),
+        (rig, {"stamp_at": "middle"}, RigError, "stamp_at is 'middle', expected 'start' or 'end'"),
+        (rig, {"offset": [3]}, RigError, r"offset is \[3\], expected \[column, row\]"),
+        (rig, {"address": 7}, RigError, "address is 7, expected a text"),
+    ]
+    with gige_camera(tmp_path, packed(noise(16, 16), PIXEL_FORMATS["Mono16"]), {}):
+        for each, keys, kind, said in refused:
+            with pytest.raises(kind, match=said) as raised, opened(each, **{"address": FAKE, **keys}):
+                pass
+            assert "\n" not in str(raised.value)
+        with opened(rig), pytest.raises(DeviceError, match="is used by another program"), opened(rig):
+            pass
