@@ -1,0 +1,100 @@
+"""Any deformable mirror of python-microscope: ALPAO, Boston Micromachines, Imagine Optic, or a simulated one."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.devices.mirrors.keys import per_input, scale_per_input, text
+from aolink.devices.simple import Lacks
+from aolink.errors import DeviceError, RigError
+from aolink.extensions import needs_extra
+from aolink.rig import Rig
+
+
+class MicroscopeMirror:
+    """A `DirectMirror` of as many inputs as the device has actuators.
+
+    The device takes numbers from 0 to 1 for each actuator, which are the vendor's full range.
+
+    Parameters
+    ----------
+    device:
+        Path of its class in Python: ``microscope.mirror.alpao.AlpaoDeformableMirror``.
+    settings:
+        The arguments that the class is made with, such as ``serial_number``.
+    unit, zero:
+        Part of the range for an input of one, and that at an input of zero; numbers, or lists of one for each input.
+        By default inputs from -1 to 1 are the whole range.
+
+    Raises
+    ------
+    DeviceError
+        The extra ``microscope`` or the vendor's library is missing, there is no such device, or it has another number
+        of actuators; or the rig's limits go beyond its range.
+    RigError
+        A key is not what it should be.
+    """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG)
+
+    def __init__(
+        self, rig: Rig, *, device: str, settings: dict[str, Any] | None = None, unit: float | list[float] = 0.5,
+        zero: float | list[float] = 0.5,
+    ) -> None:  # fmt: skip
+        self._scale, self._zero = scale_per_input("unit", unit, rig.n_inputs), per_input("zero", zero, rig.n_inputs)
+        ends = self._zero + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
+        if ends.min() < -1e-9 or ends.max() > 1 + 1e-9:
+            raise DeviceError(
+                f"mirror.input_min .. input_max are {ends.min():g} to {ends.max():g} of the device's range by"
+                " devices.mirror.unit and zero, which must be 0 to 1: correct one of them"
+            )
+        make = _class_of(text("device", device))
+        try:
+            self._device = make(**(settings or {}))
+        except Exception as error:  # whatever a vendor's library does
+            raise DeviceError(f"{device} cannot be opened with {settings or 'no settings'}: {error!r}") from error
+        self._park, self.description = rig.mirror.park, f"{device} {settings or ''}".strip()
+        try:
+            if self._device.n_actuators != rig.n_inputs:
+                raise DeviceError(
+                    f"{device} has {self._device.n_actuators} actuators, the rig file's mirror {rig.n_inputs} input(s)"
+                )
+            self.park()
+        except BaseException:
+            self._device.shutdown()
+            raise
+
+    def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        self._device.apply_pattern(np.clip(self._zero + self._scale * u, 0.0, 1.0))
+        return u
+
+    def park(self) -> None:
+        self.put(self._park)
+
+    def close(self) -> None:
+        """Give the device back, at the safe input."""
+        try:
+            self.park()
+        finally:
+            self._device.shutdown()
+
+
+def _class_of(path: str) -> Any:
+    """Raises DeviceError, or RigError for what names no deformable mirror."""
+    with needs_extra("microscope", DeviceError):
+        from microscope.abc import DeformableMirror
+    module, _, name = path.rpartition(".")
+    try:
+        found = getattr(import_module(module), name)
+    except Exception as error:  # a module that is not there, or the vendor's library that it needs
+        raise DeviceError(
+            f"devices.mirror.device: {path} cannot be had ({error!r}): is the name right, and is the vendor's library"
+            " installed?"
+        ) from error
+    if not (isinstance(found, type) and issubclass(found, DeformableMirror)):
+        raise RigError(f"devices.mirror.device: {path} is no deformable mirror of python-microscope")
+    return found

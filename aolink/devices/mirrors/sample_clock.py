@@ -1,0 +1,84 @@
+"""The clock of a device that plays a queue of samples and says only how many it has taken: seen from the host."""
+
+from __future__ import annotations
+
+_DRIFT = 200e-6
+"""No crystal drifts from the host's clock by more, as a part of the time that passes."""
+_SETTLING_S = 2.0
+"""The time told follows what the counts say within some such time, so that it never jumps."""
+_TOLERANCE = 0.05
+"""A count that contradicts the earlier ones by more than this part of a sample is no matter of drift."""
+
+
+class SampleClock:
+    """When sample 0 was put out, by the counts of samples that came after.
+
+    A count of n, true at some time between its question and its answer, says that sample n - 1 was being put out then:
+    sample 0 began n sample periods before at the earliest, and n - 1 at the latest. All counts together leave an
+    interval for that, the narrower the more phases of a sample they were asked in; it widens with time, for the host's
+    clock and the device's drift apart.
+
+    Parameters
+    ----------
+    period_ns:
+        Time of one sample by the device's clock, ns.
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._zero: tuple[float, float] | None = None
+        """Earliest and latest host time at which sample 0 can have begun, less ``_base_ns``, ns."""
+        self._base_ns = self._at_ns = 0
+        self._told_ns = self._rate = 0.0
+        """The host time told for it, less ``_base_ns``, and by how much of the time that passes it moves."""
+
+    def add(self, taken: int, asked_ns: int, answered_ns: int) -> float:
+        """Take a count into account, which was true at some time between two host times.
+
+        Gives 0, or the samples by which the device is behind what the counts before say (above 0) or ahead of it: such
+        a count is not taken into account.
+        """
+        if self._zero is None:
+            self._base_ns = asked_ns - taken * self._period_ns
+            self._zero = 0.0, float(answered_ns - asked_ns + self._period_ns)
+            self._told_ns, self._at_ns = sum(self._zero) / 2, answered_ns
+            return 0.0
+        elapsed_ns = max(answered_ns - self._at_ns, 0)
+        widened = elapsed_ns * _DRIFT
+        earliest = asked_ns - taken * self._period_ns - self._base_ns
+        latest = answered_ns - (taken - 1) * self._period_ns - self._base_ns
+        before = self._zero[0] - widened, self._zero[1] + widened
+        low, high = max(before[0], earliest), min(before[1], latest)
+        if low > high:
+            slip = (low - high) / self._period_ns * (1 if earliest > before[1] else -1)
+            if abs(slip) > _TOLERANCE:
+                return slip
+            low = high = (low + high) / 2
+        self._zero, self._at_ns = (low, high), answered_ns
+        self._follow((low + high) / 2, elapsed_ns)
+        return 0.0
+
+    def doubt(self, by_ns: int) -> None:
+        """The device has stood still meanwhile: what is known of its samples may be wrong by so much."""
+        assert self._zero is not None, "add a count first"
+        self._zero = self._zero[0] - by_ns, self._zero[1] + by_ns
+
+    def time_ns(self, host_ns: int) -> int:
+        """Time since sample 0 began, on the device's clock, at a host time of now, ns."""
+        assert self._zero is not None, "add a count first"
+        moved = self._told_ns + self._rate * (host_ns - self._at_ns)
+        return host_ns - self._base_ns - round(moved)
+
+    def settle(self) -> None:
+        """Tell from now on what the counts say, without regard to what was told: for before anybody has asked."""
+        assert self._zero is not None, "add a count first"
+        self._told_ns = sum(self._zero) / 2
+
+    def _follow(self, middle_ns: float, elapsed_ns: int) -> None:
+        """A phase-locked loop of second order, critically damped: without a lag where the drift is constant."""
+        step = min(elapsed_ns / (_SETTLING_S * 1e9), 0.5)
+        self._told_ns += self._rate * elapsed_ns
+        apart = middle_ns - self._told_ns
+        self._told_ns += 2 * step * apart
+        if elapsed_ns:
+            self._rate += step * step * apart / elapsed_ns

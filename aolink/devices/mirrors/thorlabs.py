@@ -1,0 +1,338 @@
+"""Thorlabs piezo drivers and beam aligners that speak the APT protocol, on the codec of thorlabs-apt-protocol (MIT).
+
+`ThorlabsPiezo` is a KPZ101 cube for each input (or a TPZ001), or the bays of a BPC30x; `ThorlabsAligner` is a KPA101
+(or a TQD001), whose two outputs drive the two axes.
+"""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack, suppress
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.devices.mirrors.keys import per_input, scale_per_input, text
+from aolink.devices.mirrors.line import TIMEOUT_S, Line, shown, usb_ports
+from aolink.devices.mirrors.resolution import check_resolution
+from aolink.devices.simple import Lacks
+from aolink.errors import AolinkError, DeviceError, RigError
+from aolink.extensions import needs_extra
+from aolink.rig import Rig
+
+_BAUD_RATE = 115_200
+_USB_ID = 0x0403, 0xFAF0
+_HOST, _CUBE, _FIRST_BAY = 0x01, 0x50, 0x20
+_CHANNEL = 1
+"""Cubes and bays have one channel each, which has this number."""
+_FULL_SCALE = 32_767
+_OPEN_LOOP, _CLOSED_LOOP = 1, 2
+_CUBE_VOLTS = {1: 75.0, 2: 100.0, 3: 150.0}
+"""What the voltage limit of a cube means."""
+_ALIGNER_VOLTS = 10.0
+_ALIGNER_OPEN_LOOP = 2
+_ALIGNER_OUTPUTS = 0x0D
+"""The part of the aligner's parameters that its outputs are."""
+_ALIGNER_GET, _CODEC_ALIGNER_GET = 0x0872, 0x0870
+"""The aligner's answer, and the number under which version 29 of the codec reads it: that of the command."""
+_QUIET_S = 0.05
+_LONGEST = 255
+
+
+class AptUnit:
+    """A unit at the end of a line: messages to it and from it.
+
+    Parameters
+    ----------
+    address:
+        Of the cube, or of the bay.
+
+    Raises
+    ------
+    DeviceError
+        The extra ``thorlabs`` is not installed.
+    """
+
+    def __init__(self, line: Line, address: int) -> None:
+        with needs_extra("thorlabs", DeviceError):
+            import thorlabs_apt_protocol
+            from thorlabs_apt_protocol.parsing import id_to_func
+        self._codec, self._parsers = thorlabs_apt_protocol, id_to_func
+        self._line, self._address = line, address
+        self.is_cube = address == _CUBE
+
+    def tell(self, name: str, *values: int) -> None:
+        """Send the message of this name in the codec."""
+        self._line.tell(getattr(self._codec, name)(self._address, _HOST, *values))
+
+    def ask(self, name: str, answer: str, *values: int) -> dict[str, Any]:
+        """Send a request, and give the fields of the message that answers it.
+
+        Other messages may come before it: they are thrown away. Raises DeviceError where it does not come in time, or
+        the unit says that something is wrong.
+        """
+        self.tell(name, *values)
+        deadline = time.monotonic() + TIMEOUT_S
+        while True:
+            fields = self._read(max(deadline - time.monotonic(), 0.0))
+            if fields["msg"] in ("hw_response", "hw_richresponse"):
+                notes = bytes(fields.get("notes", b"")).split(b"\0")[0].decode("ascii", "replace")
+                raise DeviceError(
+                    f"the Thorlabs unit at {self._line.url} reports an error as it is asked {name}: code"
+                    f" {fields.get('code', 'unknown')} {notes}".rstrip()
+                )
+            if fields["msg"] == answer and fields["source"] == self._address:
+                return fields
+
+    def drain(self) -> None:
+        """Throw away what is on its way from the unit."""
+        self._line.drain(_QUIET_S)
+
+    def description(self) -> str:
+        """Model, serial number and firmware."""
+        info = self.ask("hw_req_info", "hw_get_info")
+        model = bytes(info["model_number"]).split(b"\0")[0].decode("ascii", "replace").strip()
+        firmware = ".".join(str(each) for each in info["firmware_version"])
+        return f"{model}, serial number {info['serial_number']}, firmware {firmware}"
+
+    def _read(self, timeout_s: float) -> dict[str, Any]:
+        head = self._line.read_exactly(6, timeout_s)
+        number, length, is_long = head[0] | head[1] << 8, head[2] | head[3] << 8, head[4] & 0x80
+        if number == _ALIGNER_GET:
+            head, number = _CODEC_ALIGNER_GET.to_bytes(2, "little") + head[2:], _CODEC_ALIGNER_GET
+        parse = self._parsers.get(number)
+        if parse is None or (is_long and length > _LONGEST):
+            raise DeviceError(
+                f"what is at {self._line.url} sends {shown(head)}, which is no message of Thorlabs' APT protocol that"
+                " this driver knows: is this its port, and does no other program use it?"
+            )
+        data = self._line.read_exactly(length, timeout_s) if is_long else b""
+        try:
+            return dict(parse(head + data))
+        except Exception as error:  # a message of another length than the codec expects
+            raise DeviceError(f"the Thorlabs unit at {self._line.url} sends {shown(head + data)}: {error}") from None
+
+
+class _Output(NamedTuple):
+    """A piezo's channel."""
+
+    unit: AptUnit
+    closed_loop: bool
+    most: float
+    """Volts of full scale, or micrometres in closed loop."""
+
+    def put(self, value: float) -> float:
+        """Put out volts or micrometres; gives what the unit took."""
+        code = int(np.clip(round(value / self.most * _FULL_SCALE), 0, _FULL_SCALE))
+        if self.closed_loop:
+            self.unit.tell("pz_set_outputpos", _CHANNEL, code)
+            self.unit.ask("pz_req_outputpos", "pz_get_outputpos", _CHANNEL)
+        else:
+            self.unit.tell("pz_set_outputvolts", _CHANNEL, code)
+            code = int(self.unit.ask("pz_req_outputvolts", "pz_get_outputvolts", _CHANNEL)["voltage"])
+        return code * self.most / _FULL_SCALE
+
+    def enable(self) -> None:
+        self.unit.tell("mod_set_chanenablestate", _CHANNEL, 1)
+        if not self.unit.ask("mod_req_chanenablestate", "mod_get_chanenablestate", _CHANNEL)["enabled"]:
+            raise DeviceError("the Thorlabs unit does not switch its output on: is its interlock open?")
+
+
+class ThorlabsPiezo:
+    """A `DirectMirror`: an input is a voltage, or in closed loop a position.
+
+    In open loop the unit is asked for its output after each input. In closed loop it is asked for the position, as a
+    sign of life; what counts as held is the position commanded, for the sensor's noise is no input.
+
+    Parameters
+    ----------
+    port:
+        Path of the unit's USB serial port; a list of one for each input, where these are several cubes.
+    bays:
+        Numbers of the bays of a unit that has bays, one for each input.
+    closed_loop:
+        Whether the units follow their strain gauges.
+    travel_um:
+        The actuators' travel in closed loop, where the units are cubes: they do not know it.
+    unit, zero:
+        Volts (micrometres in closed loop) for an input of one, and those at an input of zero; numbers, or lists of one
+        for each input.
+    """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.WATCHDOG,)
+
+    def __init__(
+        self, rig: Rig, *, port: str | list[str], bays: list[int] | None = None, closed_loop: bool = False,
+        travel_um: float | None = None, unit: float | list[float] = 1.0, zero: float | list[float] = 0.0,
+    ) -> None:  # fmt: skip
+        places = _places(port, bays, rig.n_inputs)
+        if closed_loop and not bays and not (isinstance(travel_um, int | float) and travel_um > 0):
+            raise RigError(
+                f"devices.mirror.travel_um: in closed loop cubes need the travel of their actuators, found {travel_um}"
+            )
+        self._scale, self._zero = (scale_per_input("unit", unit, rig.n_inputs), per_input("zero", zero, rig.n_inputs))
+        self._closed_loop, self._travel_um, self._park = closed_loop, travel_um, rig.mirror.park
+        with ExitStack() as opened:
+            self._lines: dict[str, Line] = {}
+            for path, _ in places:
+                if path not in self._lines:
+                    self._lines[path] = Line("the Thorlabs unit", path, _BAUD_RATE)
+                    opened.callback(self._lines[path].close)
+            self._outputs: list[_Output] = []
+            found = []
+            for path, address in places:
+                apt = AptUnit(self._lines[path], address)
+                found.append(_greeted(self._lines[path], apt))
+                self._outputs.append(_Output(apt, closed_loop, self._prepare(apt)))
+            self.description = "Thorlabs " + "; ".join(dict.fromkeys(found))
+            self._check_reach(rig)
+            self.put(self._park)
+            for output in self._outputs:
+                output.enable()
+            opened.pop_all()
+
+    def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        values = (self._zero + self._scale * u).tolist()
+        taken = [output.put(value) for output, value in zip(self._outputs, values, strict=True)]
+        return np.asarray((np.array(taken) - self._zero) / self._scale)
+
+    def park(self) -> None:
+        """Hold the safe input; where one unit is lost, the others do all the same."""
+        lost = None
+        for output, value in zip(self._outputs, (self._zero + self._scale * self._park).tolist(), strict=True):
+            try:
+                output.unit.drain()
+                output.put(value)
+            except AolinkError as error:
+                lost = error
+        if lost is not None:
+            raise lost
+
+    def close(self) -> None:
+        """Give the units back, at the safe input."""
+        with suppress(AolinkError):  # one that is lost has said so before
+            self.park()
+        for line in self._lines.values():
+            line.close()
+
+    def _prepare(self, apt: AptUnit) -> float:
+        """Set the loop and what the output follows; gives the volts or micrometres of full scale."""
+        unit = "um" if self._closed_loop else "V"
+        apt.tell("pz_set_inputvoltssrc", _CHANNEL, 0)  # the host alone: no knob, no other input
+        mode = _CLOSED_LOOP if self._closed_loop else _OPEN_LOOP
+        apt.tell("pz_set_positioncontrolmode", _CHANNEL, mode)
+        found = apt.ask("pz_req_positioncontrolmode", "pz_get_positioncontrolmode", _CHANNEL)["mode"]
+        if found != mode:
+            raise DeviceError(
+                f"the Thorlabs unit stays in control mode {found}, asked for {mode}"
+                f" ({'closed' if self._closed_loop else 'open'} loop): is its strain gauge connected?"
+            )
+        if self._closed_loop and apt.is_cube:
+            most = float(self._travel_um or 0.0)
+        elif self._closed_loop:
+            most = apt.ask("pz_req_maxtravel", "pz_get_maxtravel", _CHANNEL)["travel"] / 10  # it counts 100 nm
+        elif apt.is_cube:
+            limit = apt.ask("pz_req_tpz_iosettings", "pz_get_tpz_iosettings", _CHANNEL)["voltage_limit"]
+            most = _CUBE_VOLTS.get(limit, 0.0)
+        else:
+            most = apt.ask("pz_req_outputmaxvolts", "pz_get_outputmaxvolts", _CHANNEL)["voltage"] / 10
+        if most <= 0:
+            raise DeviceError(f"the Thorlabs unit says that its range is {most:g} {unit}: is an actuator connected?")
+        return float(most)
+
+    def _check_reach(self, rig: Rig) -> None:
+        ends = self._zero + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
+        most = np.array([output.most for output in self._outputs])
+        if (ends < 0).any() or (ends > most * (1 + 1e-9)).any():
+            unit = "um" if self._closed_loop else "V"
+            raise DeviceError(
+                f"mirror.input_min .. input_max are {ends.min():g} to {ends.max():g} {unit} by devices.mirror.unit and"
+                f" zero, the Thorlabs unit goes from 0 to {most.min():g} {unit}: correct one of them"
+            )
+        check_resolution(rig.mirror, np.abs(most / _FULL_SCALE / self._scale), "the Thorlabs unit")
+
+
+class ThorlabsAligner:
+    """A `DirectMirror` of two inputs: the aligner's outputs along x and y, -10 V to 10 V, in open loop.
+
+    Parameters
+    ----------
+    port:
+        Path of the unit's USB serial port.
+    unit, zero:
+        Volts for an input of one, and those at an input of zero; numbers, or lists of two.
+    """
+
+    lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.WATCHDOG,)
+
+    def __init__(
+        self, rig: Rig, *, port: str, unit: float | list[float] = 1.0, zero: float | list[float] = 0.0
+    ) -> None:  # fmt: skip
+        if rig.n_inputs != 2:
+            raise DeviceError(f"the Thorlabs aligner has 2 outputs, x and y; the rig file has {rig.n_inputs} input(s)")
+        self._scale, self._zero = scale_per_input("unit", unit, 2), per_input("zero", zero, 2)
+        self._park, volt = rig.mirror.park, _ALIGNER_VOLTS / _FULL_SCALE
+        ends = self._zero + self._scale * np.array([rig.mirror.input_min, rig.mirror.input_max])
+        if np.abs(ends).max() > _ALIGNER_VOLTS * (1 + 1e-9):
+            raise DeviceError(
+                f"mirror.input_min .. input_max are {ends.min():g} to {ends.max():g} V by devices.mirror.unit and zero,"
+                f" the Thorlabs aligner goes from {-_ALIGNER_VOLTS:g} to {_ALIGNER_VOLTS:g} V: correct one of them"
+            )
+        check_resolution(rig.mirror, np.abs(volt / self._scale), "the Thorlabs aligner")
+        self._line = Line("the Thorlabs aligner", text("port", port), _BAUD_RATE)
+        with ExitStack() as opened:
+            opened.callback(self._line.close)
+            self._apt = AptUnit(self._line, _CUBE)
+            self.description = f"Thorlabs {_greeted(self._line, self._apt)}"
+            self.put(self._park)
+            self._apt.tell("quad_set_opermode", _ALIGNER_OPEN_LOOP)
+            self.put(self._park)
+            opened.pop_all()
+
+    def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        volts = np.clip((self._zero + self._scale * u) / _ALIGNER_VOLTS, -1, 1)
+        self._apt.tell("quad_set_positionoutputs", *(round(each) for each in (volts * _FULL_SCALE).tolist()))
+        found = self._apt.ask("quad_req_positionoutputs", "quad_get_params")
+        if found["submsgid"] != _ALIGNER_OUTPUTS:
+            raise DeviceError(f"the Thorlabs aligner answers with its parameters {found['submsgid']}, not its outputs")
+        taken = np.array([found["x_pos"], found["y_pos"]]) * _ALIGNER_VOLTS / _FULL_SCALE
+        return np.asarray((taken - self._zero) / self._scale)
+
+    def park(self) -> None:
+        self._line.drain(_QUIET_S)
+        self.put(self._park)
+
+    def close(self) -> None:
+        """Give the unit back, at the safe input."""
+        with suppress(AolinkError):
+            self.park()
+        self._line.close()
+
+
+def discover() -> list[tuple[str, str]]:
+    """Ports with a Thorlabs unit that speaks this protocol: (path, description)."""
+    return usb_ports(*_USB_ID)
+
+
+def _places(port: str | list[str], bays: list[int] | None, n_inputs: int) -> list[tuple[str, int]]:
+    """Path and address of each input's unit. Raises RigError."""
+    paths = port if isinstance(port, list) else [port] * (n_inputs if bays else 1)
+    numbers = bays or [0] * len(paths)
+    if not (len(paths) == len(numbers) == n_inputs):
+        raise RigError(
+            f"devices.mirror: the rig file has {n_inputs} input(s), and port = {port!r}, bays = {bays!r} name"
+            f" {min(len(paths), len(numbers))} unit(s): give a list of ports, or of bays, with one for each"
+        )
+    for each in numbers:
+        if not isinstance(each, int) or not 0 <= each <= 10:
+            raise RigError(f"devices.mirror.bays: expected whole numbers from 1 to 10, found {each!r}")
+    return [(text("port", path), _FIRST_BAY + bay if bay else _CUBE) for path, bay in zip(paths, numbers, strict=True)]
+
+
+def _greeted(line: Line, apt: AptUnit) -> str:
+    """Have a unit say nothing but answers; gives its description. Raises DeviceError."""
+    apt.tell("hw_no_flash_programming")
+    apt.tell("hw_stop_updatemsgs")
+    line.drain(_QUIET_S)
+    return apt.description()

@@ -1,0 +1,94 @@
+"""Deformable mirrors of python-microscope, held to its own simulated one: inputs, a session, and what goes wrong."""
+
+from __future__ import annotations
+
+import re
+import sys
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("microscope")
+
+from aolink import estimate
+from aolink.devices.mirrors.microscope import MicroscopeMirror
+from aolink.errors import DeviceError, RigError
+from aolink.recording.reader import Recording
+from aolink.rig import load_rig
+from aolink.session import record
+from tests.devices.mirrors import bench
+from tests.devices.simulators import spot_camera
+from tests.devices.simulators.deformable import WatchedMirror
+
+DEVICE = "tests.devices.simulators.deformable.WatchedMirror"
+RIG = load_rig("tip-tilt")
+
+
+def opened(**keys: Any) -> MicroscopeMirror:
+    return MicroscopeMirror(RIG, **{"device": DEVICE, "settings": {"n_actuators": 2}, **keys})
+
+
+def test_inputs_are_parts_of_the_range_of_each_actuator() -> None:
+    mirror = opened(unit=[0.5, -0.25])
+    device = WatchedMirror.latest
+    np.testing.assert_allclose(device.get_current_pattern(), [0.5, 0.5])
+    np.testing.assert_array_equal(mirror.put(np.array([1.0, 0.5])), [1.0, 0.5])
+    np.testing.assert_allclose(device.get_current_pattern(), [1.0, 0.375])
+    assert mirror.description == f"{DEVICE} {{'n_actuators': 2}}"
+    mirror.close()
+    np.testing.assert_allclose(device.get_current_pattern(), [0.5, 0.5])
+    assert device.is_shut_down
+
+
+@pytest.mark.parametrize(
+    ("keys", "error", "what"),
+    [
+        ({"settings": {"n_actuators": 69}}, DeviceError, r"has 69 actuators, the rig file's mirror 2 input\(s\)"),
+        ({"settings": {"serial": 3}}, DeviceError, "cannot be opened with .*'serial': 3.*TypeError"),
+        ({"unit": 0.6}, DeviceError, "are -0.1 to 1.1 of the device's range by devices.mirror.unit and zero"),
+        ({"unit": "a"}, RigError, "devices.mirror.unit: expected a finite number"),
+        ({"device": "microscope.simulators.SimulatedCamera"}, RigError, "is no deformable mirror of python-microscope"),
+        ({"device": "microscope.mirror.alpao.AlpaoDeformableMirror"}, DeviceError, "cannot be had .LibraryLoadError.*"),
+        ({"device": "nowhere.Mirror"}, DeviceError, "nowhere.Mirror cannot be had .ModuleNotFoundError.*right"),
+        ({"device": "Mirror"}, DeviceError, "Mirror cannot be had"),
+        ({"device": 3}, RigError, "devices.mirror.device: expected a text, found 3"),
+    ],
+)
+def test_what_is_wrong_is_one_line(keys: dict[str, Any], error: type[Exception], what: str) -> None:
+    with pytest.raises(error, match=what):
+        opened(**keys)
+
+
+def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "microscope.abc", None)
+    with pytest.raises(DeviceError, match=re.escape("pip install 'aolink[microscope]'")):
+        opened()
+
+
+def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
+    rig = bench.rig_with(
+        '[devices.camera]\ndriver = "spot"\n'
+        f'[devices.mirror]\ndriver = "microscope"\ndevice = "{DEVICE}"\nsettings = {{ n_actuators = 2 }}'
+    )
+
+    def held(time_ns: int) -> Any:
+        before = [pattern for since_ns, pattern in WatchedMirror.latest.held if since_ns <= time_ns]
+        return 2 * np.array(before[-1]) - 1
+
+    spot_camera.mirror.held = held
+    report = record(rig, None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
+    assert report.ended == "complete"
+    assert WatchedMirror.latest.is_shut_down
+    assert WatchedMirror.latest.held[-1][1] == (0.5, 0.5)
+    ended = report.steps_applied + report.steps_late + report.steps_refused + report.steps_not_reported
+    assert ended + report.steps_superseded == report.steps_commanded == 100
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.metadata["mirror"].startswith(DEVICE)
+    # A frame that came while the mirror was being parked may follow.
+    for exposure, found in islice(zip(recording.exposures(), estimate(recording, "o1"), strict=True), 10):
+        assert exposure.truth is not None
+        assert np.abs(found.path - exposure.truth.path).max() < 0.1  # of 0.3 that the drive moves the spot
