@@ -178,9 +178,9 @@ def _print_scan(loaded: Rig, as_json: bool) -> None:
 
 
 def _print_findings(loaded: Rig, as_json: bool) -> None:
-    from aolink.jobs.check_rig import check_rig
+    from aolink.jobs.check_rig import check_devices, check_rig
 
-    findings = check_rig(loaded)
+    findings = [*check_devices(loaded), *check_rig(loaded)]
     if as_json:
         print(json.dumps([vars(finding) for finding in findings]))
     else:

@@ -223,9 +223,31 @@ def test_a_driver_that_is_not_there_is_one_line(
 
 
 def test_the_drivers_that_there_are_are_listed(aolink: Run, installed: dict[str, str]) -> None:
-    lines = dict(line.split(": ") for line in aolink("devices", env=installed).stdout.splitlines() if "drivers" in line)
-    assert {"native", "bare", "broken", "example"} <= {*lines["camera drivers"].split(", ")}
-    assert {"native", "example"} <= {*lines["mirror drivers"].split(", ")}
+    found = {
+        (each["kind"], each["name"]): each
+        for each in json.loads(aolink("devices", "--json", env=installed).stdout)["drivers"]
+    }
+    assert {("camera", name) for name in ("native", "bare", "broken", "example", "folder")} <= {*found}
+    assert {("mirror", name) for name in ("native", "example", "optotune")} <= {*found}
+    assert "no_such_module" in found["camera", "broken"]["problem"]
+    assert any("queues no inputs" in each for each in found["mirror", "optotune"]["lacks"])
+    text = " ".join(aolink("devices", env=installed).stdout.split())
+    assert "camera driver example" in text
+    assert "mirror driver optotune" in text
+
+
+def test_the_drivers_of_a_rig_file_are_checked_before_anything_is_opened(
+    aolink: Run, installed: dict[str, str], tmp_path: Path
+) -> None:  # fmt: skip
+    rig = rig_file(tmp_path, 'driver = "exmaple"', 'driver = "optotune"\nunit_rd = 3')
+    checked = aolink("rig", rig, "--check", "--json", env=installed)
+    assert checked.returncode == 2
+    errors = {each["key"]: each["message"] for each in json.loads(checked.stdout) if each["severity"] == "error"}
+    assert "there is no camera driver exmaple" in errors["devices.camera"]
+    assert "cannot take these keys" in errors["devices.mirror"]
+    good = aolink("rig", rig_file(tmp_path, mirror=""), "--check", env=installed)
+    assert good.returncode == 0
+    assert "the camera is recorded alone" in " ".join(good.stdout.split())
 
 
 def test_native_devices_may_stand_in_the_rig_file(aolink: Run, tmp_path: Path) -> None:
