@@ -290,7 +290,12 @@ class AdaptedMirror(_Adapted):
         return self.clock.device_ns(host_ns)[0] - self._delay_ns
 
     def step_sigma_ns(self, host_ns: int) -> float:
-        return math.hypot(self.clock.device_ns(host_ns)[1], self._delay_sd_ns)
+        return math.hypot(self.clock.device_ns(host_ns)[1], self._delay_sd_ns, self._driver_sigma_ns())
+
+    def _driver_sigma_ns(self) -> float:
+        """What the driver knows of its own inexactness, unless the rig file says how late its inputs are."""
+        with self._call("when it was asked for its timing"):
+            return 0.0 if self._delay_ns else float(getattr(self._driver, "timing_sigma_ns", 0.0))
 
     def start_step(self, now_ns: int) -> int:
         return self.since_zero_ns(now_ns) // self._step_ns

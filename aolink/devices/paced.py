@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
@@ -13,6 +14,7 @@ from aolink.devices.interfaces import lacks_of
 from aolink.devices.simple import DirectMirror, Held
 from aolink.rig import Rig
 
+_REMEMBERED = 1000
 _LATE = 0.5
 """A step whose input was taken only after this part of it held the one before for longer: it was late."""
 
@@ -43,6 +45,8 @@ class PacedMirror:
         """For all of the above."""
         self._device = threading.Lock()
         """Held while the driver is called; never asked for by who holds ``_changed``."""
+        self._lateness_ns: deque[int] = deque(maxlen=_REMEMBERED)
+        """How long after the beginning of their steps the device had taken its newest inputs."""
         self._parked = self._closed = False
         self._failed: Exception | None = None
         self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
@@ -50,6 +54,12 @@ class PacedMirror:
 
     def time_ns(self) -> int:
         return time.monotonic_ns() - self._zero_ns
+
+    @property
+    def timing_sigma_ns(self) -> float:
+        """Root mean square of how late the device has taken its newest inputs, ns."""
+        with self._changed:
+            return float(np.sqrt(np.mean(np.square(self._lateness_ns)))) if self._lateness_ns else 0.0
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         with self._changed:
@@ -124,7 +134,9 @@ class PacedMirror:
                 return
             taken = self._driver.put(u)
             with self._changed:
-                reached = self.time_ns() / self._step_ns - _LATE
+                taken_ns = self.time_ns()
+                self._lateness_ns.append(taken_ns - step * self._step_ns)
+                reached = taken_ns / self._step_ns - _LATE
                 late = step < reached
                 self._held.append((self._now if late else taken, late))
                 while self._next < reached:  # the device was busy for longer than a step

@@ -82,6 +82,7 @@ def test_each_step_gets_its_input_or_is_late(rig: Rig) -> None:
     assert told[first + 13][0] == rest  # nothing is queued: the safe input
     assert set(np.round(device.given, 6)) <= {*np.round(wanted, 6), rest}
     assert device.closed == 1
+    assert mirror.timing_sigma_ns > 0
 
 
 def test_a_device_that_is_busy_goes_on_with_the_newest_step(rig: Rig) -> None:

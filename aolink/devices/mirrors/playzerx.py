@@ -178,6 +178,10 @@ class PlayzerX:
         self._thread = threading.Thread(target=self._run, name="aolink-playzerx", daemon=True)
         self._thread.start()
 
+    @property
+    def timing_sigma_ns(self) -> float:
+        return self._clock.sigma_ns
+
     def time_ns(self) -> int:
         return self._clock.time_ns(time.monotonic_ns())
 

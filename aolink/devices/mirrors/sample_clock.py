@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 _DRIFT = 200e-6
 """No crystal drifts from the host's clock by more, as a part of the time that passes."""
 _SETTLING_S = 2.0
@@ -68,6 +70,16 @@ class SampleClock:
         assert self._zero is not None, "add a count first"
         moved = self._told_ns + self._rate * (host_ns - self._at_ns)
         return host_ns - self._base_ns - round(moved)
+
+    @property
+    def sigma_ns(self) -> float:
+        """Standard deviation of the time told, ns: that of the interval which the counts leave, and how far it is off.
+
+        The line's asymmetry, at most half a round trip, does not show in the counts.
+        """
+        assert self._zero is not None, "add a count first"
+        earliest, latest = self._zero
+        return math.hypot((latest - earliest) / math.sqrt(12), self._told_ns - (earliest + latest) / 2)
 
     def settle(self) -> None:
         """Tell from now on what the counts say, without regard to what was told: for before anybody has asked."""

@@ -43,7 +43,7 @@ def test_the_time_is_known_to_a_part_of_a_sample(seed: int, drift: float) -> Non
     device = Device(seed, drift, 200_000)
     assert not any(device.count() for _ in range(30))
     device.clock.settle()
-    before = None
+    before, scores = None, []
     for _ in range(2000):
         assert device.count() == 0
         told_ns = device.clock.time_ns(device.now_ns)
@@ -51,6 +51,8 @@ def test_the_time_is_known_to_a_part_of_a_sample(seed: int, drift: float) -> Non
         if before is not None:  # it never jumps, and is never far from the host's rate
             assert abs((told_ns - before[0]) / (device.now_ns - before[1]) - 1) < 1e-3
         before = told_ns, device.now_ns
+        scores.append((told_ns - device.true_ns) / device.clock.sigma_ns)
+    assert sum(abs(score) < 3 for score in scores) > 0.95 * len(scores)
 
 
 @pytest.mark.parametrize("lost", [1, 3, -2])
