@@ -15,6 +15,7 @@ from typing import Any
 
 from aolink.devices.cameras.aravis_library import Aravis, Refused
 from aolink.devices.cameras.aravis_stream import Picture, PictureStream
+from aolink.devices.cameras.pictures import checked_corner
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError, RigError
@@ -64,8 +65,8 @@ class AravisCamera:
         file's rate.
     stamp_at:
         What the camera's time stamp marks of an exposure, its ``start`` or its ``end``: its manual says which.
-    offset:
-        Left column and upper row of the picture on the camera's sensor; None for the middle.
+    corner:
+        Upper row and left column of the picture on the camera's sensor; None for the middle.
     resend:
         Whether packets that were lost are asked for again. A frame that stays incomplete then comes a tenth of a
         second late, and without it when the next one begins.
@@ -86,7 +87,7 @@ class AravisCamera:
 
     def __init__(
         self, rig: Rig, *, address: str = "", pixel_format: str = "", trigger: str = "", stamp_at: str = "start",
-        offset: list[int] | None = None, resend: bool = True, packet_size: int = 0,
+        corner: list[int] | None = None, resend: bool = True, packet_size: int = 0,
         features: dict[str, Any] | None = None,
     ) -> None:  # fmt: skip
         for key, value, kind, called in (
@@ -98,9 +99,7 @@ class AravisCamera:
                 raise RigError(f"devices.camera.{key} is {value!r}, expected {called}")
         if stamp_at not in ("start", "end"):
             raise RigError(f"devices.camera.stamp_at is {stamp_at!r}, expected 'start' or 'end'")
-        whole = isinstance(offset, list) and all(isinstance(each, int) and each >= 0 for each in offset)
-        if offset is not None and not (whole and len(offset) == 2):
-            raise RigError(f"devices.camera.offset is {offset!r}, expected [column, row]")
+        place = checked_corner(corner)
         self._rig, self._shape, self._stamp_at = rig, rig.sensor.shape, stamp_at
         timing = rig.timing
         self._period_ns = timing.frame_period_steps * timing.fast_step_ns
@@ -121,7 +120,7 @@ class AravisCamera:
             for feature, value in (features or {}).items():
                 self._set_feature(feature, value)
             self._format = self._set_format(pixel_format)
-            self._set_region(offset)
+            self._set_region(place)
             self._exposure_ns = self._set_timing(trigger)
             self.description = self._describe()
             self._stream = self._open_stream(resend, packet_size)
@@ -238,10 +237,10 @@ class AravisCamera:
         self._set("set_pixel_format_from_string", chosen.name.encode(), to=f"give {chosen.name}")
         return chosen
 
-    def _set_region(self, offset: list[int] | None) -> None:
+    def _set_region(self, corner: tuple[int, int] | None) -> None:
         rows, columns = self._shape
-        x, y = offset or (0, 0)
-        if offset is None and self._get("is_region_offset_available"):
+        y, x = corner or (0, 0)
+        if corner is None and self._get("is_region_offset_available"):
             sensor = [ctypes.c_int(), ctypes.c_int()]
             self._get("get_sensor_size", *map(ctypes.byref, sensor))
             steps = self._get("get_x_offset_increment"), self._get("get_y_offset_increment")
@@ -255,7 +254,7 @@ class AravisCamera:
         if (got := [each.value for each in region]) != [x, y, columns, rows]:
             raise DeviceError(
                 f"the camera {self._address} gives {got[2]} x {got[3]} pixels at ({got[0]}, {got[1]}), the rig file"
-                f" asks for {columns} x {rows} at ({x}, {y}): correct [sensor] or devices.camera.offset"
+                f" asks for {columns} x {rows} at ({x}, {y}): correct [sensor] or devices.camera.corner"
             )
 
     def _set_timing(self, trigger: str) -> int:

@@ -23,7 +23,7 @@ def test_what_cannot_be_opened_is_said_in_one_line(tmp_path: Path) -> None:
         (rig, {"pixel_format": "Mono12"}, DeviceError, "has the pixel formats .* Mono12 is asked for: correct"),
         (fast_rig(10), {}, DeviceError, "has the pixel formats .*; one of 10 bits is asked for: correct sensor"),
         (fast_rig(period_steps=5), {}, DeviceError, "can take 1000 frames a second, the rig file asks for 2000"),
-        (rig, {"offset": [4000, 0]}, DeviceError, r"cannot give 16 x 16 pixels at \(4000, 0\)"),
+        (rig, {"corner": [0, 4000]}, DeviceError, r"cannot give 16 x 16 pixels at \(4000, 0\)"),
         (
             rig,
             {"packet_size": 100_000},
@@ -34,7 +34,7 @@ def test_what_cannot_be_opened_is_said_in_one_line(tmp_path: Path) -> None:
         (rig, {"features": {"GainRaw": 300}}, DeviceError, "cannot set GainRaw to 300"),
         (rig, {"trigger": "Line7"}, DeviceError, "cannot be triggered by Line7"),
         (rig, {"stamp_at": "middle"}, RigError, "stamp_at is 'middle', expected 'start' or 'end'"),
-        (rig, {"offset": [3]}, RigError, r"offset is \[3\], expected \[column, row\]"),
+        (rig, {"corner": [3]}, DeviceError, r"corner is \[3\], expected the row and the column"),
         (rig, {"address": 7}, RigError, "address is 7, expected a text"),
     ]
     with gige_camera(tmp_path, packed(noise(16, 16), PIXEL_FORMATS["Mono16"]), {}):
