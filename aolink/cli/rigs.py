@@ -459,8 +459,8 @@ def _replay_to_rig(
 
 
 @app.command(
-    epilog="Examples: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml;"
-    " aolink calibrate --interaction --camera PORT --mirror PORT --rig my.toml -o interaction.npz"
+    epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml,"
+    " or aolink calibrate --interaction --camera PORT --mirror PORT --rig my.toml -o interaction.npz"
 )
 def calibrate(
     rig: Annotated[
@@ -507,8 +507,10 @@ def calibrate(
     loaded = load_rig(rig)
     if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
         raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
-    suffix = ".npz" if interaction else ""
-    check_target(output, overwrite=overwrite, sources=files or [], suffix=suffix, error=CalibrationError)
+    if interaction:
+        check_target(output, overwrite=overwrite, sources=files or [], suffix=".npz", error=CalibrationError)
+    else:
+        check_target(output, overwrite=overwrite, sources=files or [])
     folder = keep or Path(mkdtemp(prefix="aolink-"))
     try:
         if files:

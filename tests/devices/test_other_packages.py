@@ -14,6 +14,7 @@ import pytest
 
 from aolink import estimate as estimate_exposures
 from aolink.errors import DeviceError
+from aolink.extensions import installed as installed_packages
 from aolink.jobs.demo import simulated_rig
 from aolink.recording import topics
 from aolink.recording.reader import Recording
@@ -170,6 +171,7 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(tmp_path: Path, monk
     """The mirror is parked, the camera stopped, both are closed, and the recording is whole."""
     (tmp_path / "failing.py").write_text(FAILING)
     points = "[aolink.cameras]\nfailing = failing:Camera\n[aolink.mirrors]\nexample = aolink_example.devices:Mirror\n"
+    installed_packages.cache_clear()
     info = tmp_path / "failing-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: failing\nVersion: 1.0\n")

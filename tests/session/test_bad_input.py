@@ -323,7 +323,7 @@ def test_a_command_beyond_the_limits_is_refused_by_the_host_and_by_the_device() 
             u = np.array([[0.0], [value]])
             with pytest.raises(DeviceError, match=r"input 0 at fast step 1 is .*, beyond the mirror's limits"):
                 mirror.send_block(0, u, 0, hub.now_ns())
-        mirror.identity.mirror.input_max[0] = 1.0  # a host that believes in other limits
+        rig.mirror.input_max[0] = 1.0  # a host that believes in other limits
         mirror.send_block(0, np.array([[0.06]]), 0, hub.now_ns())
         ((_, refusal),) = hub.wait(1.0)
         (answered,) = mirror.handle(refusal)
