@@ -414,6 +414,9 @@ class AdaptedMirror(_Adapted):
         """Give the device back, parked."""
         self._guarding = False
         self._closed.set()
+        if self._next is not None and self._parked_from == math.inf:  # parking it failed, or was interrupted
+            with suppress(AolinkError), self._call("when it was told to park"):
+                self._driver.park()
         with self._call("when it was closed"):
             self._driver.close()
 
@@ -431,8 +434,10 @@ class AdaptedMirror(_Adapted):
 
     def _watch(self) -> None:
         while self._guarding and not self._closed.wait(self._watchdog_ns / 4e9):
-            silent_ns = time.monotonic_ns() - self._polled_ns
-            if silent_ns <= self._watchdog_ns or self.latched:
+            if time.monotonic_ns() - self._polled_ns <= self._watchdog_ns or self.latched:
                 continue
             with suppress(AolinkError), self._call("when its watchdog parked it"):
-                self._safe, self.outage_s = (int(self._driver.park()), math.inf), silent_ns / 1e9
+                # The session may have had the driver until now: have polled, parked or closed it.
+                silent_ns = time.monotonic_ns() - self._polled_ns
+                if self._guarding and silent_ns > self._watchdog_ns:
+                    self._safe, self.outage_s = (int(self._driver.park()), math.inf), silent_ns / 1e9

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -282,6 +283,40 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     bench.reports = [(10, np.concatenate([held(10), np.tile(rig.mirror.park, (21, 1)), held(4)]))]
     assert ends(mirror) == [(1, 10, 10, 0), (0, 20, 21, pb.Applied.WATCHDOG), (3, 41, 4, 0)]
     mirror.close()
+
+
+@pytest.mark.parametrize("commanded", [True, False])
+def test_a_mirror_that_could_not_be_parked_is_parked_when_it_is_closed(commanded: bool) -> None:
+    mirror, parked = mirror_of(bench := Bench()), []
+
+    def park() -> int:
+        parked.append(True)
+        if len(parked) == 1:
+            raise DeviceError("no answer")
+        return 7
+
+    bench.park = park  # type: ignore[method-assign]
+    if commanded:
+        mirror.send_block(0, np.full((8, 1), 0.01), 0, 0)
+        with pytest.raises(DeviceError, match="no answer"):
+            mirror.park()
+    mirror.close()
+    assert len(parked) == 2 * commanded
+
+
+def test_the_watchdog_leaves_alone_a_mirror_that_was_closed_while_it_waited_for_the_driver() -> None:
+    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
+    calls, bench = [], Bench()
+    bench.park = lambda: calls.append("park") or 7  # type: ignore[method-assign, func-returns-value]
+    bench.close = lambda: (time.sleep(0.3), calls.append("close"))  # type: ignore[method-assign, assign, func-returns-value]
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
+    bench.time_ns = lambda: time.sleep(0.3) or 0  # type: ignore[method-assign, func-returns-value]
+    mirror.query_clock(bench.host_ns)  # the watchdog waits for the driver meanwhile
+    mirror.close()
+    time.sleep(0.1)
+    assert calls[-1] == "close"
 
 
 def test_a_command_that_changes_too_fast_is_refused() -> None:
