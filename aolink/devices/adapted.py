@@ -21,7 +21,7 @@ from aolink.devices.arrival import Arrivals
 from aolink.devices.clock import ClockExchange, ClockRegression
 from aolink.devices.drivers import calling
 from aolink.devices.gate import CommandLimits, converter_margin, printable
-from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Mirror, lacks_of
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Lacks, Mirror, lacks_of
 from aolink.devices.simple import Held, SimpleCamera, SimpleFrame, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
@@ -293,9 +293,14 @@ class AdaptedMirror(_Adapted):
         return math.hypot(self.clock.device_ns(host_ns)[1], self._delay_sd_ns, self._driver_sigma_ns())
 
     def _driver_sigma_ns(self) -> float:
-        """What the driver knows of its own inexactness, unless the rig file says how late its inputs are."""
+        """What the driver knows of its own inexactness.
+
+        Of a mirror without a queue that is how late its inputs are, which the rig file may say instead.
+        """
+        if self._delay_ns and Lacks.QUEUE in self.lacks:
+            return 0.0
         with self._call("when it was asked for its timing"):
-            return 0.0 if self._delay_ns else float(getattr(self._driver, "timing_sigma_ns", 0.0))
+            return float(getattr(self._driver, "timing_sigma_ns", 0.0))
 
     def start_step(self, now_ns: int) -> int:
         return self.since_zero_ns(now_ns) // self._step_ns

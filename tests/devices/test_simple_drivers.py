@@ -328,6 +328,17 @@ def test_a_command_that_changes_too_fast_is_refused() -> None:
     mirror.send_block(2, np.array([[0.003], [0.004]]), 0, 0)
 
 
+@pytest.mark.parametrize(("lacks", "expected"), [((), 3e6), ((Lacks.QUEUE,), 0.0)])
+def test_a_delay_says_how_late_inputs_are_and_not_how_well_a_queues_time_is_known(
+    lacks: tuple[Lacks, ...], expected: float
+) -> None:
+    bench = Bench()
+    bench.lacks, bench.timing_sigma_ns = lacks, 3e6  # type: ignore[attr-defined]
+    mirror = AdaptedMirror(RIG, bench, Delay(mean_s=0.001, sd_s=0.0), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    assert mirror.step_sigma_ns(bench.host_ns) == pytest.approx(expected, abs=2e3)
+
+
 class CameraWithoutTime(CameraBench):
     lacks = (Lacks.TIME, Lacks.COUNT)
 
