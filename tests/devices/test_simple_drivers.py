@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
 from aolink.devices.interfaces import CommandAnswered, Event
+from aolink.devices.opening import open_devices
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.rig import load_rig
-from aolink.rig.device_tables import Delay
+from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.session.account import Account
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as pb
@@ -382,3 +383,35 @@ def test_a_camera_that_repeats_a_number_is_refused(camera: AdaptedCamera, bench:
     bench.taken = [SimpleFrame(pixels=pixels, exposure_ns=EXPOSURE_NS, start_ns=bench.time_ns(), number=10)]
     with pytest.raises(DeviceError, match="the camera numbers a frame 10 after number 10"):
         camera.poll()
+
+
+@pytest.mark.parametrize(
+    ("lacks", "what", "closed"),
+    [
+        ((), r"the driver of the camera failed when it was opened: OSError\('no clock'\)", ["camera", "mirror"]),
+        (("wings",), "the driver of the mirror failed when it was opened: ValueError", ["mirror"]),
+    ],
+)
+def test_a_driver_that_turns_out_to_be_of_no_use_is_closed(
+    lacks: tuple[str, ...], what: str, closed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    were_closed: list[str] = []
+
+    class Driver(Bench):
+        def __init__(self, kind: str) -> None:
+            super().__init__()
+            self.kind, self.lacks = kind, lacks if kind == "mirror" else ()
+
+        def time_ns(self) -> int:
+            if self.kind == "camera":
+                raise OSError("no clock")
+            return super().time_ns()
+
+        def close(self) -> None:
+            were_closed.append(self.kind)
+
+    monkeypatch.setattr("aolink.devices.opening.open_driver", lambda kind, table, rig: Driver(kind))
+    tables = {kind: DeviceTable(driver="bench", options={}) for kind in ("camera", "mirror")}
+    with pytest.raises(DeviceError, match=what), open_devices(replace(RIG, devices=tables)):
+        pass
+    assert were_closed == closed
