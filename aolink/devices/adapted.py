@@ -108,6 +108,7 @@ class AdaptedCamera(_Adapted):
         self._last: tuple[int, int] | None = None
         """The id of the frame before, and its start on the camera's clock."""
         self._first_number = 0
+        self._failed: AolinkError | None = None
 
     def _read_clock(self) -> int:
         device_ns = self._driver.time_ns()
@@ -149,12 +150,19 @@ class AdaptedCamera(_Adapted):
             self._driver.close()
 
     def poll(self) -> list[Event]:
-        """What has happened since the last call."""
+        """What has happened since the last call. What the driver raises comes after the frames before it."""
+        if self._failed is not None:
+            raise self._failed
         events = self._take_events()
         if self._running:
-            with calling(self.name, "when it was asked for its frames"):
-                for frame in self._driver.frames():
-                    events += self._take(frame, self._now_ns())
+            try:
+                with calling(self.name, "when it was asked for its frames"):
+                    for frame in self._driver.frames():
+                        events += self._take(frame, self._now_ns())
+            except AolinkError as error:
+                if not events:
+                    raise
+                self._failed = error
         return events
 
     def _take(self, raw: SimpleFrame, now_ns: int) -> list[Event]:
@@ -389,6 +397,8 @@ class AdaptedMirror(_Adapted):
         if self._next is None or end <= self._next:
             return []
         unknown = pb.Applied(first_step=self._next, n_steps=end - self._next, source=pb.Applied.NOT_REPORTED)
+        for step in range(self._next, end):
+            self._commanded.pop(step, None)
         self._next = end
         return [unknown]
 

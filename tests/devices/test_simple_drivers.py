@@ -245,6 +245,16 @@ def test_a_frame_that_is_not_of_this_rig_is_refused(
         camera.poll()
 
 
+def test_frames_that_come_together_with_a_bad_one_are_given_before_its_error(
+    camera: AdaptedCamera, bench: CameraBench
+) -> None:
+    bench.taken = [frame(100 * STEP_NS), frame(100 * STEP_NS + PERIOD_NS, exposure_ns=1)]
+    assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1]
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="the camera exposes for 1e-09 s"):
+            camera.poll()
+
+
 def test_a_frame_that_comes_as_the_camera_stops_is_given_once(camera: AdaptedCamera, bench: CameraBench) -> None:
     bench.taken = [frame(100 * STEP_NS)]
     camera.stop()
