@@ -262,12 +262,13 @@ class AdaptedMirror(_Adapted):
 
     def __init__(self, rig: Rig, driver: SimpleMirror, delay: Delay, now_ns: Callable[[], int]) -> None:
         super().__init__("mirror", driver, delay, now_ns)
-        self.outage_s = 0.0
         self._rig, self._driver, self._limits = rig, driver, CommandLimits(rig)
         self._lock = threading.Lock()
         """Held while the driver is called."""
         self._watchdog_ns = round(rig.mirror.watchdog_s * 1e9)
         self._polled_ns = time.monotonic_ns()
+        self._left_ns: int | None = None
+        """When it was polled last before the watchdog parked it; None while it is not latched."""
         self._safe: tuple[float, float] = (math.inf, math.inf)
         """First fast step of the safe state that the watchdog asked for, and the step at which it was re-armed."""
         self._closed, self._guarding = threading.Event(), False
@@ -285,6 +286,10 @@ class AdaptedMirror(_Adapted):
     @property
     def latched(self) -> bool:
         return self._safe[0] < math.inf == self._safe[1]
+
+    @property
+    def outage_s(self) -> float:
+        return 0.0 if self._left_ns is None else (time.monotonic_ns() - self._left_ns) / 1e9
 
     def _read_clock(self) -> int:
         with self._call("when it was asked for the time"):
@@ -422,7 +427,7 @@ class AdaptedMirror(_Adapted):
     def rearm(self) -> int:
         with self._call("when it was asked for the time"):
             step = int(self._driver.time_ns()) // self._step_ns + 1
-        self._safe = self._safe[0], step
+        self._safe, self._left_ns = (self._safe[0], step), None
         return step
 
     def close(self) -> None:
@@ -453,6 +458,8 @@ class AdaptedMirror(_Adapted):
                 continue
             with suppress(AolinkError), self._call("when its watchdog parked it"):
                 # The session may have had the driver until now: have polled, parked or closed it.
-                silent_ns = time.monotonic_ns() - self._polled_ns
-                if self._guarding and silent_ns > self._watchdog_ns:
-                    self._safe, self.outage_s = (int(self._driver.park()), math.inf), silent_ns / 1e9
+                left_ns = self._polled_ns
+                if self._guarding and time.monotonic_ns() - left_ns > self._watchdog_ns:
+                    step = int(self._driver.park())
+                    self._left_ns = left_ns
+                    self._safe = step, math.inf
