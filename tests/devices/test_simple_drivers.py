@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame
+from aolink.devices import discovery
 from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
 from aolink.devices.interfaces import CommandAnswered, Event
 from aolink.devices.opening import open_devices
@@ -427,3 +428,15 @@ def test_a_driver_that_turns_out_to_be_of_no_use_is_closed(
     with pytest.raises(DeviceError, match=what), open_devices(replace(RIG, devices=tables)):
         pass
     assert were_closed == closed
+
+
+def test_a_driver_with_an_unknown_lack_is_a_line_among_those_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Driver:
+        lacks = ("wings",)
+
+    monkeypatch.setattr(discovery, "driver_names", lambda kind: ["odd"])
+    monkeypatch.setattr(discovery, "load_driver", lambda kind, name: Driver)
+    problems = [found.problem for found in discovery.find_drivers()]
+    assert [problem.split(":")[0] for problem in problems] == [
+        f"the driver of the {kind} failed when it was asked what its devices lack" for kind in ("camera", "mirror")
+    ]
