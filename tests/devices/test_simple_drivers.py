@@ -322,7 +322,12 @@ def test_the_watchdog_leaves_alone_a_mirror_that_was_closed_while_it_waited_for_
     rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
     calls, bench = [], Bench()
     bench.park = lambda: calls.append("park") or 7  # type: ignore[method-assign, func-returns-value]
-    bench.close = lambda: (time.sleep(0.3), calls.append("close"))  # type: ignore[method-assign, assign, func-returns-value]
+
+    def close() -> None:
+        time.sleep(0.3)
+        calls.append("close")
+
+    bench.close = close  # type: ignore[method-assign]
     mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
     mirror.query_clock(bench.host_ns)
     mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
