@@ -21,7 +21,7 @@ from aolink.devices.arrival import Arrivals
 from aolink.devices.clock import ClockExchange, ClockRegression
 from aolink.devices.drivers import calling
 from aolink.devices.gate import CommandLimits, converter_margin, printable
-from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Mirror, lacks_of
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Lacks, Mirror, lacks_of
 from aolink.devices.simple import Held, SimpleCamera, SimpleFrame, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
@@ -108,6 +108,7 @@ class AdaptedCamera(_Adapted):
         self._last: tuple[int, int] | None = None
         """The id of the frame before, and its start on the camera's clock."""
         self._first_number = 0
+        self._failed: AolinkError | None = None
 
     def _read_clock(self) -> int:
         device_ns = self._driver.time_ns()
@@ -149,12 +150,19 @@ class AdaptedCamera(_Adapted):
             self._driver.close()
 
     def poll(self) -> list[Event]:
-        """What has happened since the last call."""
+        """What has happened since the last call. What the driver raises comes after the frames before it."""
+        if self._failed is not None:
+            raise self._failed
         events = self._take_events()
         if self._running:
-            with calling(self.name, "when it was asked for its frames"):
-                for frame in self._driver.frames():
-                    events += self._take(frame, self._now_ns())
+            try:
+                with calling(self.name, "when it was asked for its frames"):
+                    for frame in self._driver.frames():
+                        events += self._take(frame, self._now_ns())
+            except AolinkError as error:
+                if not events:
+                    raise
+                self._failed = error
         return events
 
     def _take(self, raw: SimpleFrame, now_ns: int) -> list[Event]:
@@ -254,12 +262,13 @@ class AdaptedMirror(_Adapted):
 
     def __init__(self, rig: Rig, driver: SimpleMirror, delay: Delay, now_ns: Callable[[], int]) -> None:
         super().__init__("mirror", driver, delay, now_ns)
-        self.outage_s = 0.0
         self._rig, self._driver, self._limits = rig, driver, CommandLimits(rig)
         self._lock = threading.Lock()
         """Held while the driver is called."""
         self._watchdog_ns = round(rig.mirror.watchdog_s * 1e9)
         self._polled_ns = time.monotonic_ns()
+        self._left_ns: int | None = None
+        """When it was polled last before the watchdog parked it; None while it is not latched."""
         self._safe: tuple[float, float] = (math.inf, math.inf)
         """First fast step of the safe state that the watchdog asked for, and the step at which it was re-armed."""
         self._closed, self._guarding = threading.Event(), False
@@ -278,6 +287,10 @@ class AdaptedMirror(_Adapted):
     def latched(self) -> bool:
         return self._safe[0] < math.inf == self._safe[1]
 
+    @property
+    def outage_s(self) -> float:
+        return 0.0 if self._left_ns is None else (time.monotonic_ns() - self._left_ns) / 1e9
+
     def _read_clock(self) -> int:
         with self._call("when it was asked for the time"):
             return int(self._driver.time_ns())
@@ -293,9 +306,14 @@ class AdaptedMirror(_Adapted):
         return math.hypot(self.clock.device_ns(host_ns)[1], self._delay_sd_ns, self._driver_sigma_ns())
 
     def _driver_sigma_ns(self) -> float:
-        """What the driver knows of its own inexactness, unless the rig file says how late its inputs are."""
+        """What the driver knows of its own inexactness.
+
+        Of a mirror without a queue that is how late its inputs are, which the rig file may say instead.
+        """
+        if self._delay_ns and Lacks.QUEUE in self.lacks:
+            return 0.0
         with self._call("when it was asked for its timing"):
-            return 0.0 if self._delay_ns else float(getattr(self._driver, "timing_sigma_ns", 0.0))
+            return float(getattr(self._driver, "timing_sigma_ns", 0.0))
 
     def start_step(self, now_ns: int) -> int:
         return self.since_zero_ns(now_ns) // self._step_ns
@@ -384,6 +402,8 @@ class AdaptedMirror(_Adapted):
         if self._next is None or end <= self._next:
             return []
         unknown = pb.Applied(first_step=self._next, n_steps=end - self._next, source=pb.Applied.NOT_REPORTED)
+        for step in range(self._next, end):
+            self._commanded.pop(step, None)
         self._next = end
         return [unknown]
 
@@ -407,13 +427,16 @@ class AdaptedMirror(_Adapted):
     def rearm(self) -> int:
         with self._call("when it was asked for the time"):
             step = int(self._driver.time_ns()) // self._step_ns + 1
-        self._safe = self._safe[0], step
+        self._safe, self._left_ns = (self._safe[0], step), None
         return step
 
     def close(self) -> None:
         """Give the device back, parked."""
         self._guarding = False
         self._closed.set()
+        if self._next is not None and self._parked_from == math.inf:  # parking it failed, or was interrupted
+            with suppress(AolinkError), self._call("when it was told to park"):
+                self._driver.park()
         with self._call("when it was closed"):
             self._driver.close()
 
@@ -431,8 +454,12 @@ class AdaptedMirror(_Adapted):
 
     def _watch(self) -> None:
         while self._guarding and not self._closed.wait(self._watchdog_ns / 4e9):
-            silent_ns = time.monotonic_ns() - self._polled_ns
-            if silent_ns <= self._watchdog_ns or self.latched:
+            if time.monotonic_ns() - self._polled_ns <= self._watchdog_ns or self.latched:
                 continue
             with suppress(AolinkError), self._call("when its watchdog parked it"):
-                self._safe, self.outage_s = (int(self._driver.park()), math.inf), silent_ns / 1e9
+                # The session may have had the driver until now: have polled, parked or closed it.
+                left_ns = self._polled_ns
+                if self._guarding and time.monotonic_ns() - left_ns > self._watchdog_ns:
+                    step = int(self._driver.park())
+                    self._left_ns = left_ns
+                    self._safe = step, math.inf

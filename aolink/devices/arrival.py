@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -12,6 +13,9 @@ _LEAST = 4
 """Frames from which their jitter is known; before, each stands for itself."""
 _OUTLIER = 3.0
 """A frame that arrived this many times the median deviation later than the others was held up on its way."""
+_EARLY = 0.25
+"""A frame comes no more than this part of a period earlier than the others' delay has it, but it may be held up for
+longer: what arrives less than 1.75 periods after the frame before should have is the next frame."""
 
 
 class Arrivals:
@@ -27,13 +31,22 @@ class Arrivals:
         self._period_ns = period_ns
         self._seen: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
         """Counts of frames, and when they arrived."""
+        self._usual_ns = 0
+        """When the newest would have arrived with the usual delay."""
 
     def count_at(self, arrived_ns: int) -> int:
         """The count of a frame that arrives now from a camera that does not count, from 1 on."""
         if not self._seen:
             return 1
         before, before_ns = self._seen[-1]
-        return before + max(round((arrived_ns - before_ns) / self._period_ns), 1)
+        if len(self._seen) < _LEAST:
+            return before + max(round((arrived_ns - before_ns) / self._period_ns), 1)
+        ahead = math.floor((arrived_ns - self._usual_ns) / self._period_ns + _EARLY)
+        # The gap that was seen before the newest was none: that frame was held up.
+        if (over := min(1 - ahead, before - self._seen[-2][0] - 1)) > 0:
+            newest = self._seen.pop()
+            self._seen = deque([*((frame + over, at) for frame, at in self._seen), newest], maxlen=_WINDOW)
+        return before + max(ahead, 1)
 
     def add(self, frame: int, arrived_ns: int) -> tuple[int, float]:
         """Take a frame; gives when it would have arrived with the usual delay, and the standard deviation, ns."""
@@ -45,7 +58,8 @@ class Arrivals:
             # Another rhythm: the camera was stopped, or its rate has changed.
             self._seen = deque(list(self._seen)[-_LEAST:], maxlen=_WINDOW)
             late, sd, _ = self._line(frames[-_LEAST:], offset_ns[-_LEAST:])
-        return arrived_ns + round(late), sd
+        self._usual_ns = arrived_ns + round(late)
+        return self._usual_ns, sd
 
     def _line(
         self, frames: NDArray[np.float64], offset_ns: NDArray[np.float64]

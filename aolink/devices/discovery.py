@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 from serial.tools import list_ports as serial_ports
 
-from aolink.devices.drivers import KINDS, NATIVE, Kind, driver_names, load_driver
+from aolink.devices.drivers import KINDS, NATIVE, Kind, calling, driver_names, load_driver
+from aolink.devices.gate import printable
 from aolink.devices.identity import identify
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
@@ -65,14 +66,15 @@ def _find(kind: Kind, name: str) -> DriverFound:
         return DriverFound(kind=kind, name=name)
     try:
         driver = load_driver(kind, name)
+        with calling(kind, "when it was asked what its devices lack"):
+            lacks = [str(each) for each in lacks_of(driver)]
     except AolinkError as error:
         return DriverFound(kind=kind, name=name, problem=str(error))
-    lacks = [str(each) for each in lacks_of(driver)]
     discover = getattr(sys.modules.get(getattr(driver, "__module__", "")), "discover", None)
     try:
         devices = [(str(address), str(text)) for address, text in discover()] if discover else []
     except Exception as error:  # a library of the maker's that is missing or broken
-        return DriverFound(kind=kind, name=name, lacks=lacks, problem=f"it cannot look for devices: {error}")
+        return DriverFound(kind=kind, name=name, lacks=lacks, problem=printable(f"it cannot look for devices: {error}"))
     return DriverFound(kind=kind, name=name, lacks=lacks, devices=devices)
 
 

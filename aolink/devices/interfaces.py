@@ -135,8 +135,9 @@ class Mirror(Device, Protocol):
     def latched(self) -> bool:
         """Whether the watchdog has parked the mirror: it takes no command until `rearm`."""
 
-    outage_s: float
-    """How long the mirror had taken no command when it reported that it is latched, s; 0 at the start of a session."""
+    @property
+    def outage_s(self) -> float:
+        """How long a mirror that is latched had taken no command when the session found out, s; 0 at its start."""
 
     @property
     def last_sent_ns(self) -> int:

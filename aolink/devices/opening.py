@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
-from aolink.devices.drivers import KINDS, NATIVE, Kind, driver_names, open_driver
+from aolink.devices.drivers import KINDS, NATIVE, Kind, calling, driver_names, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import check_against_rig, check_kind, identify
@@ -94,25 +94,39 @@ def _table(rig: Rig, kind: Kind, port: str | None) -> DeviceTable | None:
 
 def _open_mirror(rig: Rig, table: DeviceTable, host: Host, stack: ExitStack) -> AdaptedMirror:
     driver = open_driver("mirror", table, rig)
-    if hasattr(driver, "put"):
-        _check_whole("mirror", table, driver, DirectMirror)
-        driver = PacedMirror(rig, driver)
-    else:
-        _check_whole("mirror", table, driver, SimpleMirror)
-    mirror = AdaptedMirror(rig, driver, table.delay or Delay(), host.now_ns)
-    stack.callback(mirror.close)
+    with _closing_what_fails("mirror", lambda: driver.close()):
+        if hasattr(driver, "put"):
+            _check_whole("mirror", table, driver, DirectMirror)
+            driver = PacedMirror(rig, driver)
+        else:
+            _check_whole("mirror", table, driver, SimpleMirror)
+        mirror = AdaptedMirror(rig, driver, table.delay or Delay(), host.now_ns)
+        stack.callback(mirror.close)
     return mirror
 
 
 def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack: ExitStack) -> AdaptedCamera:
     driver = open_driver("camera", table, rig)
-    _check_whole("camera", table, driver, SimpleCamera)
-    tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_steps * rig.timing.fast_step_s
-    # Where nothing is known of when a frame arrives, it is some time within the frame period after its exposure.
-    delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))
-    camera = AdaptedCamera(rig, driver, mirror, delay, host.now_ns)
-    stack.callback(camera.close)
+    with _closing_what_fails("camera", lambda: driver.close()):
+        _check_whole("camera", table, driver, SimpleCamera)
+        tells_time, period_s = driver.time_ns() is not None, rig.timing.frame_period_steps * rig.timing.fast_step_s
+        # Where nothing is known of when a frame arrives, it is some time within the frame period after its exposure.
+        delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))
+        camera = AdaptedCamera(rig, driver, mirror, delay, host.now_ns)
+        stack.callback(camera.close)
     return camera
+
+
+@contextmanager
+def _closing_what_fails(kind: Kind, close: Callable[[], None]) -> Iterator[None]:
+    """Close a driver that turns out to be of no use. Raises DeviceError for whatever it raises."""
+    try:
+        with calling(kind, "when it was opened"):
+            yield
+    except BaseException:
+        with suppress(Exception):  # it may lack that as well
+            close()
+        raise
 
 
 def _port(kind: Kind, table: DeviceTable) -> str:
@@ -162,11 +176,9 @@ def _open_native(
 
 
 def _check_whole(kind: Kind, table: DeviceTable, driver: Any, protocol: type) -> None:
-    """Refuse, and close, a driver that has not all of ``protocol``. Raises DeviceError."""
+    """Refuse a driver that has not all of ``protocol``. Raises DeviceError."""
     asked = [name for name in (*protocol.__annotations__, *vars(protocol)) if not name.startswith("_")]
     if lacking := [name for name in asked if not hasattr(driver, name)]:
-        with suppress(Exception):  # it may lack that as well
-            driver.close()
         raise DeviceError(
             f"the {kind} driver {table.driver} lacks {', '.join(lacking)}: see {protocol.__name__} in"
             " aolink.devices.simple"

@@ -85,8 +85,11 @@ class PacedMirror:
         with self._device:
             self._driver.park()
             with self._changed:
-                self._now = self._park
-                return max(self._next, self.time_ns() // self._step_ns + 1)
+                first = max(self._next, self.time_ns() // self._step_ns + 1)
+                # Until now it went on holding its input, also in the step whose input the thread waits to put out.
+                self._held += [(self._now, True)] * (first - self._told - len(self._held))
+                self._next, self._now = first, self._park
+                return first
 
     def close(self) -> None:
         with self._changed:
@@ -128,10 +131,12 @@ class PacedMirror:
 
     def _put(self, step: int, u: NDArray[np.float64]) -> None:
         with self._device:
-            if self._parked:
-                with self._changed:
+            with self._changed:
+                if self._told + len(self._held) == self._next:  # it was parked meanwhile, which accounts for the step
+                    return
+                if self._parked:
                     self._held.append((self._now, True))
-                return
+                    return
             taken = self._driver.put(u)
             with self._changed:
                 taken_ns = self.time_ns()

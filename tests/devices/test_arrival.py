@@ -36,6 +36,24 @@ def test_frames_that_are_not_counted_are_counted_by_their_arrival() -> None:
     assert counts == [1, 2, 3, 6, 7]
 
 
+@pytest.mark.parametrize("held_up", [0.6, 0.9, 1.4])
+def test_a_frame_that_was_held_up_does_not_move_those_after_it(held_up: float) -> None:
+    """What is held up for long looks like the frame after a lost one, but only until the next arrives."""
+    rng = np.random.default_rng(5)
+    arrivals, counts = Arrivals(PERIOD_NS), []
+    for k in range(1, 60):
+        true_ns = k * PERIOD_NS
+        at_ns = true_ns + round(rng.normal(0.0, 1e6)) + round(held_up * PERIOD_NS) * (k == 30)
+        at_ns = max(at_ns, true_ns + round((held_up - 1) * PERIOD_NS) + 1_000_000 if k == 31 else 0)
+        counts.append(arrivals.count_at(at_ns))
+        smoothed_ns, sd_ns = arrivals.add(counts[-1], at_ns)
+        if k > 31:
+            assert abs(smoothed_ns - true_ns) < max(6 * sd_ns, 2e6)
+            assert sd_ns < 2e6
+    assert (np.diff(counts) >= 1).all()
+    assert counts[-1] == (59 if held_up < 0.75 else 60)
+
+
 def test_another_rhythm_begins_anew() -> None:
     arrivals = Arrivals(PERIOD_NS)
     for k in range(1, 20):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from aolink import estimate as estimate_exposures
+from aolink import extensions
 from aolink.errors import DeviceError
 from aolink.extensions import installed as installed_packages
 from aolink.jobs.demo import simulated_rig
@@ -167,7 +168,9 @@ class Camera(Example):
 """
 
 
-def test_a_driver_that_fails_ends_the_session_in_good_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_driver_that_fails_ends_the_session_in_good_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     """The mirror is parked, the camera stopped, both are closed, and the recording is whole."""
     (tmp_path / "failing.py").write_text(FAILING)
     points = "[aolink.cameras]\nfailing = failing:Camera\n[aolink.mirrors]\nexample = aolink_example.devices:Mirror\n"
@@ -178,6 +181,8 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(tmp_path: Path, monk
     (info / "entry_points.txt").write_text(points)
     monkeypatch.syspath_prepend(EXAMPLE)
     monkeypatch.syspath_prepend(tmp_path)
+    extensions.installed.cache_clear()  # an earlier test may have asked, and later ones must not find these
+    request.addfinalizer(extensions.installed.cache_clear)
     rig = load_rig(rig_file(tmp_path, 'driver = "failing"'))
     what = r"the driver of the camera failed when it was asked for its frames: OSError\('the camera was pulled out'\)"
     with pytest.raises(DeviceError, match=what):

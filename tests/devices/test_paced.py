@@ -52,13 +52,13 @@ class Device:
         self.closed += 1
 
 
-def reports(mirror: PacedMirror, end: int) -> list[tuple[float, bool]]:
-    """What the mirror held in each step before ``end``, and whether it was late."""
+def reports(mirror: PacedMirror, end: int, first: int = 0) -> list[tuple[float, bool]]:
+    """What the mirror held in each step from ``first`` to ``end``, and whether it was late."""
     told: list[tuple[float, bool]] = []
-    while len(told) < end:
+    while first + len(told) < end:
         for held in mirror.applied():
             assert isinstance(held, Held)
-            assert held.first_step == len(told)
+            assert held.first_step == first + len(told)
             assert held.late is not None
             told += zip(held.u[:, 0].tolist(), held.late.tolist(), strict=True)
         time.sleep(0.002)
@@ -127,3 +127,19 @@ def test_what_the_device_raises_reaches_the_session(rig: Rig) -> None:
     mirror.park()
     mirror.close()
     assert (device.parked, device.closed) == (1, 1)
+
+
+def test_the_steps_in_which_it_is_being_parked_hold_the_input_before(rig: Rig) -> None:
+    mirror = PacedMirror(rig, device := Device())
+    step_ns = rig.timing.fast_step_ns
+    first = mirror.time_ns() // step_ns + 3
+    mirror.send(first, np.full((50, 1), 0.01))
+    told = reports(mirror, first + 3)
+    asked = mirror.time_ns() // step_ns
+    device.park = lambda: time.sleep(0.2)  # type: ignore[method-assign] # ten steps
+    safe = mirror.park()
+    told += reports(mirror, safe + 3, len(told))
+    mirror.close()
+    assert safe - asked >= 10
+    assert {held for held, _ in told[asked + 1 : safe]} == {0.01}
+    assert {held for held, _ in told[safe:]} == {float(rig.mirror.park[0])}

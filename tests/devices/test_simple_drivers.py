@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -14,12 +15,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame
+from aolink.devices import discovery
 from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
 from aolink.devices.interfaces import CommandAnswered, Event
+from aolink.devices.opening import open_devices
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.rig import load_rig
-from aolink.rig.device_tables import Delay
+from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.session.account import Account
 from aolink.session.report import Report
 from aolink.wire import messages_pb2 as pb
@@ -243,6 +246,16 @@ def test_a_frame_that_is_not_of_this_rig_is_refused(
         camera.poll()
 
 
+def test_frames_that_come_together_with_a_bad_one_are_given_before_its_error(
+    camera: AdaptedCamera, bench: CameraBench
+) -> None:
+    bench.taken = [frame(100 * STEP_NS), frame(100 * STEP_NS + PERIOD_NS, exposure_ns=1)]
+    assert [event.frame_id for event in camera.poll() if isinstance(event, Frame)] == [1]
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="the camera exposes for 1e-09 s"):
+            camera.poll()
+
+
 def test_a_frame_that_comes_as_the_camera_stops_is_given_once(camera: AdaptedCamera, bench: CameraBench) -> None:
     bench.taken = [frame(100 * STEP_NS)]
     camera.stop()
@@ -271,7 +284,9 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     assert parked.wait(30.0)
     while not mirror.latched:
         pass
-    assert mirror.outage_s > 0.05
+    time.sleep(0.2)
+    mirror.poll()
+    assert mirror.outage_s > 0.25  # until the session is back, not until it was parked
     mirror.send_block(30, np.full((5, 1), 0.01), 0, 0)
     (answered,) = mirror.poll()
     assert isinstance(answered, CommandAnswered)
@@ -284,6 +299,45 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     mirror.close()
 
 
+@pytest.mark.parametrize("commanded", [True, False])
+def test_a_mirror_that_could_not_be_parked_is_parked_when_it_is_closed(commanded: bool) -> None:
+    mirror, parked = mirror_of(bench := Bench()), []
+
+    def park() -> int:
+        parked.append(True)
+        if len(parked) == 1:
+            raise DeviceError("no answer")
+        return 7
+
+    bench.park = park  # type: ignore[method-assign]
+    if commanded:
+        mirror.send_block(0, np.full((8, 1), 0.01), 0, 0)
+        with pytest.raises(DeviceError, match="no answer"):
+            mirror.park()
+    mirror.close()
+    assert len(parked) == 2 * commanded
+
+
+def test_the_watchdog_leaves_alone_a_mirror_that_was_closed_while_it_waited_for_the_driver() -> None:
+    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
+    calls, bench = [], Bench()
+    bench.park = lambda: calls.append("park") or 7  # type: ignore[method-assign, func-returns-value]
+
+    def close() -> None:
+        time.sleep(0.3)
+        calls.append("close")
+
+    bench.close = close  # type: ignore[method-assign]
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
+    bench.time_ns = lambda: time.sleep(0.3) or 0  # type: ignore[method-assign, func-returns-value]
+    mirror.query_clock(bench.host_ns)  # the watchdog waits for the driver meanwhile
+    mirror.close()
+    time.sleep(0.1)
+    assert calls[-1] == "close"
+
+
 def test_a_command_that_changes_too_fast_is_refused() -> None:
     rig = replace(RIG, mirror=replace(RIG.mirror, slew_max_per_s=0.001 / RIG.timing.fast_step_s))
     mirror = AdaptedMirror(rig, bench := Bench(), Delay(), bench.now_ns)
@@ -291,6 +345,17 @@ def test_a_command_that_changes_too_fast_is_refused() -> None:
     with pytest.raises(DeviceError, match=r"input 0 changes by 0.0015 to fast step 3, more than mirror.slew_max_per_s"):
         mirror.send_block(2, np.array([[0.003], [0.0045]]), 0, 0)
     mirror.send_block(2, np.array([[0.003], [0.004]]), 0, 0)
+
+
+@pytest.mark.parametrize(("lacks", "expected"), [((), 3e6), ((Lacks.QUEUE,), 0.0)])
+def test_a_delay_says_how_late_inputs_are_and_not_how_well_a_queues_time_is_known(
+    lacks: tuple[Lacks, ...], expected: float
+) -> None:
+    bench = Bench()
+    bench.lacks, bench.timing_sigma_ns = lacks, 3e6  # type: ignore[attr-defined]
+    mirror = AdaptedMirror(RIG, bench, Delay(mean_s=0.001, sd_s=0.0), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    assert mirror.step_sigma_ns(bench.host_ns) == pytest.approx(expected, abs=2e3)
 
 
 class CameraWithoutTime(CameraBench):
@@ -336,3 +401,47 @@ def test_a_camera_that_repeats_a_number_is_refused(camera: AdaptedCamera, bench:
     bench.taken = [SimpleFrame(pixels=pixels, exposure_ns=EXPOSURE_NS, start_ns=bench.time_ns(), number=10)]
     with pytest.raises(DeviceError, match="the camera numbers a frame 10 after number 10"):
         camera.poll()
+
+
+@pytest.mark.parametrize(
+    ("lacks", "what", "closed"),
+    [
+        ((), r"the driver of the camera failed when it was opened: OSError\('no clock'\)", ["camera", "mirror"]),
+        (("wings",), "the driver of the mirror failed when it was opened: ValueError", ["mirror"]),
+    ],
+)
+def test_a_driver_that_turns_out_to_be_of_no_use_is_closed(
+    lacks: tuple[str, ...], what: str, closed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    were_closed: list[str] = []
+
+    class Driver(Bench):
+        def __init__(self, kind: str) -> None:
+            super().__init__()
+            self.kind, self.lacks = kind, lacks if kind == "mirror" else ()
+
+        def time_ns(self) -> int:
+            if self.kind == "camera":
+                raise OSError("no clock")
+            return super().time_ns()
+
+        def close(self) -> None:
+            were_closed.append(self.kind)
+
+    monkeypatch.setattr("aolink.devices.opening.open_driver", lambda kind, table, rig: Driver(kind))
+    tables = {kind: DeviceTable(driver="bench", options={}) for kind in ("camera", "mirror")}
+    with pytest.raises(DeviceError, match=what), open_devices(replace(RIG, devices=tables)):
+        pass
+    assert were_closed == closed
+
+
+def test_a_driver_with_an_unknown_lack_is_a_line_among_those_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Driver:
+        lacks = ("wings",)
+
+    monkeypatch.setattr(discovery, "driver_names", lambda kind: ["odd"])
+    monkeypatch.setattr(discovery, "load_driver", lambda kind, name: Driver)
+    problems = [found.problem for found in discovery.find_drivers()]
+    assert [problem.split(":")[0] for problem in problems] == [
+        f"the driver of the {kind} failed when it was asked what its devices lack" for kind in ("camera", "mirror")
+    ]

@@ -180,10 +180,12 @@ class PlayzerX:
 
     @property
     def timing_sigma_ns(self) -> float:
-        return self._clock.sigma_ns
+        with self._changed:
+            return self._clock.sigma_ns
 
     def time_ns(self) -> int:
-        return self._clock.time_ns(time.monotonic_ns())
+        with self._changed:
+            return self._clock.time_ns(time.monotonic_ns())
 
     def send(self, first_step: int, u: NDArray[np.float64]) -> int:
         codes = codes_of(u)
