@@ -51,7 +51,7 @@ def test_the_workers_of_a_killed_batch_end_and_the_next_run_does_it_all(
     shutil.copy(recorded.path, tmp_path / "a.mcap")
     batch = ("estimate", "a.mcap", "-e", "o1", "--set", "plant.process_noise=1,2,3,4,5,6", "--jobs", "2", "-o", "out")
     with started(tmp_path, *batch) as process:
-        wait_for(lambda: [*tmp_path.glob("out/*.partial"), *tmp_path.glob("out/.*.partial")], process)
+        wait_for(lambda: [*tmp_path.glob("out/.*.mcap.*")], process)
         children = psutil.Process(process.pid).children(recursive=True)
         assert len(children) >= 2
         process.kill()

@@ -122,6 +122,8 @@ class Relay:
 
     def _picture(self, data: bytes) -> None:
         faults = self._faults
+        if not self._port:  # the host has closed its stream
+            return
         frame_id, kind = struct.unpack_from(">HB", data, 2)
         packet_id = struct.unpack_from(">I", data, 4)[0] & 0xFFFFFF
         if kind == LEADER:
