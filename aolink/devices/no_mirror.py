@@ -93,9 +93,11 @@ class NoMirror:
 
     def _passed(self, at_least: int) -> list[Event]:
         """The fast steps that have passed since the last call and are ``at_least`` so many."""
+        if self._told is None:  # nor is the camera's clock known
+            return []
         step_ns, park = self._rig.timing.fast_step_ns, self._rig.mirror.park
         end = self.since_zero_ns(self._now_ns()) // step_ns
-        if self._told is None or end - self._told < at_least:
+        if end - self._told < at_least:
             return []
         first, self._told = self._told, end
         return [
