@@ -64,7 +64,7 @@ class Effort:
 FULL = Effort()
 QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
-    limit_runs=2, limit_exposures=4, limit_skip=1, o1_runs=4, o1_exposures=4, particles=100, film_exposures=3,
+    limit_runs=2, limit_exposures=4, limit_skip=1, o1_runs=4, o1_exposures=4, particles=150, film_exposures=3,
     made_kinds=(3, 4), made_seeds=1, made_exposures=5,
     offsets=(0.0, 0.5), densities=(0.1, 0.01), process_noises=(0.1, 10.0), frequencies=100, dpi=70,
 )  # fmt: skip
