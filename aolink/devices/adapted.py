@@ -103,15 +103,18 @@ class AdaptedCamera(_Adapted):
         self._step_ns = rig.timing.fast_step_ns
         self._period_ns = rig.timing.frame_period_steps * self._step_ns
         self._arrivals = Arrivals(self._period_ns)
-        self._running = False
+        self._running = self._tells_time = False
         self._first_step = 0
         self._last: tuple[int, int] | None = None
         """The id of the frame before, and its start on the camera's clock."""
+        self._end_step = 0
+        """The first step after the exposure before."""
         self._first_number = 0
         self._failed: AolinkError | None = None
 
     def _read_clock(self) -> int:
         device_ns = self._driver.time_ns()
+        self._tells_time = device_ns is not None
         return self._monotonic_ns() if device_ns is None else int(device_ns)
 
     def start(self, first_step: int, exposures: int) -> bool:
@@ -124,7 +127,7 @@ class AdaptedCamera(_Adapted):
         margin_ns = _START_SIGMA * math.hypot(sigma_ns, self._mirror.clock.device_ns(now_ns)[1])
         with calling(self.name, "when it was told to start"):
             self._driver.start(start_ns + round(min(margin_ns, self._step_ns)), exposures)
-        self._first_step, self._running = first_step, True
+        self._first_step, self._end_step, self._running = first_step, 0, True
         return True
 
     def stop(self) -> None:
@@ -180,15 +183,18 @@ class AdaptedCamera(_Adapted):
         self._last = frame_id, start_ns
         # To the nearest part of a step, so that a camera in step with the mirror is not now before it, now after it.
         parts = round(self._mirror.since_zero_ns(host_start_ns) * _OFFSETS / self._step_ns)
+        if parts == self._end_step * _OFFSETS - 1:  # exposures do not overlap: that is the clocks' error
+            parts += 1
         first_step, part = divmod(parts, _OFFSETS)
         if first_step < self._first_step:  # what the camera had still kept from before
             self._last = None
             return []
+        self._end_step = first_step + timing.exposure_steps
         own_sigma_ns = math.hypot(sigma_ns, jitter_ns)
         frame = Frame(
             frame_id=frame_id,
             first_step=first_step,
-            last_step=first_step + timing.exposure_steps - 1,
+            last_step=self._end_step - 1,
             pixels=pixels.astype(np.uint16, copy=False),
             mask=np.ones(pixels.shape, dtype=np.bool_) if raw.mask is None else raw.mask,
             chunks_lost=raw.chunks_lost,
@@ -240,6 +246,11 @@ class AdaptedCamera(_Adapted):
         """Start of a frame's exposure on the camera's clock, and its standard deviation without the clock's, ns."""
         if raw.start_ns is not None:
             return raw.start_ns, 0.0
+        if self._tells_time:
+            raise DeviceError(
+                f"the driver of {self.description} gives a frame without start_ns although its time_ns() tells the"
+                " camera's time: it must say when the exposure started, or tell no time (None)"
+            )
         # Ids begin anew with each frame from before the session: the camera's own count goes on.
         count = frame_id if raw.number is None else raw.number
         arrived_ns, sd_ns = self._arrivals.add(count, self._arrival_of(raw))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -32,6 +32,14 @@ STEP_NS = RIG.timing.fast_step_ns
 EXPOSURE_NS, PERIOD_NS = RIG.timing.exposure_steps * STEP_NS, RIG.timing.frame_period_steps * STEP_NS
 EPOCH_NS = 1_767_225_600_000_000_000
 CAMERA_ZERO_NS = 777_000_000
+PATIENCE_S = 10.0
+
+
+def eventually(happened: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not happened():
+        assert time.monotonic() < until_s
+        time.sleep(0.001)
 
 
 class Bench:
@@ -185,9 +193,13 @@ def bench() -> CameraBench:
 
 @pytest.fixture
 def camera(bench: CameraBench) -> AdaptedCamera:
-    """Started at fast step 100."""
-    mirror_bench = Bench()
-    camera = AdaptedCamera(RIG, bench, mirror_of(mirror_bench), Delay(), bench.now_ns)
+    return started(bench)
+
+
+def started(bench: CameraBench) -> AdaptedCamera:
+    """Started at fast step 100; frames arrive by the clock that the camera tells, or would tell."""
+    monotonic_ns = lambda: CameraBench.time_ns(bench)  # noqa: E731
+    camera = AdaptedCamera(RIG, bench, mirror_of(Bench()), Delay(), bench.now_ns, monotonic_ns)
     camera.query_clock(bench.host_ns)
     camera.poll()
     assert camera.start(100, 0)
@@ -220,8 +232,18 @@ def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench:
     assert all(f.last_step + 1 - f.first_step == RIG.timing.exposure_steps for f in frames)
 
 
-def test_arrivals_before_a_session_are_apart_from_its_own(camera: AdaptedCamera, bench: CameraBench) -> None:
+def test_exposures_without_a_pause_do_not_overlap_by_the_clocks_error(
+    camera: AdaptedCamera, bench: CameraBench
+) -> None:
+    """Each begins with the end of the one before, as well as the clocks can be compared."""
+    bench.taken = [frame((100 + 200 * k) * STEP_NS - k % 3 * STEP_NS // 40) for k in range(9)]
+    frames = [event for event in camera.poll() if isinstance(event, Frame)]
+    assert [(f.first_step, f.exposure_offset_ns) for f in frames] == [(100 + 200 * k, 0) for k in range(9)]
+
+
+def test_arrivals_before_a_session_are_apart_from_its_own() -> None:
     """Of a camera that counts its frames and tells no time, which runs before the session does."""
+    camera = started(bench := CameraWithoutTime())
     ends_ns = [100 * STEP_NS + (k + 1) * PERIOD_NS for k in range(-6, 2)]
     bench.taken = [
         frame(0, start_ns=None, arrived_ns=CAMERA_ZERO_NS + end_ns, number=9 + k) for k, end_ns in enumerate(ends_ns)
@@ -236,6 +258,7 @@ def test_arrivals_before_a_session_are_apart_from_its_own(camera: AdaptedCamera,
         ({"pixels": np.zeros((2, 3), np.uint16)}, r"the camera gives \(2, 3\) pixels from 0 to 0, the rig file says"),
         ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: correct"),
         ({"start_ns": CAMERA_ZERO_NS + 10**12}, "a frame whose exposure ends in the future"),
+        ({"start_ns": None}, r"the driver of bench gives a frame without start_ns although its time_ns\(\) tells"),
     ],
 )
 def test_a_frame_that_is_not_of_this_rig_is_refused(
@@ -281,9 +304,8 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     mirror.query_clock(bench.host_ns)
     mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
     mirror.poll()
-    assert parked.wait(30.0)
-    while not mirror.latched:
-        pass
+    assert parked.wait(PATIENCE_S)
+    eventually(lambda: mirror.latched)
     time.sleep(0.2)
     mirror.poll()
     assert mirror.outage_s > 0.25  # until the session is back, not until it was parked
@@ -296,6 +318,40 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     mirror.send_block(41, np.full((4, 1), 0.01), 0, 0)
     bench.reports = [(10, np.concatenate([held(10), np.tile(rig.mirror.park, (21, 1)), held(4)]))]
     assert ends(mirror) == [(1, 10, 10, 0), (0, 20, 21, pb.Applied.WATCHDOG), (3, 41, 4, 0)]
+    mirror.close()
+
+
+def test_a_mirror_that_the_session_serves_is_left_alone_by_the_watchdog() -> None:
+    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=1.0))
+    bench, parked = Bench(), []
+    bench.park = lambda: parked.append(True) or 0  # type: ignore[method-assign, func-returns-value]
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
+    until_s = time.monotonic() + 0.6
+    while time.monotonic() < until_s:
+        mirror.poll()
+        time.sleep(0.005)  # as a session
+    assert (parked, mirror.latched) == ([], False)
+    mirror.close()
+
+
+def test_the_watchdog_watches_again_once_it_was_re_armed_and_no_longer_once_the_session_has_parked() -> None:
+    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
+    bench, parked = Bench(), []
+    bench.park = lambda: parked.append(True) or 0  # type: ignore[method-assign, func-returns-value]
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
+    for times in (1, 2):
+        eventually(lambda: mirror.latched)
+        time.sleep(0.1)
+        assert len(parked) == times  # it parks once
+        mirror.rearm()
+    mirror.park()
+    before = len(parked)
+    time.sleep(0.3)
+    assert len(parked) == before
     mirror.close()
 
 
