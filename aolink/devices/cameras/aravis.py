@@ -10,7 +10,7 @@ import ctypes
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from aolink.devices.cameras.aravis_library import Aravis, Refused
@@ -184,7 +184,8 @@ class AravisCamera:
         try:
             return self._aravis(name, *arguments)
         except Refused as refused:
-            raise DeviceError(f"the camera {self._address} cannot {to}: {refused}") from None
+            advice = ", is it connected, and is its power on?" if "timeout" in str(refused) else ""
+            raise DeviceError(f"the camera {self._address} cannot {to}: {refused}{advice}") from None
 
     def _set(self, name: str, *arguments: Any, to: str) -> None:
         self._do(f"arv_camera_{name}", self._camera, *arguments, to=to)
@@ -312,15 +313,18 @@ class AravisCamera:
             if packet_size:
                 self._set("gv_set_packet_size", packet_size, to=f"send packets of {packet_size} bytes")
         stream = self._do("arv_camera_create_stream", self._camera, None, None, to="be read")
-        if self._is_gige:
-            has = int(self._get("gv_get_packet_size"))
-            block = has - (_PACKET_OVERHEAD_EXTENDED if self._extended_ids() else _PACKET_OVERHEAD)
-        pictures = PictureStream(
-            self._aravis, stream, name=self._address, shape=self._shape, pixel_format=self._format,
-            payload=int(self._get("get_payload")), block=block, period_s=self._period_ns / 1e9,
-        )  # fmt: skip
-        if self._is_gige:
-            pictures.set_resend(resend)
+        with ExitStack() as opened:
+            opened.callback(self._aravis, "g_object_unref", stream)
+            if self._is_gige:
+                has = int(self._get("gv_get_packet_size"))
+                block = has - (_PACKET_OVERHEAD_EXTENDED if self._extended_ids() else _PACKET_OVERHEAD)
+            pictures = PictureStream(
+                self._aravis, stream, name=self._address, shape=self._shape, pixel_format=self._format,
+                payload=int(self._get("get_payload")), block=block, period_s=self._period_ns / 1e9,
+            )  # fmt: skip
+            if self._is_gige:
+                pictures.set_resend(resend)
+            opened.pop_all()
         return pictures
 
     def _extended_ids(self) -> bool:

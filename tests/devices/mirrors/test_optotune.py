@@ -178,6 +178,25 @@ def test_a_driver_that_is_unplugged_ends_the_session_with_what_was_recorded(sess
     assert len(list(recording)) >= report.exposures > 0
 
 
+def test_a_mirror_that_gets_too_hot_ends_the_session_parked(session: Session, tmp_path: Path) -> None:
+    """Its status is asked for about once a second; the bit stays set, even if it has cooled down by then."""
+
+    class Overheating(OptotuneSimulator):
+        def answer(self, request: bytes) -> bytes:
+            self.status = 4 * (len(self.held) > 30)
+            return super().answer(request)
+
+    what = r"says that the mirror is too hot \(STATUS 0x00000004\); the \d exposure.* saved in"
+    with Overheating() as simulator:
+        with pytest.raises(DeviceError, match=what):
+            session(simulator, report := Report())
+        assert simulator.now() == (0, 0)
+        assert 1 < simulator.requests.count(b"STATUS") < 8
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.complete
+    assert len(list(recording)) >= report.exposures > 0
+
+
 def test_the_driver_is_a_mirror_without_a_queue() -> None:
     """Which the host drives at the fast rate, and parks."""
     with OptotuneSimulator() as simulator:
