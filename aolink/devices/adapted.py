@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import count, groupby
 
@@ -22,7 +22,7 @@ from aolink.devices.clock import ClockExchange, ClockRegression
 from aolink.devices.drivers import calling
 from aolink.devices.gate import CommandLimits, converter_margin, printable
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Lacks, Mirror, lacks_of
-from aolink.devices.simple import Held, SimpleCamera, SimpleFrame, SimpleMirror
+from aolink.devices.simple import ClockAnswer, Held, SimpleCamera, SimpleFrame, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
 from aolink.rig.device_tables import Delay
@@ -54,11 +54,15 @@ class _Adapted:
         """The device's clock, ns."""
         raise NotImplementedError
 
+    def _clock_doubt_ns(self) -> int:
+        """By how much the driver may correct the clock that it reads, ns."""
+        return 0
+
     def query_clock(self, now_ns: int) -> None:
-        sent_ns = self._now_ns()
+        doubt_ns, sent_ns = self._clock_doubt_ns(), self._now_ns()
         with calling(self.name, "when it was asked for the time"):
             device_ns = self._read_clock()
-        exchange = ClockExchange(sent_ns, device_ns, device_ns, self._now_ns())
+        exchange = ClockExchange(sent_ns - doubt_ns, device_ns, device_ns, self._now_ns() + doubt_ns)
         self._events.append(ClockSampled.add(self.clock, exchange))
 
     def host_ns(self, device_ns: int, since_zero_ns: int, now_ns: int) -> tuple[int, float]:
@@ -112,6 +116,12 @@ class AdaptedCamera(_Adapted):
         self._first_number = 0
         self._failed: AolinkError | None = None
 
+    def query_clock(self, now_ns: int) -> None:
+        with calling(self.name, "when it was asked for the time"):
+            self._tells_time = hasattr(self._driver, "ask_time") and self._driver.ask_time()
+        if not self._tells_time:
+            super().query_clock(now_ns)
+
     def _read_clock(self) -> int:
         device_ns = self._driver.time_ns()
         self._tells_time = device_ns is not None
@@ -157,6 +167,9 @@ class AdaptedCamera(_Adapted):
         if self._failed is not None:
             raise self._failed
         events = self._take_events()
+        if hasattr(self._driver, "time_answers"):
+            with calling(self.name, "when it was asked for the time"):
+                events += self._sampled(self._driver.time_answers())
         if self._running:
             try:
                 with calling(self.name, "when it was asked for its frames"):
@@ -167,6 +180,18 @@ class AdaptedCamera(_Adapted):
                     raise
                 self._failed = error
         return events
+
+    def _sampled(self, answers: Iterable[ClockAnswer]) -> list[Event]:
+        to_host_ns = self._now_ns() - self._monotonic_ns()
+        return [
+            ClockSampled.add(
+                self.clock,
+                ClockExchange(
+                    each.asked_ns + to_host_ns, each.camera_ns, each.camera_ns, each.answered_ns + to_host_ns
+                ),
+            )
+            for each in answers
+        ]
 
     def _take(self, raw: SimpleFrame, now_ns: int) -> list[Event]:
         timing, pixels = self._rig.timing, np.asarray(raw.pixels)
@@ -310,11 +335,18 @@ class AdaptedMirror(_Adapted):
         super().query_clock(now_ns)
         self.last_sent_ns = now_ns
 
+    def _clock_doubt_ns(self) -> int:
+        # A driver that infers its device's clock corrects it by as much. Without a queue the clock is the host's.
+        return 0 if Lacks.QUEUE in self.lacks else round(self._driver_sigma_ns())
+
     def since_zero_ns(self, host_ns: int) -> int:
         return self.clock.device_ns(host_ns)[0] - self._delay_ns
 
     def step_sigma_ns(self, host_ns: int) -> float:
-        return math.hypot(self.clock.device_ns(host_ns)[1], self._delay_sd_ns, self._driver_sigma_ns())
+        clock_ns, driver_ns = self.clock.device_ns(host_ns)[1], self._driver_sigma_ns()
+        if Lacks.QUEUE in self.lacks:
+            return math.hypot(clock_ns, self._delay_sd_ns, driver_ns)
+        return math.hypot(max(clock_ns, driver_ns), self._delay_sd_ns)  # the clock's has part of the driver's
 
     def _driver_sigma_ns(self) -> float:
         """What the driver knows of its own inexactness.

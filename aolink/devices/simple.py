@@ -40,12 +40,24 @@ class SimpleFrame:
     """What really happened, where the driver simulates a camera."""
 
 
+class ClockAnswer(NamedTuple):
+    """What a camera's clock said between two times of `time.monotonic_ns`, all in ns."""
+
+    asked_ns: int
+    camera_ns: int
+    answered_ns: int
+
+
 class SimpleCamera(Protocol):
     """A camera. The entry point is called with the rig and, by keyword, the driver's own keys of the rig file.
 
     It raises `aolink.errors.DeviceError`, with the reason, where the device cannot do what the rig file says. A class
     attribute ``lacks`` may list what the device cannot do, some of `Lacks`. A method ``statistics`` may give the counts
     of its line by the fields of the recording's ``LinkStatistics``; they are recorded once a second.
+
+    A camera whose clock takes long to ask has a method ``ask_time``, which has it asked without waiting (False where
+    there is no clock to ask), and a method ``time_answers``, which gives the `ClockAnswer`s since its last call. During
+    a session ``time_ns`` is not called then.
     """
 
     description: str

@@ -84,7 +84,8 @@ def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_
     starts = np.array([started(each, truth) for each in exposures])
     sigma = np.array([each.alignment_sigma_ns for each in exposures]) / rig.timing.fast_step_ns
     assert (np.abs(starts[:, 0] - starts[:, 1]) < 4 * sigma + 1 / 32).all()  # and half a sixteenth, by rounding
-    assert (sigma < 0.2).all()  # what the page of the bench promises
+    assert (sigma < 1).all()
+    assert not report.warnings  # nobody has set a clock
     assert max(np.abs(each.inputs).max() for each in exposures) > 0.25
 
     estimates = list(estimate(recording, "moments"))
@@ -97,7 +98,10 @@ def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_
 @pytest.mark.parametrize(
     ("faults", "what"),
     [
-        (Faults(stop_after=8), "the camera has sent no frame for"),
+        (
+            Faults(unplug_after=8),
+            "cannot tell the time: .* timeout, is it connected, and is its power on|no longer answ",
+        ),
         (Faults(resize_after=8), "has changed its picture to 21 x 20 pixels"),
     ],
 )

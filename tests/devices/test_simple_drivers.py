@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.devices import discovery
 from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
-from aolink.devices.interfaces import CommandAnswered, Event
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.devices.opening import open_devices
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
@@ -412,6 +412,20 @@ def test_a_delay_says_how_late_inputs_are_and_not_how_well_a_queues_time_is_know
     mirror = AdaptedMirror(RIG, bench, Delay(mean_s=0.001, sd_s=0.0), bench.now_ns)
     mirror.query_clock(bench.host_ns)
     assert mirror.step_sigma_ns(bench.host_ns) == pytest.approx(expected, abs=2e3)
+
+
+def test_a_clock_that_a_driver_corrects_by_as_much_as_it_doubts_it_was_not_set() -> None:
+    """The PlayzerX's driver infers its device's clock from counts of samples."""
+    bench = Bench()
+    bench.timing_sigma_ns = 1e6  # type: ignore[attr-defined]
+    mirror, events = AdaptedMirror(RIG, bench, Delay(), bench.now_ns), []
+    for k in range(40):
+        bench.host_ns += 10**9
+        bench.time_ns = lambda by=k // 20: bench.host_ns - EPOCH_NS + 150_000 * by  # type: ignore[method-assign, misc]
+        mirror.query_clock(bench.host_ns)
+        events += mirror.poll()
+    assert all(event.accepted and event.step is None for event in events if isinstance(event, ClockSampled))
+    assert not mirror.clock.suspected
 
 
 class CameraWithoutTime(CameraBench):

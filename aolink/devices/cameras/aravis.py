@@ -7,9 +7,9 @@ picture whose counts take two bytes goes to the session as it lies there, withou
 from __future__ import annotations
 
 import ctypes
-import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from typing import Any
 
@@ -17,7 +17,8 @@ from aolink.devices.cameras.aravis_library import Aravis, Refused
 from aolink.devices.cameras.aravis_stream import Picture, PictureStream
 from aolink.devices.cameras.pictures import checked_corner
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.cameras.requests import Requests
+from aolink.devices.simple import ClockAnswer, Lacks, SimpleFrame
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
 
@@ -31,6 +32,7 @@ _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, _TIMESTAMP_VALUE = 0x0944, 2, 0x0948
 _UNSURE_S = 1.0
 """How much later than others a frame may come whose arrival stands for its time."""
 _RELEASE_S = 2.0
+"""How long a camera that no longer answers is waited for: Aravis asks it again for many seconds."""
 
 
 def discover() -> list[tuple[str, str]]:
@@ -106,6 +108,9 @@ class AravisCamera:
         self._aravis = Aravis()
         self._address = address or self._only_camera()
         self._camera = None
+        self._requests = Requests("aolink-aravis")
+        self._asked: Future[ClockAnswer] | None = None
+        """The clock's answer that is under way."""
         self._running = False
         self._start_ns = 0
         self._before: tuple[int, int, int] | None = None
@@ -134,6 +139,17 @@ class AravisCamera:
         """The camera's clock, latched now; None where it has no latch, so that nothing compares it with the host's."""
         return self._latched_ns(self._latch) if self._latch else None
 
+    def ask_time(self) -> bool:
+        if self._latch and self._asked is None:
+            self._asked = self._requests.send(self._answer)
+        return bool(self._latch)
+
+    def time_answers(self) -> list[ClockAnswer]:
+        if self._asked is None or not self._asked.done():
+            return []
+        answered, self._asked = self._asked, None
+        return [answered.result()]
+
     def start(self, start_ns: int, exposures: int) -> None:
         for _ in self._stream.pictures():
             pass  # what is left from before
@@ -151,7 +167,13 @@ class AravisCamera:
     def stop(self) -> None:
         if self._running:
             self._running = False
-            self._do("arv_camera_stop_acquisition", self._camera, to="be stopped")
+            stopping = self._requests.send(
+                lambda: self._do("arv_camera_stop_acquisition", self._camera, to="be stopped")
+            )
+            try:
+                stopping.result(_RELEASE_S)
+            except TimeoutError:
+                raise DeviceError(f"the camera {self._address} does not answer when it is told to stop") from None
 
     def statistics(self) -> dict[str, int]:
         """Counts of its packets by the fields of ``LinkStatistics``, empty for a camera that is not on a network.
@@ -172,10 +194,10 @@ class AravisCamera:
                 self._stream.release()
             self._aravis("g_object_unref", camera)
 
-        if camera:  # one that no longer answers is asked again for many seconds, which nobody need wait for
-            releasing = threading.Thread(target=release, name="aolink-aravis-release", daemon=True)
-            releasing.start()
-            releasing.join(_RELEASE_S)
+        if camera:
+            with suppress(TimeoutError):
+                self._requests.send(release).result(_RELEASE_S)
+        self._requests.end()
 
     # Opening
 
@@ -378,6 +400,10 @@ class AravisCamera:
             except DeviceError:
                 continue
         return ""
+
+    def _answer(self) -> ClockAnswer:
+        asked_ns = time.monotonic_ns()
+        return ClockAnswer(asked_ns, self._latched_ns(self._latch), time.monotonic_ns())
 
     def _latched_ns(self, how: str) -> int:
         if how == "feature":
