@@ -1,8 +1,8 @@
 """Protocols for drivers of cameras and mirrors that do not speak aolink's packets.
 
 A simple driver knows its device and nothing of a session. It never waits: the session's thread polls it every few
-milliseconds. `aolink.devices.adapted` makes a session's devices of such drivers, and `aolink.devices.paced` a mirror
-that takes a queue of one that does not.
+milliseconds. `aolink.devices.adapted_camera` and `adapted_mirror` make a session's devices of such drivers, and
+`aolink.devices.paced` a mirror that takes a queue of one that does not.
 """
 
 from __future__ import annotations

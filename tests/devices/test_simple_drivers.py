@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.devices import discovery
-from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
+from aolink.devices.adapted_camera import AdaptedCamera
+from aolink.devices.adapted_mirror import AdaptedMirror
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.devices.opening import open_devices
 from aolink.devices.simple import Lacks, SimpleFrame
