@@ -135,16 +135,15 @@ class AdaptedCamera(Adapted):
         return events
 
     def _sampled(self, answers: Iterable[ClockAnswer]) -> list[Event]:
-        to_host_ns = self._now_ns() - self._monotonic_ns()
-        return [
-            ClockSampled.add(
-                self.clock,
-                ClockExchange(
-                    each.asked_ns + to_host_ns, each.camera_ns, each.camera_ns, each.answered_ns + to_host_ns
-                ),
+        """The answers on the host's clock, which is compared with `time.monotonic_ns` now."""
+        before_ns, now_ns, after_ns = self._monotonic_ns(), self._now_ns(), self._monotonic_ns()
+        exchanges = (
+            ClockExchange(
+                each.asked_ns + now_ns - after_ns, each.camera_ns, each.camera_ns, each.answered_ns + now_ns - before_ns
             )
             for each in answers
-        ]
+        )
+        return [ClockSampled.add(self.clock, exchange) for exchange in exchanges]
 
     def _take(self, raw: SimpleFrame, now_ns: int) -> list[Event]:
         timing, pixels = self._rig.timing, np.asarray(raw.pixels)

@@ -20,7 +20,7 @@ from aolink.devices.adapted_camera import AdaptedCamera
 from aolink.devices.adapted_mirror import AdaptedMirror
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.devices.opening import open_devices
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.simple import ClockAnswer, Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.rig import load_rig
 from aolink.rig.device_tables import Delay, DeviceTable
@@ -434,6 +434,38 @@ class CameraWithoutTime(CameraBench):
 
     def time_ns(self) -> int | None:  # type: ignore[override]
         return None
+
+
+class CameraWithASlowClock(CameraBench):
+    """Whose answer is under way until the test lets it come."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answers: list[ClockAnswer] = []
+
+    def ask_time(self) -> bool:
+        return True
+
+    def time_answers(self) -> list[ClockAnswer]:
+        answers, self.answers = self.answers, []
+        return answers
+
+
+def test_a_clock_that_answers_late_is_compared_with_the_time_at_which_it_was_asked() -> None:
+    bench = CameraWithASlowClock()
+    monotonic_ns = lambda: bench.host_ns - EPOCH_NS + 5_000  # noqa: E731
+    camera = AdaptedCamera(RIG, bench, mirror_of(Bench()), Delay(), bench.now_ns, monotonic_ns)
+    for _ in range(8):
+        bench.host_ns += 10**9
+        camera.query_clock(bench.host_ns)
+        assert camera.poll() == []
+        answer = ClockAnswer(monotonic_ns() - 20_000, bench.time_ns(), monotonic_ns() + 20_000)
+        bench.host_ns += 3 * 10**8
+        bench.answers = [answer]
+        (sampled,) = camera.poll()
+        assert isinstance(sampled, ClockSampled)
+        assert sampled.accepted
+    assert camera.clock.host_ns(bench.time_ns())[0] == pytest.approx(bench.host_ns, abs=100)
 
 
 def test_arrival_stands_for_the_time_that_a_camera_does_not_tell() -> None:

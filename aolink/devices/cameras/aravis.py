@@ -154,7 +154,8 @@ class AravisCamera:
         for _ in self._stream.pictures():
             pass  # what is left from before
         self._start_ns, self._before = start_ns, None
-        self._do("arv_camera_start_acquisition", self._camera, to="be started")
+        # After an answer that is under way: Aravis does not say that features may be used by two threads at once.
+        self._requests.send(lambda: self._do("arv_camera_start_acquisition", self._camera, to="be started")).result()
         self._running = True
 
     def frames(self) -> Iterator[SimpleFrame]:
