@@ -1,7 +1,8 @@
-"""One colour for each estimator, in the viewer and in every plot."""
+"""One colour for each estimator, and one order of them, in the viewer and in every plot."""
 
 from __future__ import annotations
 
+import math
 import zlib
 
 from aolink.errors import EstimatorError
@@ -18,3 +19,15 @@ def estimator_colour(name: str) -> Colour:
         return estimator_row(name).colour
     except EstimatorError:
         return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
+
+
+def by_rank(names: list[str]) -> list[str]:
+    """Estimators from the plainest to the one to look at first; those that are not installed here come last."""
+
+    def rank(name: str) -> float:
+        try:
+            return estimator_row(name).rank
+        except EstimatorError:
+            return math.inf
+
+    return sorted(names, key=lambda name: (rank(name), name))

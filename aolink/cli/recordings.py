@@ -56,9 +56,10 @@ def info(
 ) -> None:
     """Say what a recording holds. Exit code 1 if a part of it cannot be read."""
     from aolink.cli.tables import recordings as tables
+    from aolink.recording.facts import recording_facts
 
     recording = open_recording(file, check=check)
-    facts = tables.recording_facts(recording)
+    facts = recording_facts(recording)
     if as_json:
         print(json.dumps(facts, allow_nan=False))
     else:

@@ -150,9 +150,9 @@ class Series(ABC):
         ExportError
             There is no exposure or no such output, or matplotlib is missing.
         """
-        from aolink.exporting.plot import plot
+        from aolink.plotting.series import plot_series
 
-        return plot(self, estimators, output, axes)
+        return plot_series(self, estimators, output, axes)
 
     def facts(self) -> dict[str, str]:
         """What there is, in words."""

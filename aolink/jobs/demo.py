@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from aolink.errors import AolinkError, DeviceError, ViewerError
+from aolink.errors import AolinkError, DeviceError, ExportError, ViewerError
 from aolink.estimation import estimator_rows
 from aolink.files import writing
 from aolink.recording.deblur import Summary, write_deblurred
@@ -119,7 +119,7 @@ def run_demo(
     The rig runs from its ``source``, file or name: what that names is relative to it. ``stoppable`` is entered for
     the session alone, which ends in good order when what it gives says so; nothing else is made then.
     """
-    from aolink import viewing
+    from aolink import plotting, viewing
 
     with writing(folder / "rig.toml") as partial:
         partial.write_text(rig.toml)
@@ -169,8 +169,8 @@ def run_demo(
         except ViewerError as error:
             drawn, not_of_viewer = None, str(error)
             try:
-                drawn = viewing.draw_session(recording, picture)
-            except ViewerError as also:
+                drawn = plotting.draw_session(recording, picture)
+            except ExportError as also:
                 not_of_viewer += f"; {also}"
     return DemoResult(
         recording=path, rrd=rrd, picture=drawn, not_of_viewer=not_of_viewer, report=report, deblurred=deblurred,

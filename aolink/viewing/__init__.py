@@ -4,7 +4,6 @@ Each topic has a function that turns a batch of plain data into Rerun entities o
 calls them with a whole recording, `LiveView` with one exposure after the other.
 """
 
-from aolink.viewing.figure import draw_session
 from aolink.viewing.live import LiveView, live_viewer
 from aolink.viewing.save import save_rrd, send_recording
 from aolink.viewing.viewer import check_display, open_viewer, screenshot, serve_web
@@ -12,7 +11,6 @@ from aolink.viewing.viewer import check_display, open_viewer, screenshot, serve_
 __all__ = [
     "LiveView",
     "check_display",
-    "draw_session",
     "live_viewer",
     "open_viewer",
     "save_rrd",

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import rerun.blueprint as rrb
 
 from aolink.optics.sensor import SpotSensor
+from aolink.plotting.overview import NIS_COVERAGE
+from aolink.plotting.style import BAND
 from aolink.recording import topics
 from aolink.rig import Rig
 from aolink.viewing.camera import HISTORY, profile_bounds
-from aolink.viewing.motion import BAND, NIS_COVERAGE
 from aolink.viewing.scene import RESTORED_SCENE, RESTORED_SPOTS, SCENE, TRUE_SCENE
 from aolink.viewing.timebase import DEVICE_TIME, FAST_STEP
 

@@ -9,20 +9,12 @@ import numpy as np
 import rerun as rr
 
 from aolink.colours import estimator_colour
+from aolink.plotting.devices import LATENCY_STEPS
 from aolink.recording import topics
 from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
 from aolink.viewing.series import Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
-
-LATENCY_STEPS = (
-    ("first_byte_ns", "first byte"),
-    ("complete_ns", "frame complete"),
-    ("estimated_ns", "estimated"),
-    ("command_sent_ns", "command sent"),
-    ("command_acknowledged_ns", "acknowledged"),
-)
-"""Fields of a Latency in the order in which they happen, and their names."""
 
 LINK_COUNTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "reports_asked")
 """Fields of LinkStatistics that count faults."""

@@ -11,6 +11,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from aolink.colours import by_rank
 from aolink.errors import ViewerError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
@@ -19,7 +20,6 @@ from aolink.rig import Rig
 from aolink.viewing import motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.camera import HISTORY
-from aolink.viewing.palette import by_rank
 from aolink.viewing.save import APPLICATION, send_camera
 from aolink.viewing.timebase import Timebase
 from aolink.viewing.viewer import HOST, free_port, has_display, running_rerun, wait_for_server

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from scipy import special
 
 from aolink.colours import estimator_colour
 from aolink.estimation.estimate import Estimate
 from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure, Truth
+from aolink.plotting.overview import NIS_COVERAGE, nis_bounds
+from aolink.plotting.style import BAND
 from aolink.viewing.palette import TRUTH
 from aolink.viewing.series import Style, send_axes, send_line, send_states
 from aolink.viewing.timebase import Timebase
 
 FloatArray = NDArray[np.float64]
-
-BAND = 2.0
-"""Standard deviations to each side of an estimate."""
-NIS_COVERAGE = 0.95
-"""Probability that a consistent estimator's NIS lies inside the bounds drawn."""
 
 
 def log_truth(stream: rr.RecordingStream, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
@@ -117,14 +112,6 @@ def _send_table(
         True, **{name: np.concatenate([each[name] for each in scalars]) for name in scalars[0]}
     )
     stream.send_columns(path, times, [*words, *numbers.partition([len(e.start_state) for e in estimates])])
-
-
-@lru_cache(maxsize=64)
-def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
-    """Between which a consistent estimator's NIS lies in `NIS_COVERAGE` of the exposures (two-sided)."""
-    tail = (1 - NIS_COVERAGE) / 2
-    low, high = 2 * special.gammaincinv(degrees_of_freedom / 2, [tail, 1 - tail])  # of chi-square
-    return float(low), float(high)
 
 
 def _log_nis(stream: rr.RecordingStream, timebase: Timebase, estimates: Sequence[Estimate]) -> None:

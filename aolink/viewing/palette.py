@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
 from aolink.colours import Colour
-from aolink.errors import EstimatorError
-from aolink.estimation import estimator_row
 
 TRUTH: Colour = (245, 200, 40)
 MEASURED: Colour = (165, 165, 165)
@@ -44,15 +40,3 @@ STATUS_COLOURS: dict[str, Colour] = {
 def series_colour(index: int) -> Colour:
     """Colour of the ``index``-th of several lines that belong to no estimator."""
     return _SERIES[index % len(_SERIES)]
-
-
-def by_rank(names: list[str]) -> list[str]:
-    """Estimators from the plainest to the one to look at first; those that are not installed here come last."""
-
-    def rank(name: str) -> float:
-        try:
-            return estimator_row(name).rank
-        except EstimatorError:
-            return math.inf
-
-    return sorted(names, key=lambda name: (rank(name), name))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
+from aolink.colours import by_rank
 from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import score
@@ -20,7 +21,6 @@ from aolink.recording.reader import check_stands_alone
 from aolink.rig import Rig
 from aolink.viewing import camera, devices, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
-from aolink.viewing.palette import by_rank
 from aolink.viewing.rrd_file import new_rrd
 from aolink.viewing.timebase import Timebase
 

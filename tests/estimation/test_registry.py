@@ -47,14 +47,13 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     assert scored["threshold"]["path_rmse"] < 0.8 * scored["open-loop"]["path_rmse"]
     asked = (
         "from aolink.estimation import ESTIMATOR_NAMES;"
-        "from aolink.colours import estimator_colour; from aolink.viewing.palette import by_rank;"
+        "from aolink.colours import estimator_colour; from aolink.colours import by_rank;"
         "print(ESTIMATOR_NAMES[:3], estimator_colour('threshold'), by_rank(['o3', 'threshold', 'o1']))"
     )
     told = subprocess.run([sys.executable, "-c", asked], env=with_example, capture_output=True, text=True, check=True)
     assert told.stdout == "('open-loop', 'o1', 'threshold') (250, 250, 120) ['o1', 'threshold', 'o3']\n"
     # Without the package the recording is there, and its estimates have a colour and come last.
-    from aolink.colours import estimator_colour
-    from aolink.viewing.palette import by_rank
+    from aolink.colours import by_rank, estimator_colour
 
     assert by_rank(["threshold", "o3"]) == ["o3", "threshold"]
     assert estimator_colour("threshold") != (250, 250, 120)

@@ -75,7 +75,7 @@ def test_a_plot_on_axes_of_its_own_or_on_those_given(name: str) -> None:
     assert set(lines) == {"truth", *series.estimators}
     truth = series[0].truth
     assert truth is not None
-    np.testing.assert_array_equal(np.asarray(lines["truth"])[[0, 8], 1], truth.path[output, [0, -1]])
+    np.testing.assert_array_equal(np.asarray(lines["truth"])[[0, 16], 1], truth.path[output, [0, -1]])
     assert len(paths.collections) == 1  # the blur
     drawn = {line.get_label(): line.get_ydata() for line in nis.get_lines()}
     axis = output // series.rig.plant.n_outputs

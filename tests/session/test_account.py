@@ -11,11 +11,11 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aolink.cli.tables.recordings import recording_facts
 from aolink.devices.reports import AppliedReports
 from aolink.errors import DeviceError
 from aolink.recording import topics
 from aolink.recording.editing import cut
+from aolink.recording.facts import recording_facts
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session.account import Account

@@ -13,9 +13,10 @@ from scipy import stats
 
 from aolink.colours import estimator_colour
 from aolink.errors import ViewerError
+from aolink.plotting.overview import nis_bounds
 from aolink.recording.reader import Recording
 from aolink.viewing.camera import HISTORY
-from aolink.viewing.motion import log_estimates, nis_bounds
+from aolink.viewing.motion import log_estimates
 from aolink.viewing.palette import MISSING, NOTHING, TRUTH
 from aolink.viewing.save import save_rrd
 from aolink.viewing.timebase import Timebase

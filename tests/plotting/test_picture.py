@@ -12,13 +12,14 @@ import pytest
 from PIL import Image
 
 from aolink.colours import estimator_colour
-from aolink.errors import ViewerError
-from aolink.rig import load_rig
-from aolink.viewing import draw_session
-from tests.viewing.stand_in import StandIn, as_recording
-from tests.viewing.test_spots import Simulated
+from aolink.errors import ExportError
+from aolink.plotting import draw_session
+from aolink.recording.reader import Recording
+from tests.recording.small import write_small
 
 pytest.importorskip("matplotlib", reason="the picture is drawn with it: install aolink[plot]")
+
+LIVELY = Path(__file__).parents[2] / "recordings" / "section-vi-lively.mcap"
 
 
 def pixels(path: Path) -> np.ndarray:
@@ -38,48 +39,25 @@ def parts(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_every_part_shows_its_estimators(tmp_path: Path) -> None:
     """The session has the best estimator's path, the exposures also that of o1, the errors have all."""
-    session, inside, errors = parts(pixels(draw_session(as_recording(StandIn(n=60)), tmp_path / "a.png")))
-    for part, names in ((session, ["o3"]), (inside, ["o1", "o3"]), (errors, ["open-loop", "o1", "o3"])):
+    session, inside, errors = parts(pixels(draw_session(Recording(LIVELY), tmp_path / "a.png")))
+    for part, names in ((session, ["moments"]), (inside, ["o1", "moments"]), (errors, ["open-loop", "o1", "o3"])):
         for name in names:
             assert coloured(part, estimator_colour(name)).sum() > 200, name
     assert coloured(session, estimator_colour("o1")).sum() == 0
-    truth = coloured(inside, (0, 0, 0)).any(axis=0).mean()
-    assert truth > 0.7  # in three plots side by side
 
 
-def test_the_camera_s_picture_lies_under_the_path(tmp_path: Path) -> None:
-    """Of the session's picture, the pixels about the path are darker than the others."""
-    session, _, _ = parts(pixels(draw_session(as_recording(StandIn(n=60)), tmp_path / "a.png")))
-    grey = (np.ptp(session, axis=2) < 6) & (session.mean(axis=2) > 40) & (session.mean(axis=2) < 200)
-    path = coloured(session, estimator_colour("o3"))
-    for column in np.flatnonzero(path.any(axis=0))[100:-100:50]:
-        where = np.flatnonzero(path[:, column]).mean()
-        near = grey[:, column - 3 : column + 4].any(axis=1)
-        assert np.abs(np.flatnonzero(near) - where).min() < 15
-
-
-def test_without_a_truth_paths_are_drawn_and_errors_are_not(tmp_path: Path) -> None:
-    bare = StandIn(n=60, lost=(20, 21, 22, 40), with_truth=False)
-    _, inside, errors = parts(pixels(draw_session(as_recording(bare), tmp_path / "a.png")))
-    assert coloured(inside, estimator_colour("o3")).sum() > 200
+def test_without_a_truth_and_estimates_the_blur_is_drawn_and_errors_are_not(tmp_path: Path) -> None:
+    bare = Recording(write_small(tmp_path / "bare.mcap", 3, rig="sh-4x4"))
+    session, _, errors = parts(pixels(draw_session(bare, tmp_path / "a.png")))
+    assert (session.mean(axis=2) < 100).sum() > 200
     assert coloured(errors, estimator_colour("o3")).sum() == 0
 
 
-def test_spots_on_a_plane_are_drawn_too(tmp_path: Path) -> None:
-    simulated = Simulated(load_rig("sh-4x4"))
-    _, inside, _ = parts(pixels(draw_session(as_recording(simulated), tmp_path / "a.png")))
-    assert coloured(inside, estimator_colour("o1")).sum() > 200
-
-
-def test_a_recording_without_exposures_is_one_clear_error(tmp_path: Path) -> None:
-    empty = StandIn(n=5, lost=(0, 1, 2, 3, 4))
-    with pytest.raises(ViewerError, match="has no exposure"):
-        draw_session(as_recording(empty), tmp_path / "a.png")
-
-
-def test_where_it_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(ViewerError, match=r"cannot write .*a\.png: there is no folder"):
-        draw_session(as_recording(StandIn()), tmp_path / "absent" / "a.png")
+def test_what_cannot_be_drawn_or_written_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="holds no exposure"):
+        draw_session(Recording(write_small(tmp_path / "empty.mcap", 0)), tmp_path / "a.png")
+    with pytest.raises(ExportError, match=r"cannot write .*a\.png: there is no folder"):
+        draw_session(Recording(LIVELY), tmp_path / "absent" / "a.png")
 
 
 @pytest.mark.usefixtures("without_vulkan")

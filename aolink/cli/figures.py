@@ -1,0 +1,125 @@
+"""Commands that draw recordings on paper and on a page: plot, report."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from aolink.cli.common import EstimatorOption, OverwriteOption, app, open_recording, progress, stdout
+from aolink.errors import ExportError, RecordingError
+from aolink.files import check_target
+
+
+class What(StrEnum):
+    """The figures that `aolink plot` draws: those of `aolink.plotting.FIGURES`."""
+
+    BLUR = "blur"
+    EXPOSURE = "exposure"
+    NIS = "nis"
+    ERRORS = "errors"
+    LOSSES = "losses"
+    LATENCY = "latency"
+    PUPIL = "pupil"
+    SCENE = "scene"
+
+
+StepsOption = Annotated[bool, typer.Option("--steps", help="Count fast steps on time axes, not seconds.")]
+
+
+@app.command(epilog="Example: aolink plot session.mcap exposure -o exposure.pdf --width-mm 180")
+def plot(
+    file: Annotated[str, typer.Argument(help="A recording: a file, or a URL.", metavar="FILE")],
+    what: Annotated[What, typer.Argument(help="The figure.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="X.png|svg|pdf", help="The picture to write.")],
+    estimator: EstimatorOption = None,
+    exposure: Annotated[
+        int | None,
+        typer.Option(min=0, metavar="N", help="Exposure to draw, counted from 0; else the one with the largest blur."),
+    ] = None,
+    lenslet: Annotated[
+        str | None, typer.Option(metavar="I,J", help="Row and column of the lenslet to draw, counted from 0.")
+    ] = None,
+    steps: StepsOption = False,
+    width_mm: Annotated[float, typer.Option(min=30, max=1000, help="Width on paper; 88 fits a column.")] = 180.0,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Draw one figure of a recording in a paper's size.
+
+    blur: what the camera saw over the session, and the paths. exposure: one exposure's path over its blur, the path's
+    histogram and the intensity profile. nis, errors, losses, latency: along the session. pupil: maps over the
+    lenslets. scene: a picture as it came, restored, and at rest.
+    """
+    from aolink.plotting.files import FORMATS, save_figure
+
+    if output.suffix.lower() not in FORMATS:
+        raise ExportError(f"cannot write {output}: a figure is a {', '.join(FORMATS)} file; give such a name")
+    recording = open_recording(file)
+    check_target(output, overwrite=overwrite, sources=recording.files, error=ExportError)
+    spot = _spot(recording.rig.sensor, lenslet) if lenslet else 0
+    with progress("read", recording.n_frames) as tell:
+        save_figure(
+            recording, what.value, output, estimators=estimator, exposure=exposure,
+            output=2 * spot, spot=spot, unit="steps" if steps else "s", width_mm=width_mm, overwrite=overwrite,
+            progress=tell,
+        )  # fmt: skip
+    stdout.print(f"written: {output}", markup=False)
+
+
+def _spot(sensor: object, lenslet: str) -> int:
+    """Number of the spot of a lenslet that is named by its row and column."""
+    import numpy as np
+
+    from aolink.optics.sensor import SpotSensor
+
+    if not (match := re.fullmatch(r"(\d+),(\d+)", lenslet)):
+        raise typer.BadParameter(f"--lenslet {lenslet}: give row and column, counted from 0, as 2,3")
+    if not isinstance(sensor, SpotSensor):
+        raise typer.BadParameter("--lenslet is for a sensor with lenslets; this one is a line")
+    row, column = map(int, match.groups())
+    rows, columns = sensor.grid
+    inside = row < rows and column < columns
+    found = np.flatnonzero(sensor.lit == row * columns + column)
+    if not (inside and len(found)):
+        raise typer.BadParameter(f"--lenslet {lenslet}: no light falls on it; the grid has {rows} x {columns} lenslets")
+    return int(found[0])
+
+
+@app.command(epilog="Example: aolink report session.mcap -o report.html  |  aolink report results/ -o batch.html")
+def report(
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings, or folders of recordings.")],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="X.html", help="The page to write.")],
+    steps: StepsOption = False,
+    overwrite: OverwriteOption = False,
+) -> None:
+    """Write a page that tells a session: how good the estimates are, the exposures that tell most, what was lost.
+
+    One file of HTML with everything in it. Two or three recordings stand side by side; of more there is a table.
+    """
+    from aolink.plotting.report import write_report
+
+    check_target(output, overwrite=overwrite, suffix=".html", error=ExportError)
+    recordings = [open_recording(each) for each in _in_folders(files)]
+    with progress("read", None) as tell:
+        write_report(
+            recordings, output, unit="steps" if steps else "s", overwrite=overwrite,
+            progress=lambda name, done: tell(done, name),
+        )  # fmt: skip
+    stdout.print(f"written: {output}", markup=False)
+
+
+def _in_folders(files: list[str]) -> list[str]:
+    """Files and URLs as they are; of a folder, its recordings by name."""
+    found: list[str] = []
+    for each in files:
+        if Path(each).is_dir():
+            inside = sorted(str(path) for path in Path(each).glob("*.mcap"))
+            if not inside:
+                raise RecordingError(f"the folder {each} holds no recording (*.mcap)")
+            found += inside
+        else:
+            found.append(each)
+    return found

@@ -1,0 +1,119 @@
+"""Figures of what a session's devices did: losses on a time line, and when each step of the loop was done."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aolink.errors import ExportError
+from aolink.estimation.estimate import Status
+from aolink.plotting.overview import Overview, need_exposures
+from aolink.plotting.session import thinned, time_label
+from aolink.plotting.style import FloatArray, TimeUnit, axes_or_new, legend_above
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.recording.schemas_pb2 import Estimation, Latency
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+LATENCY_STEPS = (
+    ("first_byte_ns", "first byte"),
+    ("complete_ns", "frame complete"),
+    ("estimated_ns", "estimated"),
+    ("command_sent_ns", "command sent"),
+    ("command_acknowledged_ns", "acknowledged"),
+)
+"""Fields of a Latency in the order in which they happen, and their names."""
+
+_LANES = {
+    Status.GATED: ("gated", "tab:orange"),
+    Status.DIVERGED: ("diverged", "tab:red"),
+    Status.REINITIALISED: ("reinitialised", "tab:purple"),
+    Status.INPUT_INVALID: ("not usable", "tab:brown"),
+}
+"""What is said of an estimate that is not as it should be."""
+
+
+def incidents(view: Overview) -> dict[str, FloatArray]:
+    """What went wrong: the fast steps at which it did, from the first exposure on, by what it was.
+
+    Frames lost and incomplete, exposures with inputs that the mirror did not report, estimates that were gated,
+    diverged, began anew or could not use their exposure, and those that the session had no time for.
+    """
+    steps = view.steps.astype(np.float64)
+    found = {
+        "frames lost": steps[view.frames_lost > 0],
+        "frames incomplete": steps[view.missing > 0],
+        "inputs not reported": steps[view.assumed > 0],
+    }
+    for name, status in view.status.items():
+        for kind, (text, _) in _LANES.items():
+            found[f"{name}: {text}"] = steps[status == kind]
+    if isinstance(view.series, Recording):
+        by_frame = dict(zip(view.frame_ids.tolist(), steps.tolist(), strict=True))
+        for name in view.names:
+            skipped = sorted(by_frame[k] for k in view.series.skipped(name) if k in by_frame)
+            found[f"{name}: no time for it"] = np.array(skipped)
+    return {name: at for name, at in found.items() if len(at)}
+
+
+def plot_losses(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
+    """What went wrong and when: a line of marks for each kind of incident (`incidents`), with their number.
+
+    Raises
+    ------
+    ExportError
+        There is no exposure, or matplotlib is missing.
+    """
+    need_exposures(view)
+    axes, scale, found = axes_or_new(axes), view.scale(unit), incidents(view)
+    colours = dict(_LANES.values())
+    for place, (name, at) in enumerate(found.items()):
+        shade = colours.get(name.partition(": ")[2], "0.2")
+        axes.vlines(at * scale, place - 0.35, place + 0.35, color=shade, linewidth=1.0, rasterized=len(at) > 500)
+    labels = [f"{name} ({len(at)})" for name, at in found.items()]
+    axes.set_yticks(range(len(found)), labels)
+    if not found:
+        axes.text(0.5, 0.5, "nothing was lost, nothing was gated", ha="center", transform=axes.transAxes)
+    end = float(view.steps[-1] + view.n_steps[-1]) * scale
+    axes.set(xlabel=time_label(unit), xlim=(0, end), ylim=(max(len(found), 1) - 0.4, -0.6))
+    return axes
+
+
+def plot_latency(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
+    """When each step of the loop was done after the end of its exposure, and how long each estimate took, ms.
+
+    Raises
+    ------
+    ExportError
+        The series holds no latencies, or matplotlib is missing.
+    """
+    need_exposures(view)
+    series = view.series
+    wanted = [topics.LATENCY, *map(topics.estimation_topic, view.names)]
+    there = [name for name in wanted if isinstance(series, Recording) and name in series.counts]
+    lines: dict[str, list[tuple[float, float]]] = {name: [] for _, name in LATENCY_STEPS}
+    by_frame = dict(zip(view.frame_ids.tolist(), view.steps.tolist(), strict=True))
+    for recorded in series.messages(*there) if isinstance(series, Recording) and there else ():
+        message = recorded.message
+        if isinstance(message, Latency) and message.frame_id in by_frame:
+            at = by_frame[message.frame_id]
+            for key, name in LATENCY_STEPS:
+                if (done := getattr(message, key)) > 0:
+                    lines[name].append((at, (done - message.exposure_end_ns) / 1e6))
+        elif isinstance(message, Estimation) and not message.skipped and message.frame_id in by_frame:
+            name = f"{message.estimator} takes"
+            lines.setdefault(name, []).append((by_frame[message.frame_id], message.took_ns / 1e6))
+    known = {name: np.array(points).T for name, points in lines.items() if points}
+    if not known:
+        raise ExportError(f"{series.path} holds no latencies: it was recorded on virtual time, or imported")
+    axes = axes_or_new(axes)
+    for name, (at, took) in known.items():
+        style = "--" if name.endswith(" takes") else "-"
+        axes.plot(*thinned(at * view.scale(unit), took), style, linewidth=0.8, label=name)
+    axes.set(xlabel=time_label(unit), ylabel="after the exposure's end, or taken (ms)", yscale="log")
+    axes.grid(alpha=0.3)
+    legend_above(axes, 3)
+    return axes

@@ -1,0 +1,210 @@
+"""The figure that explains the method: one exposure's path, how long it was where, and the blur that it left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aolink.colours import by_rank
+from aolink.errors import ExportError
+from aolink.estimation.estimate import Estimate
+from aolink.estimation.registry import BASELINE_ESTIMATOR
+from aolink.exporting.common import check_frame
+from aolink.exporting.series import Series
+from aolink.exposure import Exposure
+from aolink.optics.kernel import exposure_density
+from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.plotting.overview import limits_of, profile_density
+from aolink.plotting.style import BAND, FloatArray, TimeUnit, colour, extremes, figure_or_new, hides_swings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+_SIZE_IN = (9.0, 3.4)
+_BINS = 48
+"""Of a path's histogram, over the drawn part of the field."""
+_SEGMENTS = 120
+"""Of a path that is drawn as an envelope."""
+
+
+def exposure_with_estimates(
+    series: Series, number: int, estimators: Sequence[str] | None = None
+) -> tuple[Exposure, dict[str, Estimate]]:
+    """An exposure by its number, counted from 0, and what there is of its estimates.
+
+    Without names those of the baseline and of the estimator to look at first.
+
+    Raises
+    ------
+    RecordingError
+        There are no estimates of such a name.
+    ExportError
+        There is no such exposure, or its frame is not of the rig's sensor.
+    """
+    if not 0 <= number < len(series):
+        there = f"has {len(series)}, counted from 0" if len(series) else "holds none"
+        raise ExportError(f"there is no exposure {number}: {series.path} {there}")
+    ranked = by_rank(list(series.named(None)))
+    names = series.named(estimators if estimators is not None else _baseline_and_best(ranked))
+    one = series[number : number + 1]
+    exposure, estimates = next(iter(one.with_estimates(names)), (None, []))
+    if exposure is None:
+        raise ExportError(f"exposure {number} of {series.path} cannot be read; `aolink info --check` says why")
+    check_frame(series, exposure)
+    return exposure, {name: each for name, each in zip(names, estimates, strict=True) if each is not None}
+
+
+def _baseline_and_best(ranked: Sequence[str]) -> list[str]:
+    return [name for name in dict.fromkeys((BASELINE_ESTIMATOR, *ranked[-1:])) if name in ranked]
+
+
+def plot_exposure(
+    series: Series, number: int, figure: Figure | SubFigure | None = None, *,
+    estimators: Sequence[str] | None = None, spot: int = 0, unit: TimeUnit = "s",
+) -> Figure | SubFigure:  # fmt: skip
+    """Draw one exposure: the path over its blur, the path's histogram, and the intensity profile beside them.
+
+    The three panels of a row share the axis of the spot's position. The path's histogram, blurred by the kernel, is
+    the intensity that the path predicts; grey is what was measured. A spot on a plane has a row for x and one for y,
+    and its picture.
+
+    Parameters
+    ----------
+    number:
+        Number of the exposure in the series, counted from 0.
+    figure:
+        Where to draw; by default a new figure.
+    estimators:
+        Whose paths; by default those of the baseline `o1` and of the estimator to look at first.
+    spot:
+        Which spot of a sensor with many.
+    unit:
+        Whether the time axis counts milliseconds of the exposure or its fast steps.
+
+    Raises
+    ------
+    RecordingError
+        There are no estimates of such a name.
+    ExportError
+        There is no such exposure or spot, its frame is not of the rig's sensor, or matplotlib is missing.
+    """
+    exposure, estimates = exposure_with_estimates(series, number, estimators)
+    return draw_exposure(series, exposure, estimates, figure, spot=spot, unit=unit)
+
+
+def draw_exposure(
+    series: Series, exposure: Exposure, estimates: dict[str, Estimate], figure: Figure | SubFigure | None = None, *,
+    spot: int = 0, unit: TimeUnit = "s",
+) -> Figure | SubFigure:  # fmt: skip
+    """What `plot_exposure` draws, of an exposure that has been read."""
+    sensor = series.rig.sensor
+    on_plane = isinstance(sensor, SpotSensor)
+    spots = sensor.spots if isinstance(sensor, SpotSensor) else series.rig.n_outputs
+    if not 0 <= spot < spots:
+        raise ExportError(f"there is no spot {spot}: the sensor has {spots}, counted from 0")
+    outputs = [2 * spot, 2 * spot + 1] if on_plane else [spot]
+    figure = figure_or_new(figure, (_SIZE_IN[0], _SIZE_IN[1] * (1.6 if on_plane else 1.0)))
+    widths = [3.0, 1.0, 1.2, 2.0] if on_plane else [3.0, 1.0, 1.2]
+    grid = figure.add_gridspec(len(outputs), len(widths), width_ratios=widths)
+    first: Axes | None = None
+    for row, output in enumerate(outputs):
+        left = figure.add_subplot(grid[row, 0], sharex=first)
+        panels = [left, *(figure.add_subplot(grid[row, k], sharey=left) for k in (1, 2))]
+        _draw_row(panels, series, exposure, estimates, output, unit)
+        left.set_ylabel(("x", "y (slope units)")[row] if on_plane else "spot (slope units)")
+        if row < len(outputs) - 1:
+            for panel in panels:
+                panel.set_xlabel("")
+        first = first or left
+    if isinstance(sensor, SpotSensor):
+        _draw_spot(figure.add_subplot(grid[:, 3]), sensor, exposure, estimates, spot)
+    if first is not None and first.get_legend_handles_labels()[0]:
+        figure.legend(*first.get_legend_handles_labels(), loc="outside upper left", ncols=4)
+    return figure
+
+
+def _draw_row(
+    panels: Sequence[Axes], series: Series, exposure: Exposure, estimates: dict[str, Estimate], output: int,
+    unit: TimeUnit,
+) -> None:  # fmt: skip
+    """Path, histogram and intensity profile of one output."""
+    over_time, histogram, intensity = panels
+    line: Sensor = series.rig.sensor.profile
+    seen = profile_density(series.rig.sensor, exposure, output)
+    paths = {name: each.path[output] for name, each in estimates.items()}
+    if exposure.truth is not None:
+        paths = {"truth": exposure.truth.path[output], **paths}
+    low, high = limits_of(line, list(paths.values()))
+    scale = series.rig.timing.fast_step_s * 1e3 if unit == "s" else 1.0
+    times: FloatArray = np.asarray(np.arange(exposure.n_steps) * scale, dtype=np.float64)
+    top = float(np.nanmax(seen)) if np.isfinite(seen).any() else line.peak_density
+    over_time.pcolormesh(
+        [0, exposure.n_steps * scale], line.edges, seen[:, None], cmap="Greys", vmin=0, vmax=2.5 * max(top, 1e-12),
+        rasterized=True,
+    )  # fmt: skip
+    bins = np.linspace(low, high, _BINS + 1)
+    drawn: Any = np.nan_to_num(seen)
+    intensity.stairs(drawn, line.edges, orientation="horizontal", fill=True, color="0.8", label="measured")
+    if not np.isfinite(seen).any():
+        intensity.text(0.5, 0.5, "no pixel\narrived", ha="center", va="center", transform=intensity.transAxes)
+    for name, path in paths.items():
+        sd = None if name == "truth" else estimates[name].path_sd[output]
+        _draw_path(over_time, times, path, sd, name)
+        share = np.histogram(np.clip(path, low, high), bins, density=True)[0]
+        histogram.stairs(share, bins, orientation="horizontal", color=colour(name), linewidth=0.9)
+        predicted = _light(series, output) * exposure_density(line.kernel, line.edges, path)
+        width = 1.5 if name == "truth" else 1.0
+        intensity.stairs(predicted, line.edges, orientation="horizontal", color=colour(name), linewidth=width)
+    over_time.set(ylim=(low, high), xlim=(0, exposure.n_steps * scale))
+    over_time.set_xlabel("time in the exposure (ms)" if unit == "s" else "fast step in the exposure")
+    histogram.set_xlabel("time at a place\n(1 / slope unit)")
+    intensity.set_xlabel("intensity\n(1 / slope unit)")
+    for panel in (histogram, intensity):
+        panel.tick_params(labelleft=False)
+        panel.set_xlim(left=0)
+
+
+def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray | None, name: str) -> None:
+    """A path with the band of its estimate; one that swings too fast to be seen as a line, as its range."""
+    low, high = extremes(path, _SEGMENTS)
+    if hides_swings(path, _SEGMENTS):
+        edges = np.linspace(times[0], times[-1], len(low))
+        axes.fill_between(edges, low, high, color=colour(name), alpha=0.4, linewidth=0, label=f"{name} (range)")
+        return
+    label = name if sd is None else f"{name}, ±{BAND:g} sd"
+    axes.plot(times, path, color=colour(name), linewidth=1.8 if sd is None else 1.2, label=label)
+    if sd is not None:
+        axes.fill_between(times, path - BAND * sd, path + BAND * sd, color=colour(name), alpha=0.2, linewidth=0)
+
+
+def _draw_spot(
+    axes: Axes, sensor: SpotSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int
+) -> None:  # fmt: skip
+    """The picture of one spot with the paths over it."""
+    row, column = divmod(int(sensor.lit[spot]), sensor.grid[1])
+    height, width = sensor.window
+    window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+    counts = np.where(exposure.mask[window], exposure.pixels[window].astype(float), np.nan)
+    low, high = sensor.field
+    picture = axes.imshow(counts, cmap="Greys", extent=(low, high, high, low), interpolation="nearest")
+    axes.figure.colorbar(picture, ax=axes, label="counts", orientation="horizontal", shrink=0.9)
+    outputs = [2 * spot, 2 * spot + 1]
+    paths = {name: each.path[outputs] for name, each in estimates.items()}
+    if exposure.truth is not None:
+        paths = {"truth": exposure.truth.path[outputs], **paths}
+    for name, path in paths.items():
+        axes.plot(*path, color=colour(name), linewidth=1.6 if name == "truth" else 1.0)
+    axes.set(xlabel="x (slope units)", ylabel="y (slope units)", xlim=(low, high), ylim=(high, low))
+    if paths:  # the part of the window that they are in, as a square
+        ends = np.array([limits_of(sensor.profile, [path[k] for path in paths.values()]) for k in (0, 1)])
+        half, (middle_x, middle_y) = float(np.ptp(ends, axis=1).max()) / 2, ends.mean(axis=1)
+        axes.set(xlim=(middle_x - half, middle_x + half), ylim=(middle_y + half, middle_y - half))
+
+
+def _light(series: Series, output: int) -> float:
+    """Share of its light that an output's lenslet gets."""
+    light = series.rig.sensor.spot_light if isinstance(series.rig.sensor, SpotSensor) else None
+    return 1.0 if light is None else float(light[output // 2])

@@ -1,0 +1,130 @@
+"""Single figures as files, in a paper's size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from aolink.colours import by_rank
+from aolink.errors import ExportError
+from aolink.exporting.common import Progress, no_progress
+from aolink.files import writing
+from aolink.optics.sensor import SpotSensor
+from aolink.plotting.devices import plot_latency, plot_losses
+from aolink.plotting.exposure import plot_exposure
+from aolink.plotting.overview import Overview, need_exposures, overview
+from aolink.plotting.pupil import plot_pupil
+from aolink.plotting.scene import plot_scene
+from aolink.plotting.session import plot_blur, plot_errors, plot_nis
+from aolink.plotting.style import TimeUnit, new_figure, paper
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from aolink.recording.reader import Recording
+
+FORMATS = (".png", ".svg", ".pdf")
+_DATED = {".svg": "Date", ".pdf": "CreationDate"}
+"""What matplotlib would write the time of day into: the same recording is to give the same file."""
+
+
+@dataclass(frozen=True)
+class _Figure:
+    """A figure that has a name."""
+
+    what: str
+    """What it shows, in words."""
+    height: float
+    """Over its width."""
+    draw: Callable[..., Axes] | None = None
+    """Draws it of an overview, on axes; None for those of one exposure, or of the pupil."""
+
+
+FIGURES = {
+    "blur": _Figure("what the camera saw over the session, and the paths", 0.42, plot_blur),
+    "exposure": _Figure("one exposure: path over blur, its histogram, the intensity profile", 0.40),
+    "nis": _Figure("the NIS of each estimator with its bounds", 0.55, plot_nis),
+    "errors": _Figure("the error of each estimator's path along the session", 0.55, plot_errors),
+    "losses": _Figure("what was lost, late, gated or skipped, and when", 0.45, plot_losses),
+    "latency": _Figure("when each step of the loop was done", 0.55, plot_latency),
+    "pupil": _Figure("maps over the lenslets: light, slopes, blur, NIS", 0.62),
+    "scene": _Figure("the picture of one exposure as it came, restored, and at rest", 0.36),
+}
+"""Single figures by name."""
+
+
+def save_figure(
+    recording: Recording, what: str, path: str | Path, *, estimators: Sequence[str] | None = None,
+    exposure: int | None = None, output: int = 0, spot: int = 0, unit: TimeUnit = "s", width_mm: float = 180.0,
+    overwrite: bool = False, progress: Progress = no_progress,
+) -> Path:  # fmt: skip
+    """Write one of the figures of `FIGURES` as a PNG, SVG or PDF file.
+
+    Parameters
+    ----------
+    what:
+        Name of the figure.
+    path:
+        The file to write; its ending says the format.
+    estimators:
+        Whose paths and NIS; by default what the figure's own function takes.
+    exposure:
+        Number of the exposure, for ``exposure`` and ``scene``; by default the one with the largest blur.
+    output, spot:
+        Output whose blur is drawn, and spot of the exposure that is drawn.
+    unit:
+        What time axes count.
+    width_mm:
+        Width on paper.
+    overwrite:
+        Whether a file of that name may be replaced.
+    progress:
+        Is told how many exposures have been read.
+
+    Raises
+    ------
+    RecordingError
+        There are no estimates of such a name.
+    ExportError
+        There is no such figure or format, the recording has nothing to draw in it, the file exists already or cannot
+        be written, or matplotlib is missing.
+    """
+    path = Path(path)
+    if what not in FIGURES:
+        raise ExportError(f"there is no figure {what!r}; there are: {', '.join(FIGURES)}")
+    if path.suffix.lower() not in FORMATS:
+        raise ExportError(f"cannot write {path}: a figure is a {', '.join(FORMATS)} file; give such a name")
+    kind = FIGURES[what]
+    with paper():
+        figure = new_figure(width_mm, width_mm * kind.height)
+        if kind.draw is not None:
+            view = overview(recording, estimators, output=output, progress=progress)
+            if kind.draw is plot_blur:
+                names = None if estimators is None else ["truth", *view.names]
+                plot_blur(view, figure.subplots(), names=names, unit=unit)
+            else:
+                kind.draw(view, figure.subplots(), unit=unit)
+        elif what == "pupil":
+            name = by_rank(list(estimators))[-1] if estimators else None
+            plot_pupil(recording, figure, estimator=name)
+        else:
+            number = exposure
+            if number is None:
+                number = _most_blurred(overview(recording, estimators, progress=progress))
+            if what == "scene":
+                plot_scene(recording, number, figure)
+            else:
+                if isinstance(recording.rig.sensor, SpotSensor):
+                    figure.set_figheight(figure.get_figheight() * 1.5)
+                plot_exposure(recording, number, figure, estimators=estimators, spot=spot, unit=unit)
+        metadata = {key: None for suffix, key in _DATED.items() if suffix == path.suffix.lower()}
+        with writing(path, overwrite=overwrite, sources=recording.files, error=ExportError) as partial:
+            figure.savefig(partial, format=path.suffix.lower()[1:], metadata=metadata)
+    return path
+
+
+def _most_blurred(view: Overview) -> int:
+    need_exposures(view)
+    return next(iter(view.telling()))

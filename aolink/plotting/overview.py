@@ -1,0 +1,316 @@
+"""What the figures need of a whole series, read in one pass: a few numbers for each exposure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from aolink.colours import by_rank
+from aolink.errors import ExportError
+from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.frames.spots import profiles
+from aolink.estimation.score import Score, Scorer
+from aolink.exporting.common import Progress, check_frame, no_progress
+from aolink.exporting.series import Series
+from aolink.exposure import Exposure
+from aolink.optics.camera import to_density
+from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
+from aolink.plotting.style import FloatArray, TimeUnit, extremes, hides_swings
+
+NIS_COVERAGE = 0.95
+"""Probability that a consistent estimator's NIS lies inside the bounds drawn."""
+_COLUMNS = 1500
+"""Of the blur over a session: a longer one has several exposures in a column."""
+_POINTS = 17
+"""Of a path within its exposure."""
+_KERNELS = 4.0
+"""What is drawn reaches this many of the kernel's standard deviations beyond the paths."""
+_NONE = -1
+"""In the place of a status where there is no estimate."""
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Paths:
+    """One output's paths over a series, by column of the blur."""
+
+    points: FloatArray
+    """Some points of each path, slope units, (columns, points); NaN where there is no path."""
+    places: FloatArray
+    """Where they are in their column, from 0 to 1, (points,)."""
+    low: FloatArray
+    high: FloatArray
+    """``low`` and ``high``: between which the path is around each point, slope units, (columns, points)."""
+    envelope: bool
+    """Whether the path swings more than its points show."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Overview:
+    """A series of n exposures as `aolink.plotting` draws it. Arrays by name have NaN where there is no estimate."""
+
+    series: Series
+    names: list[str]
+    """The estimators, from the plainest to the one to look at first."""
+    output: int
+    """Which output ``blur`` and ``paths`` are of."""
+    frame_ids: IntArray
+    first_steps: IntArray
+    n_steps: IntArray
+    missing: FloatArray
+    """Share of the frame's pixels that never came, (n,)."""
+    assumed: IntArray
+    """Steps of each exposure whose input the mirror did not report, (n,)."""
+    moved: FloatArray
+    """How far the spots moved: RMS of the path about its mean, slope units, (n,); of the truth or of the last name."""
+    apart: FloatArray
+    """RMS of the last name's path minus the truth, or without a truth minus the first name's, slope units, (n,)."""
+    errors: dict[str, FloatArray]
+    """RMS of the path minus the truth by estimator, slope units, (n,)."""
+    status: dict[str, IntArray]
+    """A `Status` by estimator, -1 where there is no estimate, (n,)."""
+    nis: dict[str, FloatArray]
+    """NIS of the output's axis by estimator, of those that measure something, (n,)."""
+    mean_nis: dict[str, FloatArray]
+    """The same as a mean over all axes of which something was measured, (n,)."""
+    measurements: dict[str, int]
+    """Numbers that an estimator measures of an axis."""
+    scores: dict[str, Score]
+    spans: FloatArray
+    """First step and end of each column of the blur, from the first exposure on, (columns, 2)."""
+    blur: FloatArray
+    """Intensity density over the output's positions, one over slope units, (columns, pixels); NaN: never came."""
+    paths: dict[str, Paths] = field(default_factory=dict)
+    """By ``truth`` and by estimator; those that have any."""
+
+    def __len__(self) -> int:
+        return len(self.frame_ids)
+
+    @property
+    def steps(self) -> IntArray:
+        """First step of each exposure, from that of the first one on, (n,)."""
+        return self.first_steps - self.first_steps[:1]
+
+    @property
+    def frames_lost(self) -> IntArray:
+        """Frames lost between the exposure before and each, (n,)."""
+        return np.asarray(np.maximum(np.diff(self.frame_ids, prepend=self.frame_ids[:1] - 1) - 1, 0))
+
+    def scale(self, unit: TimeUnit) -> float:
+        """What a fast step is in a unit."""
+        return self.series.rig.timing.fast_step_s if unit == "s" else 1.0
+
+    def telling(self) -> dict[int, str]:
+        """The exposures that tell most, by number: why each is one of them. Fewer where they are the same."""
+        told: dict[int, str] = {}
+
+        def tell(number: int, why: str) -> None:
+            told[number] = f"{told[number]}; {why}" if number in told else why
+
+        if np.isfinite(self.moved).any():
+            tell(int(np.nanargmax(self.moved)), "the largest blur")
+        if np.isfinite(self.apart).any():
+            against = "the truth" if self.errors else f"{self.names[0]}"
+            tell(int(np.nanargmax(self.apart)), f"{self.names[-1]} is furthest from {against}")
+        refused = [
+            (int(np.flatnonzero(bad)[0]), name)
+            for name, status in self.status.items()
+            if (bad := (status == Status.GATED) | (status == Status.DIVERGED)).any()
+        ]
+        if refused:
+            number, name = min(refused)
+            tell(number, f"the first that was gated, by {name}")
+        if not told and len(self):
+            tell(0, "the first")
+        return told
+
+
+def overview(
+    series: Series, estimators: Sequence[str] | None = None, *, output: int = 0, progress: Progress = no_progress
+) -> Overview:
+    """Read a series once, for any of the figures.
+
+    Parameters
+    ----------
+    estimators:
+        Those to draw; all by default.
+    output:
+        Number of the output (a row of a path) whose blur and paths are drawn.
+    progress:
+        Is told how many exposures have been read.
+
+    Raises
+    ------
+    RecordingError
+        There are no estimates of such a name.
+    ExportError
+        There is no such output, or the frames are not those of the rig's sensor.
+    """
+    names = by_rank(list(series.named(estimators)))
+    if not 0 <= output < series.rig.n_outputs:
+        raise ExportError(f"there is no output {output}: {series.path} has {series.rig.n_outputs}, counted from 0")
+    gathered = _Gathered(series, names, output)
+    number = 0
+    for number, (exposure, estimates) in enumerate(series.with_estimates(names), 1):
+        check_frame(series, exposure)
+        gathered.add(exposure, estimates)
+        progress(number)
+    return gathered.result()
+
+
+def need_exposures(view: Overview) -> None:
+    """Raise ExportError where there is no exposure to draw."""
+    if not len(view):
+        raise ExportError(f"{view.series.path} holds no exposure to draw; `aolink info` says what it holds")
+
+
+class _Gathered:
+    """The overview as it grows."""
+
+    def __init__(self, series: Series, names: list[str], output: int) -> None:
+        self.series, self.names, self.output = series, names, output
+        self.axis = output // series.rig.plant.n_outputs
+        self.stride = max(1, -(-len(series) // _COLUMNS))
+        self.facts: list[tuple[int, int, int, float, int]] = []
+        self.moved: list[float] = []
+        self.apart: list[float] = []
+        self.errors: dict[str, list[float]] = {name: [] for name in names}
+        self.status: dict[str, list[int]] = {name: [] for name in names}
+        self.nis: dict[str, list[tuple[float, float]]] = {name: [] for name in names}
+        self.measurements: dict[str, int] = {}
+        self.scorers = {name: Scorer() for name in names}
+        self.column: list[tuple[Exposure, dict[str, FloatArray]]] = []
+        self.spans: list[tuple[int, int]] = []
+        self.blur: list[FloatArray] = []
+        self.paths: dict[str, list[tuple[FloatArray, FloatArray, FloatArray, bool]]] = {}
+
+    def add(self, exposure: Exposure, estimates: Sequence[Estimate | None]) -> None:
+        missing = 0.0 if exposure.slopes is not None else 1 - float(np.mean(exposure.mask))
+        self.facts.append(
+            (exposure.frame_id, exposure.first_step, exposure.n_steps, missing, exposure.inputs_assumed)
+        )  # fmt: skip
+        truth = None if exposure.truth is None else exposure.truth.path
+        found = {"truth": truth} if truth is not None else {}
+        for name, estimate in zip(self.names, estimates, strict=True):
+            self.status[name].append(_NONE if estimate is None else int(estimate.status))
+            self.errors[name].append(np.nan if estimate is None or truth is None else _rms(estimate.path - truth))
+            nis = (np.nan, np.nan)
+            if estimate is not None:
+                self.scorers[name].add(exposure, estimate)
+                found[name] = estimate.path
+                if estimate.innovation.shape[1]:
+                    self.measurements[name] = estimate.innovation.shape[1]
+                    seen = estimate.nis[estimate.nis > 0]
+                    nis = (float(estimate.nis[self.axis]), float(seen.mean()) if len(seen) else np.nan)
+            self.nis[name].append(nis)
+        last = self.names[-1] if self.names else ""
+        about = truth if truth is not None else found.get(last)
+        self.moved.append(np.nan if about is None else _rms(about - about.mean(axis=1, keepdims=True)))
+        other = truth if truth is not None else found.get(self.names[0]) if len(self.names) > 1 else None
+        self.apart.append(np.nan if other is None or last not in found else _rms(found[last] - other))
+        self.column.append((exposure, {name: path[self.output] for name, path in found.items()}))
+        if len(self.column) == self.stride:
+            self._close_column()
+
+    def _close_column(self) -> None:
+        """What the exposures of a column have in common: their mean blur, the range of their paths."""
+        if not self.column:
+            return
+        exposures = [exposure for exposure, _ in self.column]
+        self.spans.append((exposures[0].first_step, exposures[-1].first_step + exposures[-1].n_steps))
+        seen = np.stack([profile_density(self.series.rig.sensor, each, self.output) for each in exposures])
+        counted = np.isfinite(seen).sum(axis=0)
+        self.blur.append(np.where(counted > 0, np.nansum(seen, axis=0) / np.maximum(counted, 1), np.nan))
+        for name in ("truth", *self.names):
+            known = [paths[name] for _, paths in self.column if name in paths]
+            lines = self.paths.setdefault(name, [])
+            count = _POINTS if self.stride == 1 else 1
+            if not known:
+                unknown = np.full(count, np.nan)
+                lines.append((unknown, unknown, unknown, False))
+                continue
+            path = np.concatenate(known)
+            low, high = extremes(path, count)
+            if len(low) < count:  # a path of fewer steps than points
+                low, high = np.resize(low, count), np.resize(high, count)
+            some = np.linspace(0, len(path) - 1, count).astype(int)
+            points = path[some] if count > 1 else path.mean(keepdims=True)
+            lines.append((points, low, high, hides_swings(path, count)))
+        self.column = []
+
+    def result(self) -> Overview:
+        self._close_column()
+        facts = np.array(self.facts, dtype=np.float64).reshape(-1, 5)
+        frame_ids, first_steps, n_steps, missing, assumed = facts.T
+        spans = np.array(self.spans, dtype=np.float64).reshape(-1, 2)
+        count = _POINTS if self.stride == 1 else 1
+        paths = {}
+        for name, lines in self.paths.items():
+            points, low, high = (np.array([line[k] for line in lines]) for k in range(3))
+            if np.isfinite(points).any():
+                swings = [line[3] for line in lines if np.isfinite(line[0]).any()]
+                steps = float(n_steps[0])
+                places = np.linspace(0, (steps - 1) / steps, count) if count > 1 else np.array([0.5])
+                envelope = self.stride > 1 or float(np.mean(swings)) > 0.5
+                paths[name] = Paths(points=points, places=places, low=low, high=high, envelope=envelope)
+        truth = any(np.isfinite(each).any() for each in self.errors.values())
+        nis = {name: np.array(values).reshape(-1, 2).T for name, values in self.nis.items()}
+        return Overview(
+            series=self.series,
+            names=self.names,
+            output=self.output,
+            frame_ids=frame_ids.astype(np.int64),
+            first_steps=first_steps.astype(np.int64),
+            n_steps=n_steps.astype(np.int64),
+            missing=missing,
+            assumed=assumed.astype(np.int64),
+            moved=np.array(self.moved),
+            apart=np.array(self.apart),
+            errors={name: np.array(values) for name, values in self.errors.items()} if truth else {},
+            status={name: np.array(values, dtype=np.int64) for name, values in self.status.items()},
+            nis={name: nis[name][0] for name in self.measurements},
+            mean_nis={name: nis[name][1] for name in self.measurements},
+            measurements=self.measurements,
+            scores={name: scorer.result() for name, scorer in self.scorers.items()},
+            spans=spans - (spans[0, 0] if len(spans) else 0),
+            blur=np.array(self.blur),
+            paths=paths,
+        )
+
+
+def profile_density(sensor: BaseSensor, exposure: Exposure, output: int) -> FloatArray:
+    """Intensity density over the positions of one output, one over slope units, (pixels,); NaN: it never came."""
+    counts, mask = exposure.pixels.astype(np.float64), exposure.mask
+    if isinstance(sensor, SpotSensor):
+        found = profiles(sensor, exposure.pixels, exposure.mask)
+        counts, mask = np.asarray(found.counts[output], dtype=np.float64), found.mask[output]
+    return np.where(mask, to_density(sensor.profile, counts), np.nan).ravel()
+
+
+def limits_of(line: Sensor, paths: Sequence[FloatArray]) -> tuple[float, float]:
+    """The part of the field that paths and their blur are in, slope units; the whole field where there is none."""
+    known = [path for path in paths if np.isfinite(path).any()]
+    if not known:
+        return line.field
+    reach = _KERNELS * line.kernel.sigma
+    low = max(min(float(np.nanmin(path)) for path in known) - reach, line.field[0])
+    high = min(max(float(np.nanmax(path)) for path in known) + reach, line.field[1])
+    return (low, high) if low < high else line.field
+
+
+@lru_cache(maxsize=64)
+def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
+    """Between which a consistent estimator's NIS lies in `NIS_COVERAGE` of the exposures (two-sided)."""
+    tail = (1 - NIS_COVERAGE) / 2
+    low, high = 2 * special.gammaincinv(degrees_of_freedom / 2, [tail, 1 - tail])  # of chi-square
+    return float(low), float(high)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

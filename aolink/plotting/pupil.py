@@ -1,0 +1,121 @@
+"""Maps over the pupil of a sensor with many lenslets: light, slopes, blur, consistency."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from aolink.colours import by_rank
+from aolink.errors import ExportError
+from aolink.exporting.common import check_frame
+from aolink.exporting.series import Series
+from aolink.exposure import Exposure
+from aolink.optics.camera import to_density
+from aolink.optics.frame import spot_windows
+from aolink.optics.sensor import SpotSensor
+from aolink.plotting.overview import profile_density
+from aolink.plotting.style import FloatArray, colour_bar, figure_or_new
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure, SubFigure
+
+_EXPOSURES = 24
+"""Read for the maps, spread evenly over the series."""
+_MAP_IN = (2.6, 2.3)
+_LEAST_SPOTS = 4
+
+
+def has_pupil(series: Series) -> bool:
+    """Whether the sensor has lenslets enough for a map."""
+    return isinstance(series.rig.sensor, SpotSensor) and series.rig.sensor.spots >= _LEAST_SPOTS
+
+
+def plot_pupil(
+    series: Series, figure: Figure | SubFigure | None = None, *, estimator: str | None = None, columns: int = 3
+) -> Figure | SubFigure:
+    """Draw maps over the lenslets: light, mean slope in x and in y, blur, NIS; as means over a part of the exposures.
+
+    Slopes and blur are those of the estimated paths; without estimates slopes are the spots' centroids. NIS is
+    drawn where each spot has axes of its own. At most 24 exposures are read, spread evenly over the series.
+
+    Parameters
+    ----------
+    figure:
+        Where to draw; by default a new figure.
+    estimator:
+        Whose paths; by default those of the estimator to look at first.
+    columns:
+        Maps in a row.
+
+    Raises
+    ------
+    RecordingError
+        There are no estimates of such a name.
+    ExportError
+        The sensor has fewer than four lenslets, there is no exposure, or matplotlib is missing.
+    """
+    sensor = series.rig.sensor
+    if not isinstance(sensor, SpotSensor) or not has_pupil(series):
+        raise ExportError(f"{series.path} has no map over the pupil: its sensor has fewer than {_LEAST_SPOTS} lenslets")
+    names = by_rank(list(series.named(None if estimator is None else [estimator])))
+    maps = _maps(series, sensor, names[-1:])
+    rows = -(-len(maps) // columns)
+    figure = figure_or_new(figure, (_MAP_IN[0] * columns, _MAP_IN[1] * rows))
+    for place, (title, (label, values, cmap)) in enumerate(maps.items(), 1):
+        axes = figure.add_subplot(rows, columns, place)
+        shown = np.full(sensor.grid[0] * sensor.grid[1], np.nan)
+        shown[sensor.lit] = values
+        reach = float(np.nanmax(np.abs(values))) if np.isfinite(values).any() else 1.0
+        low = -reach if cmap == "RdBu_r" else 0.0
+        picture = axes.imshow(shown.reshape(sensor.grid), cmap=cmap, vmin=low, vmax=reach or 1.0)
+        axes.set_title(title)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        colour_bar(picture, axes, label)
+    return figure
+
+
+def _maps(series: Series, sensor: SpotSensor, names: Sequence[str]) -> dict[str, tuple[str, FloatArray, str]]:
+    """Each map by its title: what its colours are, a value for each spot, a colour map."""
+    light, slopes, blur, nis = [], [], [], []
+    axes_of_spot = 2 // series.rig.plant.n_outputs if series.rig.plant.n_outputs <= 2 else 0
+    for number in np.unique(np.linspace(0, max(len(series) - 1, 0), _EXPOSURES).astype(int)):
+        for exposure, estimates in series[int(number) : int(number) + 1].with_estimates(names):
+            check_frame(series, exposure)
+            density = np.where(exposure.mask, to_density(sensor, exposure.pixels), 0.0)
+            windows = spot_windows(sensor, density)
+            light.append(windows.sum(axis=(-2, -1)) * sensor.pixel_size if exposure.mask.any() else None)
+            estimate = next(iter(estimates), None)
+            if estimate is None:
+                slopes.append(exposure.slopes if exposure.slopes is not None else _centroids(series, exposure))
+                continue
+            mean = estimate.path.mean(axis=1, keepdims=True)
+            slopes.append(mean[:, 0])
+            blur.append(np.sqrt(np.mean((estimate.path - mean) ** 2, axis=1).reshape(-1, 2).sum(axis=1)))
+            if axes_of_spot and estimate.innovation.shape[1]:
+                measured = np.where(estimate.nis > 0, estimate.nis, np.nan)
+                nis.append(measured.reshape(-1, axes_of_spot).mean(axis=1))
+    if not slopes:
+        raise ExportError(f"{series.path} holds no exposure to draw; `aolink info` says what it holds")
+    slope = np.mean(slopes, axis=0).reshape(-1, 2)
+    by = names[0] if names else "centroid"
+    found = {}
+    if lit := [each for each in light if each is not None]:
+        found["light"] = ("1 = a lenslet wholly lit", np.mean(lit, axis=0), "viridis")
+    found[f"mean slope x ({by})"] = ("slope units", slope[:, 0], "RdBu_r")
+    found[f"mean slope y ({by})"] = ("slope units", slope[:, 1], "RdBu_r")
+    if blur:
+        found[f"blur ({by})"] = ("RMS of the path, slope units", np.mean(blur, axis=0), "magma")
+    if nis:
+        found[f"NIS ({by})"] = ("no unit", np.mean(nis, axis=0), "magma")
+    return found
+
+
+def _centroids(series: Series, exposure: Exposure) -> FloatArray:
+    """Centre of each output's profile, slope units, (n_outputs,)."""
+    line, sensor = series.rig.sensor.profile, series.rig.sensor
+    seen = np.array([np.nan_to_num(profile_density(sensor, exposure, k)) for k in range(series.rig.n_outputs)])
+    light = seen.sum(axis=1)
+    return np.asarray(np.divide(seen @ line.centres, light, out=np.full(len(seen), np.nan), where=light > 0))

@@ -1,0 +1,386 @@
+"""A report: one page of HTML with everything in it, of one recording, of two side by side, or of many."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from html import escape
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from aolink.errors import AolinkError, ExportError
+from aolink.estimation.score import Consistency, Score
+from aolink.files import writing
+from aolink.optics.sensor import SpotSensor
+from aolink.plotting.devices import incidents, plot_latency, plot_losses
+from aolink.plotting.exposure import draw_exposure, exposure_with_estimates
+from aolink.plotting.overview import Overview, overview
+from aolink.plotting.pupil import has_pupil, plot_pupil
+from aolink.plotting.scene import plot_scene
+from aolink.plotting.session import plot_blur, plot_errors, plot_nis
+from aolink.plotting.style import TimeUnit, new_figure, paper
+from aolink.recording import topics
+from aolink.recording.facts import recording_facts
+from aolink.recording.reader import Recording
+from aolink.units import duration, with_unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SIDE_BY_SIDE = 3
+"""So many recordings have all their figures, beside each other; of more there is a table, and one figure of each."""
+_DPI = 150
+"""Of what is no line in a figure."""
+_WIDE, _NARROW = (160.0, 66.0), (110.0, 66.0)
+"""Width and height of figures, mm."""
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #fff; max-width: 75rem; margin: 0 auto;
+  padding: 1rem; }
+h1 { font-size: 1.5rem; margin: 0 0 .3rem; } h2 { font-size: 1.15rem; margin: 1.6rem 0 .4rem;
+  border-bottom: 1px solid #ccc; } h3 { font-size: 1rem; margin: .6rem 0 .2rem; overflow-wrap: anywhere; }
+.row { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); gap: 1rem; }
+.row > * { min-width: 0; } .pairs { grid-template-columns: repeat(auto-fit, minmax(min(30rem, 100%), 1fr)); }
+figure { margin: .4rem 0; break-inside: avoid; } img { width: 100%; height: auto; }
+figcaption, .note { font-size: .875rem; color: #444; margin: .2rem 0; overflow-wrap: anywhere; }
+.scroll { overflow-x: auto; } table { border-collapse: collapse; font-size: .875rem; }
+th, td { text-align: left; padding: .15rem .55rem .15rem 0; vertical-align: top; border-bottom: 1px solid #eee; }
+td.n, th.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums; }
+td.off { font-weight: 600; color: #a33000; } td { overflow-wrap: anywhere; }
+pre { font-size: .75rem; white-space: pre-wrap; overflow-wrap: anywhere; }
+@media print { body { font-size: 10pt; max-width: none; padding: 0; } h2 { break-after: avoid; }
+  .row { grid-template-columns: repeat(auto-fit, minmax(8cm, 1fr)); } .scroll { overflow: visible; }
+  th, td { padding-right: .3rem; font-size: 7pt; } tr { break-inside: avoid; } }
+@page { margin: 15mm; }
+"""
+
+
+def write_report(
+    recordings: Sequence[Recording], path: str | Path, *, unit: TimeUnit = "s", overwrite: bool = False,
+    progress: Callable[[str, int], None] | None = None,
+) -> Path:  # fmt: skip
+    """Write a page of HTML that says what recordings hold and how good their estimates are.
+
+    Figures, style and all else are in the one file; it has no scripts and loads nothing. What a recording does not
+    have, or what cannot be read of it, is said in its place. Up to three recordings stand side by side with all their
+    figures; of more there is a table, and for each one figure of the session.
+
+    Parameters
+    ----------
+    unit:
+        What time axes count.
+    overwrite:
+        Whether a file of that name may be replaced.
+    progress:
+        Is told the name of the recording that is read, and how many of its exposures have been.
+
+    Raises
+    ------
+    ExportError
+        There is no recording, the file exists already or cannot be written, or matplotlib is missing.
+    """
+    path = Path(path)
+    if not recordings:
+        raise ExportError("a report needs a recording")
+    sources = [each for recording in recordings for each in recording.files]
+    with (
+        paper(),
+        writing(path, overwrite=overwrite, sources=sources, suffix=path.suffix, error=ExportError) as partial,
+    ):
+        sessions = [_Session(each, unit, progress or (lambda name, done: None)) for each in recordings]
+        partial.write_text(_page(sessions), encoding="utf-8")
+    return path
+
+
+class _Session:
+    """One recording, as parts of a page."""
+
+    def __init__(self, recording: Recording, unit: TimeUnit, progress: Callable[[str, int], None]) -> None:
+        self.recording, self.unit = recording, unit
+        self.name = recording.path.name
+        self.view: Overview | None = None
+        self.problem = ""
+        try:
+            self.view = overview(recording, progress=lambda done: progress(self.name, done))
+        except (AolinkError, ValueError, ArithmeticError) as error:
+            self.problem = str(error)
+        self.facts = recording_facts(recording)  # after all of it was read: damage is known then
+
+    def title(self) -> str:
+        return f"<h3>{escape(self.name)}</h3>"
+
+    def drawn(
+        self, size: tuple[float, float], caption: str, draw: Callable[[Overview, Figure], object]
+    ) -> str:  # fmt: skip
+        """A figure with its caption; where it cannot be drawn, why."""
+        if self.view is None:
+            return _note(self.problem)
+        try:
+            figure = new_figure(*size)
+            draw(self.view, figure)
+            return _image(figure, caption)
+        except AolinkError as error:
+            return _note(str(error))
+
+    def what_it_was(self) -> str:
+        """The session's facts."""
+        facts = self.facts
+        rows = {
+            "recorded": (facts["start_utc"] or "").replace("T", " ").replace("+00:00", " UTC"),
+            "duration": duration(facts["duration_s"]),
+            "size": with_unit(facts["bytes"], "B"),
+            **self.recording.facts(),
+            "gaps": f"{facts['gaps']['count']}, the longest {facts['gaps']['longest_steps']} fast steps",
+            "steps": _counts(facts["commands"]) or "no account of commanded steps",
+            "losses": _counts(facts["losses"]) or "none counted",
+            "damage": facts["damage"],
+        }
+        session = facts["session"]
+        rows |= {key: str(session[key]) for key in ("note", "camera", "mirror", "seed") if session.get(key)}
+        return _facts(rows)
+
+    def lacks(self) -> list[str]:
+        """What is not in the recording, in sentences."""
+        recording, said = self.recording, []
+        if self.view is not None and not len(self.view):
+            said.append("It holds no exposure: there is nothing to draw.")
+        if not recording.estimators:
+            said.append("It holds no estimates; `aolink estimate` makes them.")
+        if not recording.has_truth:
+            said.append("The truth is not known, so there are no errors, only NIS.")
+        if topics.COMMAND not in recording.counts:
+            said.append("It holds no commands.")
+        if topics.APPLIED not in recording.counts:
+            said.append("It holds no reports of what the mirror did; inputs are those commanded, or zero.")
+        if recording.rig.scene is not None and topics.RESTORED_SCENE not in recording.counts:
+            said.append("Its pictures were not restored; `aolink deblur` does that.")
+        if recording.damage:
+            said.append(f"It is damaged: {recording.damage}.")
+        return said
+
+    def scores(self) -> str:
+        """The demo's table."""
+        if self.view is None or not self.view.scores:
+            return _note(self.problem or "No estimates.")
+        return _score_table(self.view.scores)
+
+    def exposures(self) -> str:
+        """The exposures that tell most."""
+        if self.view is None:
+            return _note(self.problem)
+        parts = []
+        spots = isinstance(self.recording.rig.sensor, SpotSensor)
+        for number, why in self.view.telling().items():
+            exposure, estimates = exposure_with_estimates(self.recording, number)
+            status = "; ".join(
+                f"{name}: {each.status.name.lower()} ({each.reason})" for name, each in estimates.items() if each.reason
+            )
+            caption = f"Exposure {number} (frame {exposure.frame_id}): {why}. {status}"
+            size = (_WIDE[0], _WIDE[1] * (1.45 if spots else 1.0))
+
+            def draw(_: Overview, figure: Figure, exposure: Any = exposure, estimates: Any = estimates) -> None:
+                draw_exposure(self.recording, exposure, estimates, figure, unit=self.unit)
+
+            parts.append(self.drawn(size, caption, draw))
+        return "".join(parts) or _note("No exposure.")
+
+    def scene(self) -> str:
+        """The picture of the first exposure that was restored; without one, of the one that is blurred most."""
+        number = next(iter(self.view.telling()), 0) if self.view is not None else 0
+        frames = self.view.frame_ids.tolist() if self.view is not None else []
+        for each in self.recording.restored():
+            if (each.scene is not None or each.spots is not None) and each.frame_id in frames:
+                number = frames.index(each.frame_id)
+                break
+        caption = f"The picture of exposure {number}."
+        return self.drawn(_WIDE, caption, lambda _, figure: plot_scene(self.recording, number, figure))
+
+    def blur(self) -> str:
+        return self.drawn(
+            _NARROW, "What the camera saw, and where the spot was.",
+            lambda view, figure: plot_blur(view, figure.subplots(), unit=self.unit),
+        )  # fmt: skip
+
+    def nis(self) -> str:
+        return self.drawn(
+            _NARROW, "NIS of each estimator; dashed: the bounds of 95 % of a consistent estimator's values.",
+            lambda view, figure: plot_nis(view, figure.subplots(), unit=self.unit),
+        )  # fmt: skip
+
+    def errors(self) -> str:
+        return self.drawn(
+            _NARROW, "Error of the path against the truth, a running mean.",
+            lambda view, figure: plot_errors(view, figure.subplots(), unit=self.unit),
+        )  # fmt: skip
+
+    def losses(self) -> str:
+        if self.view is not None and not incidents(self.view):
+            return _note("No frame was lost or incomplete, no exposure was gated or skipped.")
+        return self.drawn(
+            _NARROW, "What was lost, gated or skipped, and when.",
+            lambda view, figure: plot_losses(view, figure.subplots(), unit=self.unit),
+        )  # fmt: skip
+
+    def latencies(self) -> str:
+        return self.drawn(
+            _NARROW, "When each step of the loop was done, and how long an estimate took (dashed).",
+            lambda view, figure: plot_latency(view, figure.subplots(), unit=self.unit),
+        )  # fmt: skip
+
+    def pupil(self) -> str:
+        """Maps over the lenslets."""
+        return self.drawn(
+            (_WIDE[0], 95.0), "Over the pupil, as means over exposures spread over the session.",
+            lambda _, figure: plot_pupil(self.recording, figure),
+        )  # fmt: skip
+
+
+_OVER_SESSION = {
+    "Blur and paths": _Session.blur,
+    "Consistency": _Session.nis,
+    "Errors": _Session.errors,
+    "Losses": _Session.losses,
+    "Latencies": _Session.latencies,
+}
+"""Figures over the session, by their titles."""
+
+
+def _page(sessions: Sequence[_Session]) -> str:
+    many = len(sessions) > _SIDE_BY_SIDE
+    title = ", ".join(each.name for each in sessions[:_SIDE_BY_SIDE]) + (
+        f" and {len(sessions) - 3} more" if many else ""
+    )
+    parts = [f"<h1>{escape(title)}</h1>", _note(f"A report by aolink {version('aolink')}.")]
+    if len(sessions) > 1:
+        parts += ["<h2>Beside each other</h2>", _comparison(sessions)]
+    if many:
+        parts.append("<h2>Each of them</h2>")
+        for each in sessions:
+            parts += [each.title(), *map(_note, each.lacks()), _row([each.blur(), each.scores()])]
+    else:
+        parts.extend(_sections(sessions))
+    body = "\n".join(parts)
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(title)}</title><style>{_STYLE}</style>"
+    )
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
+
+
+def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
+    """All that there is of a few sessions, each section side by side."""
+    one = len(sessions) == 1
+
+    def beside(title: str, give: Callable[[_Session], str]) -> str:
+        return f"<h2>{title}</h2>" + _row([("" if one else each.title()) + give(each) for each in sessions])
+
+    yield beside("The session", lambda each: each.what_it_was() + "".join(map(_note, each.lacks())))
+    yield beside("The estimates", _Session.scores)
+    yield beside("Inside the exposures that tell most", _Session.exposures)
+    if one:
+        figures = [draw(sessions[0]) for draw in _OVER_SESSION.values()]
+        yield "<h2>Over the session</h2>" + _row(figures, "row pairs")
+    else:
+        for title, draw in _OVER_SESSION.items():
+            yield beside(title, draw)
+    if any(has_pupil(each.recording) for each in sessions):
+        yield beside("Over the pupil", _Session.pupil)
+    if any(each.recording.rig.scene is not None or topics.RESTORATION in each.recording.counts for each in sessions):
+        yield beside("Before and after", _Session.scene)
+    yield beside("Configuration", lambda each: f"<pre>{escape(each.recording.rig.toml)}</pre>")
+
+
+def _comparison(sessions: Sequence[_Session]) -> str:
+    """A row for each recording and estimator."""
+    heads = ("recording", "rig", "exposures", "estimator", "RMSE path", "RMSE end", "NIS", "NEES end", "gated")
+    rows = []
+    for each in sessions:
+        count = str(len(each.recording))
+        known = each.view.scores if each.view is not None else {}
+        if not known:
+            rows.append(
+                [_text(each.name), _text(each.recording.rig.name), _number(count), *[_text("none")], *["<td></td>"] * 5]
+            )
+        for name, score in known.items():
+            rows.append([
+                _text(each.name), _text(each.recording.rig.name), _number(count), _text(name),
+                _number(_rounded(score.path_rmse, score)), _number(_rounded(score.end_rmse, score)),
+                _consistency(score.nis), _consistency(score.end_nees), _number(str(score.gated)),
+            ])  # fmt: skip
+    return _table(heads, rows, text_columns=(0, 1, 3))
+
+
+def _score_table(scores: Mapping[str, Score]) -> str:
+    """RMSE, NIS and NEES as `aolink estimate` prints them, and why measurements were not used."""
+    truth = any(score.exposures for score in scores.values())
+    heads = ["estimator", *(("RMSE start", "RMSE end", "RMSE path") if truth else ()), "NIS"]
+    heads += ["NEES start", "NEES end"] if truth else []
+    gated = any(score.gated for score in scores.values())
+    heads += ["gated"] if gated else []
+    rows = []
+    for name, score in scores.items():
+        errors = [_number(_rounded(each, score)) for each in (score.start_rmse, score.end_rmse, score.path_rmse)]
+        nees = [_consistency(score.start_nees), _consistency(score.end_nees)]
+        row = [_text(name), *(errors if truth else ()), _consistency(score.nis), *(nees if truth else ())]
+        rows.append([*row, *([_number(str(score.gated))] if gated else ())])
+    notes = ["! is outside the 95 % bounds of a consistent filter. RMSE of the path is in slope units."]
+    notes += [f"{name}: {each.text(score.estimated)}" for name, score in scores.items() for each in score.unused[:3]]
+    return _table(heads, rows, text_columns=(0,)) + "".join(map(_note, notes))
+
+
+def _rounded(value: float, score: Score) -> str:
+    return f"{value:.4f}" if score.exposures and math.isfinite(value) else "-"
+
+
+def _consistency(value: Consistency) -> str:
+    if math.isnan(value.mean):
+        return _number("-")
+    bounds = f"{value.low:.2f} to {value.high:.2f}"
+    mark, kind = ("", "n") if value.inside else (" !", "n off")
+    return f'<td class="{kind}" title="95 % bounds: {bounds}">{value.mean:.2f}{mark}</td>'
+
+
+def _text(text: str) -> str:
+    return f"<td>{escape(text)}</td>"
+
+
+def _number(text: str) -> str:
+    return f'<td class="n">{escape(text)}</td>'
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], *, text_columns: Sequence[int]) -> str:
+    """A table of cells that are HTML."""
+    head = "".join(
+        f"<th>{name}</th>" if k in text_columns else f'<th class="n">{name}</th>' for k, name in enumerate(heads)
+    )
+    body = "".join(f"<tr>{''.join(row)}</tr>" for row in rows)
+    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _facts(rows: Mapping[str, str]) -> str:
+    body = "".join(f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in rows.items() if text)
+    return f'<div class="scroll"><table><tbody>{body}</tbody></table></div>'
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items() if count)
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{escape(text)}</p>' if text else ""
+
+
+def _row(parts: Sequence[str], kind: str = "row") -> str:
+    return f'<div class="{kind}">{"".join(f"<div>{part}</div>" for part in parts)}</div>'
+
+
+def _image(figure: Figure, caption: str) -> str:
+    """A figure inside the page."""
+    file = io.BytesIO()
+    figure.savefig(file, format="svg", dpi=_DPI, metadata={"Date": None})
+    data = base64.b64encode(file.getvalue()).decode()
+    text = escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/svg+xml;base64,{data}"><figcaption>{text}</figcaption></figure>'

@@ -1,0 +1,74 @@
+"""A picture as it came, without its blur, and at rest."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from aolink.errors import ExportError
+from aolink.plotting.exposure import exposure_with_estimates
+from aolink.plotting.style import FloatArray, figure_or_new
+from aolink.recording.reader import Recording
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure, SubFigure
+
+_PICTURE_IN = (3.0, 3.2)
+
+
+def plot_scene(
+    recording: Recording, number: int, figure: Figure | SubFigure | None = None
+) -> Figure | SubFigure:  # fmt: skip
+    """Draw the picture sensor's scene of one exposure: as it came, restored, and at rest, so far as they are there.
+
+    All have the same grey: black is dark, white an intensity of one. Pixels that never came are red. In a recording
+    of a rig without a picture sensor whose spots were restored, it is the frame of the spots.
+
+    Parameters
+    ----------
+    number:
+        Number of the exposure in the recording, counted from 0.
+    figure:
+        Where to draw; by default a new figure.
+
+    Raises
+    ------
+    ExportError
+        There is no such exposure, it has no picture and was not restored, or matplotlib is missing.
+    """
+    pictures = _pictures(recording, number)
+    figure = figure_or_new(figure, (_PICTURE_IN[0] * len(pictures), _PICTURE_IN[1]))
+    axes = figure.subplots(1, len(pictures), squeeze=False)[0]
+    shown: Any = None
+    for each, (title, picture) in zip(axes, pictures.items(), strict=True):
+        each.set_facecolor("tab:red")
+        shown = each.imshow(picture, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
+        each.set_title(title)
+        each.set_xticks([])
+        each.set_yticks([])
+    what = "intensity (1 = full)" if recording.rig.scene is not None else "share of the brightest pixel"
+    figure.colorbar(shown, ax=list(axes), label=what, shrink=0.8)
+    return figure
+
+
+def _pictures(recording: Recording, number: int) -> dict[str, FloatArray]:
+    """Pictures of one exposure by what they are, intensity; NaN where a pixel never came."""
+    exposure, _ = exposure_with_estimates(recording, number, [])
+    restored = next((each for each in recording.restored() if each.frame_id == exposure.frame_id), None)
+    sensor, found = recording.rig.scene, {}
+    if sensor is not None and exposure.scene is not None:
+        found["as it came"] = np.where(exposure.scene.mask, sensor.to_intensity(exposure.scene.pixels), np.nan)
+        if restored is not None and restored.scene is not None:
+            found[f"restored ({restored.estimator}, {restored.method})"] = restored.scene.astype(np.float64)
+        if (true := recording.true_scene) is not None:
+            found["at rest"] = sensor.to_intensity(true)
+    elif restored is not None and restored.spots is not None:
+        light = exposure.pixels.astype(np.float64) - recording.rig.sensor.black_level
+        seen = np.where(exposure.mask, light, np.nan)
+        found["the frame as it came"] = seen / max(float(np.nanmax(seen)), 1e-12)
+        spots = restored.spots.astype(np.float64)
+        found[f"restored ({restored.estimator}, {restored.method})"] = spots / max(float(spots.max()), 1e-12)
+    if not found:
+        raise ExportError(f"exposure {number} of {recording.path} has no picture; `aolink deblur` restores frames")
+    return found

@@ -1,0 +1,173 @@
+"""Figures of a whole session, each on axes that are given or made: blur and paths, NIS, errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.errors import ExportError
+from aolink.estimation.estimate import Status
+from aolink.plotting.overview import NIS_COVERAGE, Overview, limits_of, need_exposures, nis_bounds
+from aolink.plotting.style import FloatArray, TimeUnit, axes_or_new, colour, colour_bar, legend_above
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_BRIGHTEST = 98.0
+"""Percentile of the columns' brightest pixels that is drawn black."""
+_RUNNING = 20
+"""The errors are averaged over this share of the session."""
+_MOST_POINTS = 3000
+"""Of a line: a longer one is drawn as the range of its values."""
+
+
+def plot_blur(
+    view: Overview, axes: Axes | None = None, *, names: Sequence[str] | None = None, unit: TimeUnit = "s",
+    bar: bool = True,
+) -> Axes:  # fmt: skip
+    """What the camera saw of one output, exposure by exposure, and where the spot was.
+
+    Parameters
+    ----------
+    names:
+        Whose paths are drawn: ``truth`` or estimators; by default the truth and the estimator to look at first.
+    bar:
+        Whether a colour bar says what the grey is.
+
+    Raises
+    ------
+    ExportError
+        There is no exposure, or matplotlib is missing.
+    """
+    need_exposures(view)
+    axes, scale, line = axes_or_new(axes), view.scale(unit), view.series.rig.sensor.profile
+    blur = np.full((line.pixels, 2 * len(view.spans) - 1), np.nan)
+    blur[:, ::2] = view.blur.T  # a lost frame leaves its place empty
+    brightest = [float(np.nanmax(each)) for each in view.blur if np.isfinite(each).any()]
+    top = float(np.percentile(brightest, _BRIGHTEST)) if brightest else line.peak_density
+    grey = axes.pcolormesh(
+        np.ravel(view.spans) * scale, line.edges, blur, cmap="Greys", vmin=0, vmax=1.2 * max(top, 1e-12),
+        rasterized=True,
+    )  # fmt: skip
+    if bar:
+        colour_bar(grey, axes, "intensity (1 / slope unit)")
+    chosen = ["truth", *view.names[-1:]] if names is None else names
+    for name in [each for each in chosen if each in view.paths]:
+        _draw_paths(axes, view, name, scale)
+    axes.set(ylabel=f"output {view.output} (slope units)", xlim=(0, view.spans[-1, 1] * scale))
+    drawn = [each for name, of in view.paths.items() if name in chosen for each in (of.low, of.high)]
+    axes.set_ylim(limits_of(line, drawn))
+    axes.set_xlabel(time_label(unit))
+    legend_above(axes)
+    return axes
+
+
+def _draw_paths(axes: Axes, view: Overview, name: str, scale: float) -> None:
+    """Paths as one line with gaps between exposures; where they swing too fast for that, their range."""
+    paths = view.paths[name]
+    begin, end = view.spans[:, :1], view.spans[:, 1:]
+    gap = np.full((len(begin), 1), np.nan)
+    width = 1.4 if name == "truth" else 0.9
+    if paths.envelope:
+        edges = np.linspace(0, 1, len(paths.places) + 1)
+        times = begin + (end - begin) * np.repeat(edges, 2)[1:-1]
+        low, high = np.repeat(paths.low, 2, axis=1), np.repeat(paths.high, 2, axis=1)
+        times, low, high = (np.concatenate([each, gap], axis=1).ravel() for each in (times * scale, low, high))
+        axes.fill_between(
+            times, low, high, color=colour(name), alpha=0.35, linewidth=0.3, label=f"{name} (range)", rasterized=True
+        )  # fmt: skip
+        return
+    times = np.concatenate([(begin + (end - begin) * paths.places) * scale, gap], axis=1).ravel()
+    axes.plot(
+        times, np.concatenate([paths.points, gap], axis=1).ravel(), color=colour(name), linewidth=width, label=name
+    )  # fmt: skip
+
+
+def plot_nis(
+    view: Overview, axes: Axes | None = None, *, one_axis: bool = False, unit: TimeUnit = "s"
+) -> Axes:  # fmt: skip
+    """The NIS of each estimator with the interval that holds 95 % of its values if the filter is consistent.
+
+    Of many axes it is their mean, whose interval is narrower; with ``one_axis`` that of the overview's output.
+    What was gated is a cross.
+
+    Raises
+    ------
+    ExportError
+        There is no NIS: no estimates, or only of estimators that measure nothing; or matplotlib is missing.
+    """
+    need_exposures(view)
+    found = view.nis if one_axis else view.mean_nis
+    if not found:
+        raise ExportError(f"{view.series.path} holds no NIS: it has no estimates by an estimator that measures")
+    axes, times = axes_or_new(axes), np.asarray(view.steps * view.scale(unit), dtype=np.float64)
+    count = 1 if one_axis else view.series.rig.plant.axes
+    drawn: dict[int, list[str]] = {}
+    for name, values in found.items():
+        _line(axes, times, values, name)
+        drawn.setdefault(view.measurements[name], []).append(name)
+        gated = np.isin(view.status[name], (Status.GATED, Status.DIVERGED))
+        if gated.any():
+            axes.plot(
+                times[gated], values[gated], "x", color=colour(name), markersize=5, label=f"{name}, gated"
+            )  # fmt: skip
+    for degrees, names in drawn.items():
+        for bound in nis_bounds(degrees * count):
+            axes.axhline(bound / count, color=colour(names[-1]), linewidth=0.7, linestyle="--", zorder=1)
+    positive = any((values > 0).any() for values in found.values())
+    mean = " (mean over the axes)" if count > 1 else ""
+    axes.set(ylabel=f"NIS{mean}", xlabel=f"{time_label(unit)};  - - -  {NIS_COVERAGE:.0%} bounds")
+    if positive:
+        axes.set_yscale("log")
+    legend_above(axes)
+    return axes
+
+
+def plot_errors(view: Overview, axes: Axes | None = None, *, unit: TimeUnit = "s") -> Axes:
+    """RMSE of each estimator's path along the session, as a running mean over a twentieth of it.
+
+    Raises
+    ------
+    ExportError
+        The series holds no truth or no estimates, or matplotlib is missing.
+    """
+    need_exposures(view)
+    if not view.errors:
+        raise ExportError(f"{view.series.path} holds no errors: it has no truth or no estimates")
+    axes, scale = axes_or_new(axes), view.scale(unit)
+    for name, errors in view.errors.items():
+        known = np.isfinite(errors)
+        if not known.any():
+            continue
+        width = max(1, int(known.sum()) // _RUNNING)
+        kernel = np.full(width, 1 / width)
+        times = np.convolve(view.steps[known] * scale, kernel, mode="valid")
+        running = np.sqrt(np.convolve(errors[known] ** 2, kernel, mode="valid"))
+        axes.plot(*thinned(times, running), color=colour(name), label=name)
+    axes.set(yscale="log", xlabel=time_label(unit), ylabel="RMSE of the path (slope units)")
+    axes.grid(alpha=0.3)
+    legend_above(axes)
+    return axes
+
+
+def time_label(unit: TimeUnit) -> str:
+    """What is written at a time axis."""
+    return "time (s)" if unit == "s" else "fast step"
+
+
+def thinned(times: NDArray[Any], values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A line of at most some thousand points that shows the same ranges: of many points the extremes of each run."""
+    if len(times) <= _MOST_POINTS:
+        return np.asarray(times, dtype=np.float64), values
+    runs = np.array_split(np.arange(len(times)), _MOST_POINTS // 2)
+    filled = np.where(np.isfinite(values), values, np.nanmean(values) if np.isfinite(values).any() else 0.0)
+    chosen = np.unique([run[pick] for run in runs for pick in (filled[run].argmin(), filled[run].argmax())])
+    return np.asarray(times, dtype=np.float64)[chosen], values[chosen]
+
+
+def _line(axes: Axes, times: FloatArray, values: FloatArray, name: str) -> None:
+    marker = ".-" if len(times) <= 200 else "-"
+    axes.plot(*thinned(times, values), marker, color=colour(name), linewidth=0.6, markersize=3, label=name)

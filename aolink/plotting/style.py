@@ -1,0 +1,97 @@
+"""What all figures share: sizes, colours, the axes and figures that are given or made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.colours import estimator_colour
+from aolink.exporting.common import needed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+FloatArray = NDArray[np.float64]
+TimeUnit = Literal["s", "steps"]
+"""What a time axis counts: seconds, or fast steps."""
+
+BAND = 2.0
+"""Standard deviations to each side of an estimate."""
+MM = 1 / 25.4
+"""A millimetre in inches."""
+_PAPER: dict[Any, Any] = {
+    "font.size": 8, "axes.linewidth": 0.6, "lines.linewidth": 1.0, "legend.frameon": False, "legend.fontsize": 7,
+    "axes.spines.top": False, "axes.spines.right": False, "pdf.fonttype": 42, "savefig.dpi": 300,
+    "axes.titlesize": 8,
+}  # fmt: skip
+_ENVELOPE_FROM = 0.5
+"""Where a line through some points of a path misses it by this share of its motion (RMS), its range is drawn."""
+
+
+@contextmanager
+def paper() -> Iterator[None]:
+    """Small type and thin lines, for figures made in the block. Raises ExportError without matplotlib."""
+    with needed("matplotlib", "plot", "a figure").rc_context(_PAPER):
+        yield
+
+
+def new_figure(width_mm: float, height_mm: float) -> Figure:
+    """An empty figure of a size on paper. Raises ExportError without matplotlib."""
+    figure = needed("matplotlib.figure", "plot", "a figure")
+    made: Figure = figure.Figure(figsize=(width_mm * MM, height_mm * MM), layout="constrained")
+    return made
+
+
+def axes_or_new(axes: Axes | None) -> Axes:
+    """The axes given, or those of a new figure that a notebook shows. Raises ExportError without matplotlib."""
+    if axes is None:
+        axes = needed("matplotlib.pyplot", "plot", "a plot").subplots(layout="constrained")[1]
+    return axes
+
+
+def figure_or_new(figure: Figure | SubFigure | None, size_in: tuple[float, float]) -> Figure | SubFigure:
+    """The figure given, or a new one that a notebook shows. Raises ExportError without matplotlib."""
+    if figure is None:
+        figure = needed("matplotlib.pyplot", "plot", "a plot").figure(figsize=size_in, layout="constrained")
+    return figure
+
+
+def colour(name: str) -> tuple[float, ...]:
+    """As in the viewer, but for the truth, whose yellow is hard to see on white."""
+    return (0.0, 0.0, 0.0) if name == "truth" else tuple(part / 255 for part in estimator_colour(name))
+
+
+def legend_above(axes: Axes, columns: int = 5) -> None:
+    """A legend over the axes, where it covers no curve; none where nothing has a label."""
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(
+            loc="lower left",
+            bbox_to_anchor=(0, 1),
+            borderaxespad=0.2,
+            ncols=columns,
+            columnspacing=1.0,
+            handlelength=1.5,
+        )
+
+
+def colour_bar(mapped: Any, axes: Axes, label: str) -> None:
+    """A colour bar beside the axes, with what it shows and its unit."""
+    axes.figure.colorbar(mapped, ax=axes, label=label, shrink=0.9)
+
+
+def extremes(path: FloatArray, segments: int) -> tuple[FloatArray, FloatArray]:
+    """The least and the largest value of a path in each of so many segments of it, (segments,) each."""
+    parts = np.array_split(path, min(segments, len(path)))
+    return np.array([part.min() for part in parts]), np.array([part.max() for part in parts])
+
+
+def hides_swings(path: FloatArray, count: int) -> bool:
+    """Whether a line through ``count`` points of a path, spread evenly, misses most of its motion."""
+    places = np.linspace(0, len(path) - 1, min(count, len(path)))
+    drawn = np.interp(np.arange(len(path)), places, path[places.astype(int)])
+    return bool(np.std(path - drawn) > _ENVELOPE_FROM * np.std(path))

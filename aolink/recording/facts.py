@@ -1,0 +1,113 @@
+"""What a recording holds: rates, gaps, losses, estimates, the session's own facts; as plain data."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import Any
+
+from aolink.estimation import Status
+from aolink.estimation.score import UnusedCounter
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.recording.schemas_pb2 import Estimate as EstimateMessage
+from aolink.recording.schemas_pb2 import ExposureInfo
+
+_LOSSES = (
+    "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
+    "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_refused", "steps_not_reported",
+    "steps_clipped", "steps_parked",
+)  # fmt: skip
+"""What a session counts of what went wrong."""
+_ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")
+"""Steps that a session commanded, and how they ended: the first is the sum of the others."""
+
+
+def recording_facts(recording: Recording) -> dict[str, Any]:
+    """What a recording holds, as plain data: what `aolink info --json` prints."""
+    duration_s = (recording.end_ns - recording.start_ns) / 1e9
+    gaps, estimates = _gaps_and_estimates(recording)
+    return {
+        "file": str(recording.path),
+        "bytes": recording.size,
+        "complete": recording.complete,
+        "damage": recording.damage,
+        "start_ns": recording.start_ns,
+        "start_utc": _date(recording.start_ns),
+        "duration_s": duration_s,
+        "messages": dict(sorted(recording.counts.items())),
+        "rates_per_s": {
+            topic: round((count - 1) / duration_s, 3)
+            for topic, count in sorted(recording.counts.items())
+            if duration_s and count > 1
+        },
+        "gaps": gaps,
+        "estimates": estimates,
+        "commands": {
+            end: int(steps) for end in _ENDS if (steps := recording.end_metadata.get(f"steps_{end}", "")).isdigit()
+        },
+        "losses": _losses(recording),
+        "damaged_parts": [loss.text() for loss in recording.losses],
+        "truth": topics.TRUTH in recording.counts,
+        "session": {name: _typed(name, value) for name, value in recording.metadata.items()},
+        "estimators": recording.estimators,
+    }
+
+
+def _date(time_ns: int) -> str | None:
+    """A time on the host's clock as a date, ISO 8601; None for one that no calendar has."""
+    try:
+        return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="seconds")
+    except (OverflowError, ValueError, OSError):
+        return None
+
+
+def _gaps_and_estimates(recording: Recording) -> tuple[dict[str, float], dict[str, Any]]:
+    """Where the camera's frames are further apart than their period: how often, and the longest, in fast steps.
+
+    And for each estimator how many estimates there are, and why some could not use their exposure.
+    """
+    period, last, gaps = recording.rig.timing.frame_period_steps, None, []
+    names = recording.estimators
+    counts, unused = dict.fromkeys(names, 0), {name: UnusedCounter() for name in names}
+    for recorded in recording.messages(topics.EXPOSURE, *map(topics.estimate_topic, names)):
+        message = recorded.message
+        if isinstance(message, ExposureInfo):
+            if last is not None and message.first_step - last != period:
+                gaps.append(message.first_step - last - period)
+            last = message.first_step
+        elif isinstance(message, EstimateMessage):
+            name = recorded.topic.removeprefix(topics.ESTIMATE)
+            counts[name] += 1
+            with contextlib.suppress(ValueError):  # a status that a later aolink has
+                unused[name].add(Status(message.status), message.reason, message.frame_id)
+    estimates = {name: {"count": n, "unused": [asdict(u) for u in unused[name].result()]} for name, n in counts.items()}
+    return {"count": len(gaps), "longest_steps": max(gaps, default=0)}, estimates
+
+
+def _losses(recording: Recording) -> dict[str, int]:
+    """What was lost in the session, by cause; and in the file."""
+    counted = {
+        name: int(recording.metadata[name])
+        for name in _LOSSES
+        if recording.metadata.get(name, "0").isdigit() and int(recording.metadata.get(name, "0"))
+    }
+    for name, value in recording.metadata.items():  # exposures, by the estimator that had no time for them
+        if name.startswith("skipped_") and value.isdigit() and int(value):
+            counted[name] = int(value)
+    if recording.losses:
+        counted["parts_of_the_file"] = len(recording.losses)
+    return counted
+
+
+def _typed(name: str, value: str) -> Any:
+    """A value of the metadata, which knows text only."""
+    if name in ("note", "rig", "rig_digest", "camera", "mirror"):
+        return value
+    with contextlib.suppress(ValueError):
+        if value.lstrip("-").isdigit():
+            return int(value)
+        return number if math.isfinite(number := float(value)) else None
+    return {"True": True, "False": False}.get(value, value)
