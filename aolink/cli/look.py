@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, stdout
 from aolink.errors import FrameError, ViewerError
 from aolink.files import check_target
 
@@ -52,7 +52,8 @@ def view(
         rrd = Path(recorded)
         if recording is not None:
             rrd = save or Path(folder) / f"{file.stem}.rrd"
-            viewing.save_rrd(recording, rrd, overwrite=overwrite)
+            with progress("write .rrd", len(recording.estimators) + 2) as tell:
+                viewing.save_rrd(recording, rrd, overwrite=overwrite, progress=tell)
         if save is not None:
             stdout.print(f"written: {save}", markup=False)
         if screenshot is not None:

@@ -9,17 +9,20 @@ from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from aolink.signals import Interrupted
 
 
 @contextmanager
 def progress_bar(console: Console, total: int | None) -> Iterator[Callable[..., None]]:
-    """A progress bar on a terminal; gives ``tell(what, done, note="")``, whose note is shown behind the bar."""
+    """A progress bar on a terminal, with the time spent and the time left; gives ``tell(what, done, note="")``.
+
+    The note is shown behind the bar. Where there is no terminal nothing is printed.
+    """
     columns = (
         TextColumn("{task.description:>14}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TextColumn("{task.fields[note]}"),
+        TimeRemainingColumn(), TextColumn("{task.fields[note]}"),
     )  # fmt: skip
     with Progress(*columns, console=console, transient=not console.is_terminal, disable=not console.is_terminal) as bar:
         tasks: dict[str, Any] = {}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,7 +31,9 @@ APPLICATION = "aolink"
 """Rerun keeps a user's own layouts by this name."""
 
 
-def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False) -> Path:
+def save_rrd(
+    recording: Recording, path: str | Path, *, overwrite: bool = False, progress: Callable[[int], None] | None = None
+) -> Path:
     """Write a recording as an .rrd file that any Rerun viewer opens with aolink's layout.
 
     Its recording id in Rerun is the digest of the recording's bytes: the same recording opened twice is one there.
@@ -44,6 +46,8 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
         The file to write; it appears only when it is whole.
     overwrite:
         Whether a file of that name may be replaced.
+    progress:
+        Is told how many parts are written: the frames, each estimator's, the devices'.
 
     Raises
     ------
@@ -52,14 +56,16 @@ def save_rrd(recording: Recording, path: str | Path, *, overwrite: bool = False)
     """
     path = Path(path)
     with new_rrd(APPLICATION, path, overwrite=overwrite, sources=recording.files, identity=recording.digest) as stream:
-        contents = send_recording(stream, recording)
+        contents = send_recording(stream, recording, progress or (lambda parts: None))
         # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
         stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
         stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
     return path
 
 
-def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents:
+def send_recording(
+    stream: rr.RecordingStream, recording: Recording, progress: Callable[[int], None] = lambda parts: None
+) -> Contents:
     """Send everything in a recording to a stream; tells what there was, for the layout."""
     check_stands_alone(recording)
     rig = recording.rig
@@ -76,9 +82,11 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
 
     top = send_camera(stream, rig, timebase, exposures, estimates)
     motion.log_truth(stream, timebase, exposures)
-    for sequence in estimates.values():
+    progress(1)
+    for part, sequence in enumerate(estimates.values(), 2):
         motion.log_estimates(stream, timebase, sequence)
         motion.log_errors(stream, timebase, sequence, truths)
+        progress(part)
     scenes = rig.scene is not None and scene.log_scenes(stream, rig.scene, timebase, exposures)
     restored = list(recording.restored())
     scenes_restored = scene.log_restored(stream, timebase, exposures, restored)
@@ -88,7 +96,7 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
     stream.log(
         "session", rr.TextDocument(_summary(recording, exposures, estimates), media_type="text/markdown"), static=True
     )
-    return Contents(
+    contents = Contents(
         rig=rig,
         estimators=names,
         measuring=[name for name, sequence in estimates.items() if any(e.innovation.shape[1] for e in sequence)],
@@ -98,6 +106,8 @@ def send_recording(stream: rr.RecordingStream, recording: Recording) -> Contents
         restored_spots=any(each.spots is not None for each in restored),
         topics=_send_devices(stream, recording, timebase),
     )
+    progress(len(names) + 2)
+    return contents
 
 
 def send_camera(
