@@ -9,13 +9,13 @@ import numpy as np
 
 from aolink.colours import by_rank
 from aolink.errors import ExportError
+from aolink.estimation.frames.spots import profiles
 from aolink.exporting.common import check_frame
 from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
 from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import SpotSensor
-from aolink.plotting.overview import profile_density
 from aolink.plotting.style import FloatArray, colour_bar, figure_or_new
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def _maps(series: Series, sensor: SpotSensor, names: Sequence[str]) -> dict[str,
             light.append(windows.sum(axis=(-2, -1)) * sensor.pixel_size if exposure.mask.any() else None)
             estimate = next(iter(estimates), None)
             if estimate is None:
-                slopes.append(exposure.slopes if exposure.slopes is not None else _centroids(series, exposure))
+                slopes.append(exposure.slopes if exposure.slopes is not None else _centroids(sensor, exposure))
                 continue
             mean = estimate.path.mean(axis=1, keepdims=True)
             slopes.append(mean[:, 0])
@@ -113,9 +113,9 @@ def _maps(series: Series, sensor: SpotSensor, names: Sequence[str]) -> dict[str,
     return found
 
 
-def _centroids(series: Series, exposure: Exposure) -> FloatArray:
-    """Centre of each output's profile, slope units, (n_outputs,)."""
-    line, sensor = series.rig.sensor.profile, series.rig.sensor
-    seen = np.array([np.nan_to_num(profile_density(sensor, exposure, k)) for k in range(series.rig.n_outputs)])
-    light = seen.sum(axis=1)
-    return np.asarray(np.divide(seen @ line.centres, light, out=np.full(len(seen), np.nan), where=light > 0))
+def _centroids(sensor: SpotSensor, exposure: Exposure) -> FloatArray:
+    """Centre of each output's profile, slope units, (n_outputs,); NaN where no light came."""
+    line, found = sensor.profile, profiles(sensor, exposure.pixels, exposure.mask)
+    density = np.where(found.mask, to_density(line, np.asarray(found.counts, dtype=np.float64)), 0.0)
+    light = density.sum(axis=1)
+    return np.asarray(np.divide(density @ line.centres, light, out=np.full(len(light), np.nan), where=light > 0))
