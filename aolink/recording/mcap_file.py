@@ -6,12 +6,12 @@ import contextlib
 import json
 import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from google.protobuf.message import Message
-from mcap.records import Schema
+from mcap.records import Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -204,10 +204,18 @@ def sealed(name: str, values: Mapping[str, str]) -> dict[str, str]:
     return {**values, _SEAL: _checksum(name, values)}
 
 
-def unsealed(name: str, values: Mapping[str, str]) -> dict[str, str] | None:
-    """Metadata without its checksum; None if that is wrong. Other writers' metadata has none."""
-    rest = {key: value for key, value in values.items() if key != _SEAL}
-    return rest if _SEAL not in values or values[_SEAL] == _checksum(name, rest) else None
+def unsealed(records: Sequence[Metadata]) -> Iterator[tuple[str, dict[str, str] | None]]:
+    """The name and the facts of each metadata without their checksum, or None where that is wrong.
+
+    Where one record of a file has a checksum, all of ours have: damage to a length may hide the key. Metadata of older
+    files and of other writers have none, and are believed.
+    """
+    is_sealed = any(_SEAL in each.metadata for each in records)
+    for each in records:
+        facts = {key: value for key, value in each.metadata.items() if key != _SEAL}
+        expected = is_sealed and each.name.startswith(topics.SESSION_METADATA)
+        found = each.metadata.get(_SEAL, None if expected else _checksum(each.name, facts))
+        yield each.name, facts if found == _checksum(each.name, facts) else None
 
 
 def _checksum(name: str, values: Mapping[str, str]) -> str:

@@ -506,6 +506,7 @@ class Recording(Series):
         else:
             records = self._scanned()
         ids: dict[int, str] = {}
+        noted: list[Metadata] = []
         for record, sure in records:
             if isinstance(record, McapMessage):
                 self.start_ns = min(self.start_ns, record.log_time) if held else record.log_time
@@ -521,8 +522,11 @@ class Recording(Series):
                     kind = ids.get(record.schema_id, before[1] if before else "")
                     self._channels[record.id] = (record.topic, kind)
                     self.encodings[record.topic] = record.message_encoding
-            else:
-                self._note(record)
+            elif isinstance(record, Attachment):
+                self._attach(record)
+            elif isinstance(record, Metadata):
+                noted.append(record)
+        self._note(noted)
         for channel_id, number in held.items():
             if channel_id in self._channels:
                 self.counts[self._channels[channel_id][0]] = number
@@ -539,24 +543,27 @@ class Recording(Series):
                 if (found := record_at(file, each, self._lose)) is not None:
                     yield found, True
 
-    def _note(self, record: McapRecord) -> None:
-        """Keep what an attachment or metadata says."""
-        if isinstance(record, Attachment):
-            self.attachments[record.name] = record.data
-            if (held := sum(map(len, self.attachments.values()))) > limits().attachment_bytes:
-                raise exceeded(f"{self.path} holds attachments of {held} bytes", "attachment_bytes")
-        elif isinstance(record, Metadata):
-            if (values := unsealed(record.name, record.metadata)) is None:
-                self._losses[-1 - len(self._losses)] = Loss(0, 0, f"the metadata {record.name!r} is damaged")
-                return
-            if record.name in (topics.SESSION_METADATA, topics.END_METADATA):
+    def _attach(self, record: Attachment) -> None:
+        self.attachments[record.name] = record.data
+        if (held := sum(map(len, self.attachments.values()))) > limits().attachment_bytes:
+            raise exceeded(f"{self.path} holds attachments of {held} bytes", "attachment_bytes")
+
+    def _note(self, records: Sequence[Metadata]) -> None:
+        """Keep what the metadata of the file say."""
+        for name, values in unsealed(records):
+            if values is None:
+                self._losses[-1 - len(self._losses)] = Loss(0, 0, f"the metadata {name!r} is damaged")
+            elif name in (topics.SESSION_METADATA, topics.END_METADATA):
                 self.metadata.update(values)
-                if record.name == topics.END_METADATA:
+                if name == topics.END_METADATA:
                     self.end_metadata.update(values)
-            elif record.name == topics.RIG_METADATA:
+            elif name == topics.RIG_METADATA:
                 self._second_rig_text = values.get("toml", self._second_rig_text)
-            elif record.name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
-                self._channels.setdefault(int(values["id"]), (values.get("topic", ""), values.get("schema", "")))
+            elif name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
+                number = int(values["id"])
+                # The chunk that names the channel, or the one that holds its schema, may be lost.
+                if not self._channels.get(number, ("", ""))[1]:
+                    self._channels[number] = (values.get("topic", ""), values.get("schema", ""))
 
     def _records(self, channels: Container[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""
