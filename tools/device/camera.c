@@ -134,6 +134,6 @@ void camera_take(struct camera *camera, uint8_t byte, int64_t now_ns)
         line_clock_reply(&camera->line, &packet, now_ns);
         break;
     default:
-        line_not_supported(&camera->line, &packet, 0);
+        line_not_supported(&camera->line, &packet);
     }
 }

@@ -43,15 +43,16 @@ void line_event(struct line *line, enum level level, int64_t now_ns, const char 
     line_send(line, EVENT, &writer);
 }
 
-void line_clock_reply(struct line *line, const struct packet *packet, int64_t now_ns)
+bool line_clock_reply(struct line *line, const struct packet *packet, int64_t now_ns)
 {
     struct clock_query query;
     struct writer writer = line_write(line);
     if (!clock_query_decode(&query, packet->payload, packet->size))
-        return;
+        return false;
     /* The answer is on its way at once unless something waits before it: a few microseconds after it came. */
     clock_reply_encode(&writer, &query, now_ns, now_ns);
     line_send(line, CLOCK_REPLY, &writer);
+    return true;
 }
 
 void line_identity(struct writer *writer, uint64_t nonce, enum kind kind, const char *model,
@@ -77,21 +78,11 @@ void line_clear(struct line *line)
     line->out_size = 1;
 }
 
-void line_not_supported(struct line *line, const struct packet *packet, uint64_t step)
+bool line_not_supported(struct line *line, const struct packet *packet)
 {
-    if (packet->type == CAMERA_CONTROL || packet->type == PARK || packet->type == REARM) {
-        line_ack(line, packet, NOT_SUPPORTED, "this device does not do that", step);
-    } else if (packet->type == COMMAND_BLOCK) {
-        struct command_block block;
-        struct command_ack ack = {.code = NOT_SUPPORTED, .sequence = packet->sequence, .text = "this is no mirror"};
-        struct writer writer = line_write(line);
-        if (command_block_decode(&block, NULL, 0, packet->payload, packet->size)) {
-            ack.block_id = block.block_id;
-            command_ack_encode(&writer, &ack);
-            line_send(line, COMMAND_ACK, &writer);
-        }
-    }
-    /* No answer is defined to anything else. */
+    if (type_is_known(packet->type))
+        line_ack(line, packet, NOT_SUPPORTED, "this device does not take such a message", 0);
+    return type_is_known(packet->type);
 }
 
 void line_sent(struct line *line, size_t n)

@@ -30,7 +30,7 @@ void line_send(struct line *line, enum type type, const struct writer *writer);
 
 void line_ack(struct line *line, const struct packet *packet, enum code code, const char *text, uint64_t step);
 void line_event(struct line *line, enum level level, int64_t now_ns, const char *text);
-void line_clock_reply(struct line *line, const struct packet *packet, int64_t now_ns);
+bool line_clock_reply(struct line *line, const struct packet *packet, int64_t now_ns); /* false: no query */
 
 /* What Identity tells of any device. */
 void line_identity(struct writer *writer, uint64_t nonce, enum kind kind, const char *model,
@@ -39,8 +39,8 @@ void line_identity(struct writer *writer, uint64_t nonce, enum kind kind, const 
 /* Drops what waits to be sent: Identify begins a session. */
 void line_clear(struct line *line);
 
-/* The answer to a request that this kind of device does not know, by the type that the page gives for the answer. */
-void line_not_supported(struct line *line, const struct packet *packet, uint64_t step);
+/* The answer to a message that this kind of device does not take. False for types of no message: they get none. */
+bool line_not_supported(struct line *line, const struct packet *packet);
 
 /* The first `n` bytes of out have been sent. */
 void line_sent(struct line *line, size_t n);

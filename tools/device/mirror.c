@@ -93,7 +93,7 @@ void mirror_watchdog(struct mirror *mirror, int64_t now_ns)
     }
 }
 
-static void identify(struct mirror *mirror, const struct packet *packet)
+static bool identify(struct mirror *mirror, const struct packet *packet)
 {
     uint8_t bytes[3 * (8 * N_INPUTS + 4) + 40]; /* three lists, seven small numbers and a double, and their keys */
     struct writer limits = {bytes, sizeof bytes, 0, false}, writer = line_write(&mirror->line);
@@ -101,7 +101,7 @@ static void identify(struct mirror *mirror, const struct packet *packet)
     double watchdog_s = WATCHDOG_NS * 1e-9;
     uint64_t nonce;
     if (!identify_decode(&nonce, packet->payload, packet->size))
-        return;
+        return false;
     for (int i = 0; i < N_INPUTS; i++) {
         lowest[i] = INPUT_MIN;
         highest[i] = INPUT_MAX;
@@ -123,6 +123,7 @@ static void identify(struct mirror *mirror, const struct packet *packet)
     line_identity(&writer, nonce, KIND_MIRROR, MODEL_MIRROR, next_step(mirror), mirror->step_zero_ns);
     put_bytes(&writer, 13, bytes, limits.size);
     line_send(&mirror->line, IDENTITY, &writer);
+    return true;
 }
 
 /* Rounded to the converter's steps, which begin at the lowest input and end at the highest. */
@@ -146,16 +147,16 @@ static void judge(struct mirror *mirror, const struct command_block *block, stru
     uint64_t next = next_step(mirror), room_end = next + QUEUE_STEPS;
     uint64_t late = block->first_step < next ? next - block->first_step : 0;
     ack->text = "";
-    if (mirror->latched) {
-        ack->code = LATCHED;
-        ack->text = "the watchdog has parked the mirror: send Rearm";
-    } else if (block->block_id == 0 || block->n_steps == 0 || block->n_u > MAX_INPUTS ||
-               block->n_u != (uint64_t)block->n_steps * N_INPUTS) {
+    if (block->block_id == 0 || block->n_steps == 0 || block->n_u > MAX_INPUTS ||
+        block->n_u != (uint64_t)block->n_steps * N_INPUTS) {
         ack->code = WRONG_SHAPE;
         ack->text = "a block has an id, a step at least, and n_steps x n_inputs inputs";
     } else if (beyond_limits(mirror->u, block->n_u)) {
         ack->code = OUT_OF_RANGE;
         ack->text = "an input is beyond the limits";
+    } else if (mirror->latched) {
+        ack->code = LATCHED;
+        ack->text = "the watchdog has parked the mirror: send Rearm";
     } else if (late >= block->n_steps) {
         ack->code = TOO_LATE;
         ack->late_steps = block->n_steps;
@@ -182,13 +183,13 @@ static void judge(struct mirror *mirror, const struct command_block *block, stru
     ack->queue_end_step = mirror->queue_end;
 }
 
-static void command(struct mirror *mirror, const struct packet *packet)
+static bool command(struct mirror *mirror, const struct packet *packet)
 {
     struct command_block block;
     struct command_ack ack = {.sequence = packet->sequence};
     struct writer writer = line_write(&mirror->line);
     if (!command_block_decode(&block, mirror->u, MAX_INPUTS, packet->payload, packet->size))
-        return;
+        return false;
     ack.block_id = block.block_id;
     unsigned i = 0;
     while (i < mirror->n_answers && mirror->answers[i].block_id != block.block_id)
@@ -207,6 +208,7 @@ static void command(struct mirror *mirror, const struct packet *packet)
     }
     command_ack_encode(&writer, &ack);
     line_send(&mirror->line, COMMAND_ACK, &writer);
+    return true;
 }
 
 static void park(struct mirror *mirror, const struct packet *packet)
@@ -218,11 +220,11 @@ static void park(struct mirror *mirror, const struct packet *packet)
     line_ack(&mirror->line, packet, OK, "", next_step(mirror));
 }
 
-static void query(struct mirror *mirror, const struct packet *packet)
+static bool query(struct mirror *mirror, const struct packet *packet)
 {
     struct applied_query query;
     if (!applied_query_decode(&query, packet->payload, packet->size))
-        return;
+        return false;
     /* Only the steps before the one that is going on have gone by. */
     uint64_t first = query.first_step, left = first < mirror->step ? mirror->step - first : 0;
     uint64_t end = first + (query.n_steps < left ? query.n_steps : left), oldest = oldest_step(mirror);
@@ -237,35 +239,37 @@ static void query(struct mirror *mirror, const struct packet *packet)
     }
     if (first < end)
         report(mirror, first, end);
+    return true;
+}
+
+/* False where the payload is no message. */
+static bool deal_with(struct mirror *mirror, const struct packet *packet, int64_t now_ns)
+{
+    switch (packet->type) {
+    case IDENTIFY:
+        return identify(mirror, packet);
+    case COMMAND_BLOCK:
+        return command(mirror, packet);
+    case PARK:
+        park(mirror, packet);
+        return true;
+    case CLOCK_QUERY:
+        return line_clock_reply(&mirror->line, packet, now_ns);
+    case APPLIED_QUERY:
+        return query(mirror, packet);
+    case REARM:
+        mirror->latched = false;
+        line_ack(&mirror->line, packet, OK, "", next_step(mirror));
+        return true;
+    default:
+        return line_not_supported(&mirror->line, packet);
+    }
 }
 
 void mirror_take(struct mirror *mirror, uint8_t byte, int64_t now_ns)
 {
     struct packet packet;
-    if (!line_take(&mirror->line, byte, &packet))
-        return;
-    mirror->last_valid_ns = now_ns;
-    switch (packet.type) {
-    case IDENTIFY:
-        identify(mirror, &packet);
-        break;
-    case COMMAND_BLOCK:
-        command(mirror, &packet);
-        break;
-    case PARK:
-        park(mirror, &packet);
-        break;
-    case CLOCK_QUERY:
-        line_clock_reply(&mirror->line, &packet, now_ns);
-        break;
-    case APPLIED_QUERY:
-        query(mirror, &packet);
-        break;
-    case REARM:
-        mirror->latched = false;
-        line_ack(&mirror->line, &packet, OK, "", next_step(mirror));
-        break;
-    default:
-        line_not_supported(&mirror->line, &packet, next_step(mirror));
-    }
+    /* The watchdog wants packets that mean something: noise with the right checksum is no host. */
+    if (line_take(&mirror->line, byte, &packet) && deal_with(mirror, &packet, now_ns))
+        mirror->last_valid_ns = now_ns;
 }

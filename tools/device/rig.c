@@ -34,13 +34,11 @@ static double normal(struct rig *rig)
     return a * scale;
 }
 
-void rig_begin(struct rig *rig, uint64_t seed)
+void rig_begin_at_rest(struct rig *rig, uint64_t seed)
 {
-    static const double at_rest[N_INPUTS] = {PARK_INPUT};
     /* splitmix64's finaliser, so that neighbouring seeds give unlike noise. */
     for (int i = 0; i < 2; i++) {
-        uint64_t z = seed * 2 + (uint64_t)i + 1;
-        z *= 0x9e3779b97f4a7c15;
+        uint64_t z = (seed * 2 + (uint64_t)i + 1) * 0x9e3779b97f4a7c15;
         z = (z ^ z >> 30) * 0xbf58476d1ce4e5b9;
         z = (z ^ z >> 27) * 0x94d049bb133111eb;
         rig->random[i] = z ^ z >> 31;
@@ -49,9 +47,15 @@ void rig_begin(struct rig *rig, uint64_t seed)
     rig->step = 0;
     for (int i = 0; i < N_STATES; i++)
         rig->x[0][i] = 0.0;
+}
+
+void rig_begin(struct rig *rig, uint64_t seed)
+{
+    static const double parked[N_INPUTS] = {PARK_INPUT};
+    rig_begin_at_rest(rig, seed);
     /* The rig file's default is a stationary start. The slowest time constant is 1.5 s: twenty of them, in steps. */
     for (int i = 0; i < 30000; i++)
-        rig_step(rig, at_rest);
+        rig_step(rig, parked);
     for (int i = 0; i < N_STATES; i++)
         rig->x[0][i] = rig->x[rig->step % STATES_KEPT][i];
     rig->step = 0;

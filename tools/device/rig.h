@@ -19,7 +19,9 @@ struct rig {
     double x[STATES_KEPT][N_STATES];
 };
 
-/* The plant at rest, and then in its stationary state: it has moved for long. */
+void rig_begin_at_rest(struct rig *rig, uint64_t seed);
+
+/* The plant has moved for long: it is in its stationary state. */
 void rig_begin(struct rig *rig, uint64_t seed);
 
 /* From the beginning of the next fast step to its end, with this input. */

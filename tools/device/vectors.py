@@ -14,12 +14,13 @@ def array(text: str) -> str:
 vectors = json.load(open(sys.argv[1]))
 schema = re.sub(r"\s", "", re.sub(r"//[^\n]*", "", open(sys.argv[2]).read()))
 print("/* Made by vectors.py. */")
-print(f"static const struct bytes schema_hash = {{{array(hashlib.sha256(schema.encode()).hexdigest()[:16])}}};")
 print("static const struct good good[] = {")
 for vector in vectors["good"]:
     head = f"{vector['version']}, {vector['type']}, {vector['sequence']}"
     print(f'    {{"{vector["what"]}", {head}, {{{array(vector["payload"])}}}, {{{array(vector["wire"])}}}}},')
-print("};\nstatic const struct broken broken[] = {")
+print("};\n#ifndef GOOD_ONLY")
+print(f"static const struct bytes schema_hash = {{{array(hashlib.sha256(schema.encode()).hexdigest()[:16])}}};")
+print("static const struct broken broken[] = {")
 for vector in vectors["broken"]:
     print(f'    {{"{vector["what"]}", {{{array(vector["wire"])}}}, {vector["bad_crc"]}, {vector["bad_framing"]}}},')
 print("};\nstatic const struct in_parts in_parts[] = {")
@@ -27,4 +28,4 @@ for vector in vectors["parts"]:
     assert len(vector["messages"]) <= 1
     kind, payload = vector["messages"][0] if vector["messages"] else (0, "")
     print(f'    {{"{vector["what"]}", {{{array(vector["wire"])}}}, {kind}, {{{array(payload)}}}, {vector["refused"]}}},')
-print("};")
+print("};\n#endif")
