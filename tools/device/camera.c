@@ -86,7 +86,6 @@ static void identify(struct camera *camera, const struct packet *packet)
         return;
     line_clear(&camera->line);
     camera->control.run = camera->started = false;
-    camera->frame_id = 1;
     put_uint(&geometry, 1, WIDTH);
     put_uint(&geometry, 2, HEIGHT);
     put_uint(&geometry, 3, BIT_DEPTH);

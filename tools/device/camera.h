@@ -13,7 +13,7 @@ struct camera {
     struct camera_control control; /* the newest start; run is false when its exposures are over */
     bool started;                  /* no stop has come since */
     uint64_t frame_step;           /* the first step of the exposure that is next to end */
-    uint64_t frame_id;             /* of that exposure; the first one of a session has 1 */
+    uint64_t frame_id;             /* of that exposure; it grows for as long as the device runs, through all sessions */
 };
 
 /* The device time at which fast step 0 begins, and now is in it. */

@@ -76,6 +76,7 @@ void line_clear(struct line *line)
     /* The driver may have half a packet already: a delimiter ends it, so that the next one is not lost with it. */
     line->out[0] = 0;
     line->out_size = 1;
+    line->cleared = true;
 }
 
 bool line_not_supported(struct line *line, const struct packet *packet)

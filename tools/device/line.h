@@ -17,6 +17,7 @@ struct line {
     size_t out_size;
     uint16_t out_sequence;
     uint32_t out_dropped; /* packets */
+    bool cleared;         /* the driver has to forget too what it has not sent; it then says false here */
     /* The payload that is being written. Identity of a mirror with hundreds of inputs would need more, and parts. */
     uint8_t payload[MAX_PAYLOAD];
 };

@@ -20,6 +20,10 @@ static struct camera camera;
 static struct mirror mirror;
 static volatile sig_atomic_t stopped;
 
+struct port {
+    int fd, host_fd; /* the pseudo terminal's own end; the host's, kept open so that it outlives a host */
+};
+
 static void stop(int signal)
 {
     (void)signal;
@@ -38,8 +42,7 @@ static int64_t device_ns(void)
     return CLOCK_OFFSET_NS + (int64_t)(since * (1.0 + CLOCK_DRIFT));
 }
 
-/* A new pseudo terminal: returns its own end. The host's end stays open here too, so that it outlives a host. */
-static int open_line(const char *what, const char *link)
+static struct port open_port(const char *what, const char *link)
 {
     int line = posix_openpt(O_RDWR | O_NOCTTY);
     const char *path = line < 0 || grantpt(line) != 0 || unlockpt(line) != 0 ? NULL : ptsname(line);
@@ -60,12 +63,15 @@ static int open_line(const char *what, const char *link)
         }
     }
     printf("%s  %s\n", what, link != NULL ? link : path);
-    return line;
+    return (struct port){line, host};
 }
 
-static void send_what_goes(int fd, struct line *line)
+static void send_what_goes(struct port port, struct line *line)
 {
-    ssize_t n = line->out_size > 0 ? write(fd, line->out, line->out_size) : 0;
+    if (line->cleared)
+        tcflush(port.host_fd, TCIFLUSH); /* what the last host has not read is still in the terminal */
+    line->cleared = false;
+    ssize_t n = line->out_size > 0 ? write(port.fd, line->out, line->out_size) : 0;
     if (n > 0)
         line_sent(line, (size_t)n);
 }
@@ -94,8 +100,9 @@ static void receive(int fd, bool is_camera)
     }
 }
 
-static void serve(int camera_fd, int mirror_fd)
+static void serve(struct port camera_port, struct port mirror_port)
 {
+    int camera_fd = camera_port.fd, mirror_fd = mirror_port.fd;
     int highest = camera_fd > mirror_fd ? camera_fd : mirror_fd;
     while (!stopped) {
         fd_set readable, writable;
@@ -121,8 +128,8 @@ static void serve(int camera_fd, int mirror_fd)
         if (FD_ISSET(mirror_fd, &readable))
             receive(mirror_fd, false);
         mirror_watchdog(&mirror, device_ns());
-        send_what_goes(camera_fd, &camera.line);
-        send_what_goes(mirror_fd, &mirror.line);
+        send_what_goes(camera_port, &camera.line);
+        send_what_goes(mirror_port, &mirror.line);
     }
 }
 
@@ -147,13 +154,13 @@ int main(int argc, char **argv)
     action.sa_handler = stop;
     sigaction(SIGINT, &action, NULL);
     sigaction(SIGTERM, &action, NULL);
-    int camera_fd = open_line("camera", camera_link), mirror_fd = open_line("mirror", mirror_link);
+    struct port camera_port = open_port("camera", camera_link), mirror_port = open_port("mirror", mirror_link);
     fflush(stdout);
     rig_begin(&rig, seed);
     int64_t step_zero_ns = device_ns();
     mirror_begin(&mirror, &rig, step_zero_ns);
     camera_begin(&camera, &rig, step_zero_ns);
-    serve(camera_fd, mirror_fd);
+    serve(camera_port, mirror_port);
     if (camera_link != NULL)
         unlink(camera_link);
     if (mirror_link != NULL)

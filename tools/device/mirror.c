@@ -66,6 +66,7 @@ void mirror_tick(struct mirror *mirror)
         *now = parked;
     if (mirror->latched)
         now->source = SOURCE_WATCHDOG;
+    rig_step(mirror->rig, now->u);
     if (mirror->queue_end < next_step(mirror))
         mirror->queue_end = next_step(mirror);
     at(mirror, step + QUEUE_STEPS)->block_id = 0; /* the oldest step makes room for the end of the queue */
@@ -73,7 +74,6 @@ void mirror_tick(struct mirror *mirror)
     if (mirror->report_step < step && (now->block_id != before->block_id || now->source != before->source ||
                                        step - mirror->report_step >= BLOCK_STEPS))
         report_until(mirror, step);
-    rig_step(mirror->rig, now->u);
 }
 
 static void clear_queue(struct mirror *mirror)

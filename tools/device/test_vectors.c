@@ -384,6 +384,8 @@ static void test_duplicates(void)
     const char *what = "duplicates";
     struct writer empty = {NULL, 0, 0, false};
     begin();
+    ask(&mirror.line, 99, &empty); /* no message has this number */
+    CHECK(what, n_answers == 0);
     ask(&mirror.line, REARM, &empty);
     CHECK(what, n_answers == 1);
     send(&mirror.line, REARM, &empty, (uint16_t)(host_sequence - 1));
@@ -425,6 +427,15 @@ static void test_camera(void)
     CHECK(what, number(2, 9) == 500000000 && number(2, 10) == 80 && answers[3].type == TRUTH_CHUNK);
     ask(&camera.line, PARK, &w);
     CHECK(what, n_answers == 1 && answers[0].type == ACK && number(0, 2) == NOT_SUPPORTED);
+    ask_numbers(&camera.line, IDENTIFY, 80, 0); /* another session: the frames' ids go on */
+    w.size = 0;
+    put_uint(&w, 1, 1);
+    put_uint(&w, 2, camera.step + 1);
+    ask(&camera.line, CAMERA_CONTROL, &w);
+    camera.line.out_size = 0;
+    tick(201);
+    collect(&camera.line);
+    CHECK(what, n_answers == 2 && answers[0].type == FRAME_CHUNK && number(0, 1) == 3);
 }
 
 int main(void)
