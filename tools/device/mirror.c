@@ -3,6 +3,9 @@
 #include <math.h>
 #include <string.h>
 
+/* A report is made from the ring: what has not been reported must still be there. */
+typedef char history_holds_a_report[HISTORY_STEPS > BLOCK_STEPS ? 1 : -1];
+
 static const struct held parked = {{PARK_INPUT}, 0, SOURCE_PARKED};
 
 static struct held *at(struct mirror *mirror, uint64_t step)
@@ -89,7 +92,7 @@ void mirror_watchdog(struct mirror *mirror, int64_t now_ns)
     if (mirror->armed && now_ns - mirror->last_valid_ns >= WATCHDOG_NS) {
         clear_queue(mirror);
         mirror->latched = true;
-        line_event(&mirror->line, LEVEL_WARNING, now_ns, "parked by the watchdog: no valid packet has come for 1 s");
+        line_event(&mirror->line, LEVEL_WARNING, now_ns, "parked by the watchdog: no valid packet has come for watchdog_s");
     }
 }
 
