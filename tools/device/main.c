@@ -8,6 +8,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/select.h>
+#include <sys/stat.h>
 #include <termios.h>
 #include <time.h>
 #include <unistd.h>
@@ -55,12 +56,12 @@ static struct port open_port(const char *what, const char *link)
     raw.c_iflag = raw.c_oflag = raw.c_lflag = 0;
     raw.c_cflag = CS8 | CREAD | CLOCAL;
     tcsetattr(host, TCSANOW, &raw);
-    if (link != NULL) {
-        unlink(link);
-        if (symlink(path, link) != 0) {
-            perror(link);
-            exit(1);
-        }
+    struct stat old;
+    if (link != NULL && lstat(link, &old) == 0 && S_ISLNK(old.st_mode))
+        unlink(link); /* of a device that was killed; anything else stays, and symlink says that it is there */
+    if (link != NULL && symlink(path, link) != 0) {
+        perror(link);
+        exit(1);
     }
     printf("%s  %s\n", what, link != NULL ? link : path);
     return (struct port){line, host};
