@@ -6,7 +6,7 @@
 /* A report is made from the ring: what has not been reported must still be there. */
 typedef char history_holds_a_report[HISTORY_STEPS > BLOCK_STEPS ? 1 : -1];
 
-static const struct held parked = {{PARK_INPUT}, 0, SOURCE_PARKED};
+static const struct held parked = {PARK_INPUTS, 0, SOURCE_PARKED};
 
 static struct held *at(struct mirror *mirror, uint64_t step)
 {

@@ -51,7 +51,7 @@ void rig_begin_at_rest(struct rig *rig, uint64_t seed)
 
 void rig_begin(struct rig *rig, uint64_t seed)
 {
-    static const double parked[N_INPUTS] = {PARK_INPUT};
+    static const double parked[N_INPUTS] = PARK_INPUTS;
     rig_begin_at_rest(rig, seed);
     /* The rig file's default is a stationary start. The slowest time constant is 1.5 s: twenty of them, in steps. */
     for (int i = 0; i < 30000; i++)

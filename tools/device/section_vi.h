@@ -35,17 +35,17 @@ enum {
 
 #define INPUT_MIN (-0.05) /* mirror.input_min */
 #define INPUT_MAX 0.05    /* mirror.input_max */
-#define PARK_INPUT 0.0    /* mirror.park */
+#define PARK_INPUTS {0.0} /* mirror.park, of each input */
 enum {
-    DAC_BITS = 16,    /* mirror.dac_bits */
-    BLOCK_STEPS = 50, /* mirror.block_steps: a report is as long as a block at most */
+    DAC_BITS = 16,     /* mirror.dac_bits */
+    BLOCK_STEPS = 50,  /* mirror.block_steps: a report is as long as a block at most */
     QUEUE_STEPS = 400, /* mirror.queue_steps, its default: eight blocks */
     HISTORY_STEPS = 1647 /* more than the watchdog's time, after which the host gives missing reports up */
 };
 #define WATCHDOG_NS 1000000000 /* mirror.watchdog_s, its default */
 
-#define SEED 1                  /* simulation.seed */
+#define SEED 1                    /* simulation.seed */
 #define CLOCK_OFFSET_NS 250000000 /* simulation.clock_offset_s */
-#define CLOCK_DRIFT 20e-6       /* simulation.clock_drift_ppm */
+#define CLOCK_DRIFT 20e-6         /* simulation.clock_drift_ppm */
 
 #endif
