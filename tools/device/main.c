@@ -115,7 +115,7 @@ static void serve(struct port camera_port, struct port mirror_port)
             FD_SET(camera_fd, &writable);
         if (mirror.line.out_size > 0)
             FD_SET(mirror_fd, &writable);
-        int64_t left = mirror.step_zero_ns + (int64_t)(mirror.step + 1) * FAST_STEP_NS - device_ns();
+        int64_t before = device_ns(), left = mirror.step_zero_ns + (int64_t)(mirror.step + 1) * FAST_STEP_NS - before;
         struct timespec wait = {0, left > 0 ? (long)left : 0};
         if (pselect(highest + 1, &readable, &writable, NULL, &wait, NULL) < 0) {
             if (errno == EINTR)
@@ -128,7 +128,8 @@ static void serve(struct port camera_port, struct port mirror_port)
             receive(camera_fd, true);
         if (FD_ISSET(mirror_fd, &readable))
             receive(mirror_fd, false);
-        mirror_watchdog(&mirror, device_ns());
+        /* Whatever came before pselect has been read: a process that had to wait must not take itself for a silent host. */
+        mirror_watchdog(&mirror, before);
         send_what_goes(camera_port, &camera.line);
         send_what_goes(mirror_port, &mirror.line);
     }
