@@ -262,6 +262,16 @@ def record(
         Light | None,
         typer.Option(help="Record frames of this light for `aolink calibrate`; the mirror stays parked."),
     ] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Close the loop with this controller, integrator, lqg or another package's; the first -e serves it.",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --control: also a loop that is unstable by the model.")
+    ] = False,
     view: Annotated[
         bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
     ] = False,
@@ -280,7 +290,7 @@ def record(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Record a session: play the rig's drive, record everything, estimate online.
+    """Record a session: play the rig's drive, or close the loop; record everything, estimate online.
 
     In real time an estimator that is slower than the camera skips exposures; the recording has them all.
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
@@ -293,6 +303,8 @@ def record(
         split_bytes=round(split_mib * 2**20), split_s=split_s,
     )  # fmt: skip
     loaded = load_checked(rig)
+    if force and not control:
+        raise typer.BadParameter("--force is for --control")
     if exposures is not None and duration is not None:
         raise typer.BadParameter("give --exposures or --duration, not both")
     if duration is not None:
@@ -305,13 +317,15 @@ def record(
 
     def told(done: int) -> None:
         skipped = report.exposures_skipped.items()
-        tell(done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
+        notes = ["skipped: " + ", ".join(f"{name} {n}" for name, n in skipped)] if skipped else []
+        tell(done, "; ".join([*notes, *([report.control.note] if report.control else [])]))
 
     with _live_view(loaded, estimator or [], shown=view) as live:
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
-                calibration=calibration or "", watch=live.show if live else None, overwrite=overwrite,
+                calibration=calibration or "", control=control or "", force=force,
+                watch=live.show if live else None, overwrite=overwrite,
                 options=options, stop=stop, progress=told, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)

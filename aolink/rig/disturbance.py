@@ -126,8 +126,9 @@ def _model(table: Table, n_outputs: int, fast_step_s: float) -> DisturbanceModel
         noise = table.vector("sd", modes.shape[1], "modes") ** 2 / one[0, 0]
     each = np.eye(len(noise))
     return DisturbanceModel(
-        A=np.kron(each, A), B_w=np.kron(each, B_w), C=np.kron(modes, np.eye(1, len(A))), process_noise=np.diag(noise),
-        initial_covariance=np.kron(np.diag(noise), one),
+        A=np.asarray(np.kron(each, A)), B_w=np.asarray(np.kron(each, B_w)),
+        C=np.asarray(np.kron(modes, np.eye(1, len(A)))), process_noise=np.diag(noise),
+        initial_covariance=np.asarray(np.kron(np.diag(noise), one)),
     )  # fmt: skip
 
 
