@@ -372,6 +372,14 @@ def replay(
     ] = 0.0,
     start: Annotated[float, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")] = 0.0,
     end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Say what this controller would have commanded, served by the first -e; and on a simulated rig what"
+            " would have come of it.",
+        ),
+    ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun.")] = False,
     to_rig: Annotated[
         bool, typer.Option("--to-rig", help="Send its commands to a rig, and record a new session.")
@@ -394,6 +402,10 @@ def replay(
     names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if to_rig:
+        if control:
+            raise typer.BadParameter(
+                "--to-rig sends the recorded commands: `aolink record --control` closes a loop"
+            )
         if not (output and _are_driven(recording.rig, camera, mirror)):
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
@@ -402,6 +414,11 @@ def replay(
         return
     if camera or mirror or output:
         raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
+    if control:
+        if view or rate or start or end is not None:
+            raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
+        _replay_control(recording, control, names[0], as_json=as_json)
+        return
     from aolink.cli.tables import scores as tables
     from aolink.estimation import Scorer
     from aolink.session.replay import replay as replay_recording
@@ -427,6 +444,19 @@ def replay(
             stdout.print(tables.scores(scores))
     stop.raise_if_asked()
     check_measured(file, scores)
+
+
+def _replay_control(recording: Recording, controller: str, estimator: str, *, as_json: bool) -> None:
+    from aolink.cli.tables import control as tables
+    from aolink.jobs.closed_loop import replayed
+
+    with StopRequest().installed() as stop, progress("replay", None) as tell:
+        result = replayed(recording, controller, estimator, stop, tell)
+    stop.raise_if_asked()
+    if as_json:
+        print(json.dumps(tables.replayed_as_json(result), allow_nan=False))
+    else:
+        stdout.print(tables.replayed(result))
 
 
 def _are_driven(rig: Rig, camera: str | None, mirror: str | None) -> bool:

@@ -13,6 +13,7 @@ from aolink.rig import Plant, Rig
 
 _DOUBLINGS = 60
 _SMALL = 1e-14
+_SETTLES = 1e-9
 
 
 class LQG:
@@ -58,7 +59,7 @@ def lqr_gain(plant: Plant, effort: float, n_steps: int) -> FloatArray:
     Raises
     ------
     ControlError
-        The Riccati equation has no stabilising solution: the inputs cannot calm the plant.
+        The Riccati equation has no stabilising solution.
     """
     one, two = reached(plant)
     A1, A12, A2 = (plant.A[np.ix_(*pair)] for pair in ((one, one), (one, two), (two, two)))
@@ -67,13 +68,16 @@ def lqr_gain(plant: Plant, effort: float, n_steps: int) -> FloatArray:
     R = effort * float(np.mean(gains**2)) * np.eye(plant.n_inputs)
     try:
         P = linalg.solve_discrete_are(A1, B, C1.T @ C1, R)
+        weight = linalg.cho_factor(R + B.T @ P @ B)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ControlError(
-            f"lqg has no gain for this plant ({error}): its inputs must reach every state that does not die out"
-        ) from None
-    weight = linalg.cho_factor(R + B.T @ P @ B)
+        raise ControlError(f"lqg has no gain for this plant: {error}") from None
     K1 = linalg.cho_solve(weight, B.T @ P @ A1)
     closed = (A1 - B @ K1).T
+    if float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0)) > 1 - _SETTLES:
+        raise ControlError(
+            "lqg has no gain for this plant: the slopes must show every state that its inputs move and that does not"
+            " die out"
+        )
     S, left, right = C1.T @ C2 + closed @ P @ A12, closed, A2
     for _ in range(_DOUBLINGS):
         more = left @ S @ right

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from aolink.control import Act, State
@@ -82,7 +82,7 @@ class ControlReport:
             self.note += ", the model does not fit"
 
     def counts(self) -> dict[str, Any]:
-        """Everything but the single delays."""
+        """Everything but the single delays, of which it gives the median and the longest."""
         names = ("exposures", "open_exposures", "late_exposures", "misfit_exposures", "clipped_steps", "slope_rms")
         delays = sorted(self.delay_ms)
         delay = {"delay_ms": delays[len(delays) // 2], "longest_delay_ms": delays[-1]} if delays else {}
@@ -155,7 +155,7 @@ class Report:
 
     def counts(self) -> dict[str, str]:
         """Everything but the latencies, as text, for the recording's metadata."""
-        facts = asdict(self)
+        facts = asdict(replace(self, control=None))
         for name in ("latencies", "warnings", "files", "estimation", "unwatched", "control"):
             del facts[name]
         for name, each in self.estimation.items():
