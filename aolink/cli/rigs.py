@@ -403,9 +403,7 @@ def replay(
     get_ready(recording.rig, names)
     if to_rig:
         if control:
-            raise typer.BadParameter(
-                "--to-rig sends the recorded commands: `aolink record --control` closes a loop"
-            )
+            raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
         if not (output and _are_driven(recording.rig, camera, mirror)):
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"

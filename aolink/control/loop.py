@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aolink.control.controller import Controller, Seen
+from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
 from aolink.control.registry import find_controller
 from aolink.errors import AolinkError, ControlError
@@ -76,8 +76,8 @@ class ControlLoop:
 
     Parameters
     ----------
-    name:
-        The controller.
+    controller:
+        Its name, or its row.
     first_step:
         First fast step of the session. Until the first exposure is seen the mirror holds its safe input.
 
@@ -87,13 +87,13 @@ class ControlLoop:
         As `find_controller`.
     """
 
-    def __init__(self, rig: Rig, name: str, first_step: int = 0) -> None:
-        row = find_controller(name, rig)
+    def __init__(self, rig: Rig, controller: str | ControllerRow, first_step: int = 0) -> None:
+        row = find_controller(controller, rig) if isinstance(controller, str) else controller
         self.name, self.needs_state = row.name, row.needs_state
         self.delay_steps = delay_steps(rig)
         self.state, self.reason = State.CLOSED, ""
         self.fit: Fit | None = None
-        self._rig, self._controller = rig, _made(row.build, rig, name)
+        self._rig, self._controller = rig, _made(row, rig)
         mirror = rig.mirror
         self._low, self._high, self._park = mirror.input_min, mirror.input_max, mirror.park
         self._most_change = mirror.slew_max_per_s * rig.timing.fast_step_s or math.inf
@@ -261,13 +261,13 @@ def delay_steps(rig: Rig) -> int:
     return max(1, math.ceil(rig.control.delay_s / rig.timing.fast_step_s - 1e-9))
 
 
-def _made(build: Callable[[Rig], Controller], rig: Rig, name: str) -> Controller:
+def _made(row: ControllerRow, rig: Rig) -> Controller:
     try:
-        return build(rig)
+        return row.build(rig)
     except AolinkError:
         raise
-    except Exception as error:
-        raise ControlError(f"the controller {name} cannot work on the rig {rig.name}: {error!r}") from error
+    except Exception as error:  # whatever another package does wrong
+        raise ControlError(f"the controller {row.name} cannot work on the rig {rig.name}: {error!r}") from error
 
 
 def _rms(values: FloatArray) -> float:

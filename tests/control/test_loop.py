@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aolink.control import ControlLoop, State
+from aolink.control import ControllerRow, ControlLoop, Seen, State
 from aolink.control.loop import BLIND_EXPOSURES, TRUSTED_EXPOSURES, centroids
 from aolink.errors import ControlError
 from aolink.estimation import Status, make_estimator
 from aolink.exposure import Exposure
 from aolink.jobs.closed_loop import Closed, closed_loop
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from aolink.simulation.model import simulate
 from tests.control.rigs import DRIFT, LINE, small_rig
@@ -164,3 +165,36 @@ def test_centroids_are_those_of_the_frame() -> None:
 def test_a_controller_that_does_not_exist_is_named_with_those_that_do() -> None:
     with pytest.raises(ControlError, match="there is no controller 'pid': use one of integrator, lqg"):
         ControlLoop(small_rig(), "pid")
+
+
+class Nonsense:
+    """A controller of somebody else that is wrong in one way or the other."""
+
+    def __init__(self, given: object) -> None:
+        self._given = given
+
+    def see(self, seen: Seen) -> None:
+        pass
+
+    def step(self, held: FloatArray) -> FloatArray:
+        if isinstance(self._given, Exception):
+            raise self._given
+        return np.asarray(self._given)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ([0.1, 0.2], r"the controller mine gives an array of \(2,\), expected \(1,\) finite inputs"),
+        ([np.nan], "the controller mine gives a number that is not finite"),
+        (KeyError("gone"), r"the controller mine failed: KeyError\('gone'\); the mirror is parked"),
+    ],
+)
+def test_a_controller_that_gives_nonsense_is_an_error_that_names_it(given: object, message: str) -> None:
+    rig = small_rig()
+    row = ControllerRow(name="mine", summary="", build=lambda rig: Nonsense(given), needs_state=False)
+    loop = ControlLoop(rig, row)
+    (exposure,) = simulate(rig, 1)
+    loop.see(exposure, None, 40)
+    with pytest.raises(ControlError, match=message):
+        loop.inputs(40, 20)
