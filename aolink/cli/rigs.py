@@ -649,6 +649,10 @@ def demo(
     exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
     real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
+    control: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Close the loop, and compare with the open one and the integrator."),
+    ] = None,
 ) -> None:
     """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
     from aolink.cli.tables import scores, sessions
@@ -663,8 +667,8 @@ def demo(
     try:
         with progress_bar(stderr, exposures) as tell:
             result = run_demo(
-                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stoppable=stop.installed,
-                progress=tell,
+                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time,
+                control=control or "", stoppable=stop.installed, progress=tell,
             )  # fmt: skip
     except Interrupted as interrupted:
         raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None

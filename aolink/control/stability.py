@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import repeat
 
 import numpy as np
 
@@ -29,7 +30,8 @@ _MOST_GAIN = 16.0
 _HALVINGS = 5
 _SWING = 5
 _SETTLED = 1e-9
-"""What has fallen to this share of the beginning has settled."""
+_BURST = 1e6
+"""What has fallen to the one share of the beginning has settled, and what has grown to the other never will."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,28 +107,29 @@ def _growth(rig: Rig, build: Callable[[Rig], Controller], gain: FloatArray, of_m
     moved, _ = reached(rig.plant)
     start = np.zeros((rig.plant.axes, rig.plant.n_states))
     start[:, moved] = np.random.default_rng(0).standard_normal((len(start), len(moved)))
-    with np.errstate(over="ignore", invalid="ignore"):
-        followed = _followed(rig, build(rig), gain, of_mirror, start)
-        if rig.mirror.park.any():  # an undisturbed loop moves by itself, which is taken off
-            followed -= _followed(rig, build(rig), gain, of_mirror, np.zeros_like(start))
-        sizes = np.linalg.norm(followed, axis=1)
-    if not np.isfinite(sizes).all():
-        known = np.flatnonzero(np.isfinite(sizes))[-1]
-        return float((sizes[known] / sizes[0]) ** (1 / max(known, 1)))
+    disturbed = _followed(rig, build(rig), gain, of_mirror, start)
+    # An undisturbed loop may move by itself, where its safe input is not zero: that is taken off.
+    alone: Iterator[FloatArray] = repeat(np.zeros(1))
+    if rig.mirror.park.any():
+        alone = _followed(rig, build(rig), gain, of_mirror, np.zeros_like(start))
+    sizes: list[float] = []
+    for one, other in zip(disturbed, alone, strict=False):
+        sizes.append(float(np.linalg.norm(one - other)))
+        if len(sizes) > _SWING and not _SETTLED < max(sizes[-_SWING:]) / sizes[0] < _BURST:
+            break
     # Maxima over some exposures, because a loop may swing as it shrinks or grows.
-    first, middle, last = (float(sizes[k : k + _SWING].max()) for k in (0, _EXPOSURES // 2, _EXPOSURES - _SWING))
-    if middle <= _SETTLED * first:
-        return float((middle / first) ** (2 / _EXPOSURES))
-    return float((last / middle) ** (1 / (_EXPOSURES - _SWING - _EXPOSURES // 2)))
+    middle, last = (max(sizes[k - _SWING : k]) for k in (max(len(sizes) // 2, _SWING), len(sizes)))
+    return float((last / middle) ** (1 / (len(sizes) - max(len(sizes) // 2, _SWING))))
 
 
-def _followed(rig: Rig, controller: Controller, gain: FloatArray, of_mirror: float, start: FloatArray) -> FloatArray:
-    """Slopes at the end of each exposure, and their means in it, (exposures, 2 n_outputs)."""
+def _followed(
+    rig: Rig, controller: Controller, gain: FloatArray, of_mirror: float, start: FloatArray
+) -> Iterator[FloatArray]:
+    """Slopes at the end of each exposure, and their means in it, (2 n_outputs,)."""
     plant, timing, delay = rig.plant, rig.timing, delay_steps(rig)
     A, B, C = plant.A.T.copy(), plant.B.T.copy(), plant.C.T.copy()
     true, believed, u = start, np.zeros_like(start), rig.mirror.park
     recent: deque[FloatArray] = deque([u] * delay, maxlen=delay)
-    ends: list[FloatArray] = []
     waiting: tuple[FloatArray, FloatArray] | None = None
     acting, due = False, 0
     means = np.zeros((2, plant.axes, plant.n_outputs))
@@ -136,7 +139,7 @@ def _followed(rig: Rig, controller: Controller, gain: FloatArray, of_mirror: flo
             y, expected = means / timing.exposure_steps
             believed = believed + (y - expected) @ gain.T
             waiting, due = (y.ravel(), believed), step + delay
-            ends.append(np.concatenate([(true @ C).ravel(), y.ravel()]))
+            yield np.concatenate([(true @ C).ravel(), y.ravel()])
             means[:] = 0
         if waiting is not None and step == due:
             slopes, state = waiting
@@ -150,4 +153,3 @@ def _followed(rig: Rig, controller: Controller, gain: FloatArray, of_mirror: flo
             means[1] += believed @ C
         pushed = u.reshape(plant.axes, -1) @ B
         true, believed = true @ A + of_mirror * pushed, believed @ A + pushed
-    return np.array(ends[:_EXPOSURES])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ import numpy as np
 from aolink.control import Act, ControlLoop, State, find_controller, stability
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
-from aolink.exposure import Exposure
+from aolink.exposure import Exposure, residual_rms
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
@@ -40,12 +40,6 @@ def seed_of(recording: Recording) -> int | None:
     if (found := _SIMULATED.search(recording.metadata.get("camera", ""))) is None:
         return None
     return int(found[2]) if recording.rig.digest.startswith(found[1]) else None
-
-
-def residual_rms(series: Iterable[Exposure]) -> float:
-    """Root mean square of the true slopes at each fast step, slope units; NaN without truth."""
-    squares = [float(np.mean(each.truth.path**2)) for each in series if each.truth is not None]
-    return float(np.sqrt(np.mean(squares))) if squares else float("nan")
 
 
 def closed_loop(

@@ -165,6 +165,9 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
         lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
     else:
         lines = ["online and offline estimates agree bit for bit"]
+    if result.residuals:
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in result.residuals.items())
+        lines.append(f"residual slopes at the fast rate, rms: {shown}")
     if result.deblurred is not None:
         from aolink.restoration.registry import DEFAULT_METHOD
 
