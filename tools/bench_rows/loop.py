@@ -29,9 +29,9 @@ def residual(rig: Rig, controller: str, estimator: str, exposures: int, seed: in
 
 
 def residual_slopes(effort: Effort) -> list[Row]:
-    """Drift and a line of equal sd, as the rig file's model has them; 5 seeds of 120 exposures; the best of four gains of the integrator.
+    """Drift and a line of equal sd, as the rig file's model has them: 5 seeds of 120 exposures, four gains tried.
 
-    That gain is the best for all seeds together, with hindsight. In brackets: the mean over the seeds of ours over the
+    The integrator's gain is the best for all seeds together, with hindsight. In brackets: the mean over the seeds of ours over the
     integrator's, and its one-sided 95 % bound.
     """
     seeds, exposures = range(101, 101 + effort.of(5, 2)), effort.of(120, 6)
