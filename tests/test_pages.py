@@ -128,7 +128,7 @@ def commands(block: CodeBlock) -> Iterator[str]:
 def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all the files that the pages' commands speak of."""
     folder = tmp_path_factory.mktemp("laboratory")
-    rigs = Path(load_rig("section-vi").folder)
+    rigs = load_rig("section-vi").path_of("", "")
     shutil.copytree(rigs, folder / "aolink" / "rigs")
     shutil.copy(rigs / "section-vi.toml", folder / "my.toml")  # as README begins with
     rig = load_rig(folder / "my.toml")

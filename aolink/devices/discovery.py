@@ -49,6 +49,8 @@ class DriverFound:
     lacks: list[str] = field(default_factory=list)
     devices: list[tuple[str, str]] = field(default_factory=list)
     """Address and description of each device found: the address is a key of the rig file's ``[devices]``."""
+    search: str = ""
+    """What there is to know of how its devices are found; empty where some were."""
     problem: str = ""
     """Why it cannot be used, or cannot look for devices; empty where it can."""
 
@@ -56,26 +58,30 @@ class DriverFound:
 def find_drivers() -> list[DriverFound]:
     """The installed drivers of cameras and mirrors, each with the devices that it finds on this machine.
 
-    A driver looks for its devices if its module has a function ``discover()``. None is opened.
+    A driver looks for its devices if its module has a function ``discover()``, and says with a text ``NOT_LISTED``
+    which of them that cannot find. None is opened.
     """
     return [_find(kind, name) for kind in KINDS for name in driver_names(kind)]
 
 
 def _find(kind: Kind, name: str) -> DriverFound:
     if name == NATIVE:
-        return DriverFound(kind=kind, name=name)
+        return DriverFound(kind=kind, name=name, search="`aolink devices PORT...` asks who answers at a port")
     try:
         driver = load_driver(kind, name)
         with calling(kind, "when it was asked what its devices lack"):
             lacks = [str(each) for each in lacks_of(driver)]
     except AolinkError as error:
         return DriverFound(kind=kind, name=name, problem=str(error))
-    discover = getattr(sys.modules.get(getattr(driver, "__module__", "")), "discover", None)
+    module = sys.modules.get(getattr(driver, "__module__", ""))
+    discover = getattr(module, "discover", None)
     try:
         devices = [(str(address), str(text)) for address, text in discover()] if discover else []
     except Exception as error:  # a library of the maker's that is missing or broken
         return DriverFound(kind=kind, name=name, lacks=lacks, problem=printable(f"it cannot look for devices: {error}"))
-    return DriverFound(kind=kind, name=name, lacks=lacks, devices=devices)
+    usual = "no device found" if discover else "it does not look for devices: the rig file says where they are"
+    search = "" if devices else str(getattr(module, "NOT_LISTED", usual))
+    return DriverFound(kind=kind, name=name, lacks=lacks, devices=devices, search=search)
 
 
 def list_ports() -> list[tuple[str, str]]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
+from aolink.devices.adapted_camera import AdaptedCamera
+from aolink.devices.adapted_mirror import AdaptedMirror
 from aolink.devices.interfaces import Happened
 from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.devices.no_mirror import NoMirror

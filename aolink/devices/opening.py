@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
-from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
+from aolink.devices.adapted_camera import AdaptedCamera
+from aolink.devices.adapted_mirror import AdaptedMirror
 from aolink.devices.drivers import KINDS, NATIVE, Kind, calling, driver_names, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host

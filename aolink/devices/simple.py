@@ -1,8 +1,8 @@
 """Protocols for drivers of cameras and mirrors that do not speak aolink's packets.
 
 A simple driver knows its device and nothing of a session. It never waits: the session's thread polls it every few
-milliseconds. `aolink.devices.adapted` makes a session's devices of such drivers, and `aolink.devices.paced` a mirror
-that takes a queue of one that does not.
+milliseconds. `aolink.devices.adapted_camera` and `adapted_mirror` make a session's devices of such drivers, and
+`aolink.devices.paced` a mirror that takes a queue of one that does not.
 """
 
 from __future__ import annotations
@@ -40,12 +40,24 @@ class SimpleFrame:
     """What really happened, where the driver simulates a camera."""
 
 
+class ClockAnswer(NamedTuple):
+    """What a camera's clock said between two times of `time.monotonic_ns`, all in ns."""
+
+    asked_ns: int
+    camera_ns: int
+    answered_ns: int
+
+
 class SimpleCamera(Protocol):
     """A camera. The entry point is called with the rig and, by keyword, the driver's own keys of the rig file.
 
     It raises `aolink.errors.DeviceError`, with the reason, where the device cannot do what the rig file says. A class
     attribute ``lacks`` may list what the device cannot do, some of `Lacks`. A method ``statistics`` may give the counts
     of its line by the fields of the recording's ``LinkStatistics``; they are recorded once a second.
+
+    A camera whose clock takes long to ask has a method ``ask_time``, which has it asked without waiting (False where
+    there is no clock to ask), and a method ``time_answers``, which gives the `ClockAnswer`s since its last call. During
+    a session ``time_ns`` is not called then.
     """
 
     description: str

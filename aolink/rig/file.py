@@ -8,6 +8,7 @@ the unit of ``sensor.field``, of the plant's output and of the kernel's width.
 from __future__ import annotations
 
 import hashlib
+import re
 import tomllib
 from dataclasses import dataclass
 from importlib import resources
@@ -31,13 +32,16 @@ from aolink.rig.tables import (
     read_timing,
     with_disturbance,
 )
-from aolink.rig.toml_table import Table
+from aolink.rig.toml_table import Table, named_file
 
 _TABLES = (
     "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
     "lenslets", "disturbance", "scene", "calibration", "devices", "control",
 )  # fmt: skip
 """The top-level keys of a rig file."""
+_LONGEST = 16 << 20
+_DEEPEST = 200
+"""Characters of a rig file, and parts of a key: what a key takes of the memory grows with the square of its parts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,8 +66,9 @@ class Rig:
     """The picture sensor that shares the exposure, where the rig has one."""
     devices: dict[str, DeviceTable]
     """Drivers of the devices, by the names ``camera`` and ``mirror``, where the file names them."""
-    folder: Path
-    """Folder of the rig file, which paths in the file are relative to."""
+    folder: Path | None
+    """Folder of the rig file, which paths in the file are relative to. None where the file came out of a recording:
+    such a one names no file, since nobody on this machine has chosen it."""
     toml: str
     """The file's text, as read."""
 
@@ -71,6 +76,16 @@ class Rig:
     def digest(self) -> str:
         """SHA-256 of the file's text: the rig's identity in a recording."""
         return hashlib.sha256(self.toml.encode()).hexdigest()
+
+    def path_of(self, name: str | Path, key: str) -> Path:
+        """The path of a file that the rig file names under ``key``.
+
+        Raises
+        ------
+        RigError
+            The rig file comes out of a recording.
+        """
+        return named_file(self.folder, name, key)
 
     @property
     def n_inputs(self) -> int:
@@ -102,7 +117,8 @@ def load_rig(path_or_name: str | Path) -> Rig:
         text = path.read_text()
     else:
         try:
-            text = path.read_text()
+            with path.open() as file:
+                text = file.read(_LONGEST + 1)
         except OSError as error:
             if path.name.removesuffix(".toml") in builtin_rigs() and path.parent == Path():
                 return load_rig(path.name.removesuffix(".toml"))
@@ -125,7 +141,15 @@ def builtin_rigs() -> list[str]:
 
 
 def parse_rig(text: str, folder: Path | None = None) -> Rig:
-    """Validate the text of a rig file. Raises `RigError`, naming the key."""
+    """Validate the text of a rig file. Raises `RigError`, naming the key.
+
+    Parameters
+    ----------
+    folder:
+        The folder of the file; None for a text that comes out of a recording.
+    """
+    if len(text) > _LONGEST or _deepest_key(text) > _DEEPEST:
+        raise RigError(f"it is longer than {_LONGEST >> 20} MiB, or has a key of more than {_DEEPEST} parts")
     try:
         root = Table(tomllib.loads(text), "")
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number or nesting beyond what Python reads
@@ -153,5 +177,10 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
         mirror=mirror, drive=drive, control=control, simulation=simulation, calibration=calibration,
-        optics=optics, disturbance=disturbance, scene=scene, devices=devices, folder=folder or Path(), toml=text,
+        optics=optics, disturbance=disturbance, scene=scene, devices=devices, folder=folder, toml=text,
     )  # fmt: skip
+
+
+def _deepest_key(text: str) -> int:
+    """More than the parts of any key in a text, as far as one can tell without parsing it."""
+    return max(part.count(".") for part in re.split(r"[,=\[\]\n]", text.replace(" ", "").replace("\t", "")))

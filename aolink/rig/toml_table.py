@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -35,6 +36,22 @@ KEYS = frozenset(_KEYS.split())
 Where a key is missing, a key of the file that is not among these is taken for a misspelling of it if the two look
 alike. What the readers have asked for cannot tell: they have not asked yet for the keys after the missing one.
 """
+
+
+def named_file(folder: Path | None, name: str | Path, key: str) -> Path:
+    """The path of a file that a rig file in ``folder`` names under ``key``.
+
+    Raises
+    ------
+    RigError
+        There is no folder: the rig file comes out of a recording.
+    """
+    if folder is None:
+        raise RigError(
+            f"{key}: the rig file comes out of a recording, and such a one may not name files ({name}): save it as a"
+            " file of your own, look at it, and give that"
+        )
+    return folder / name
 
 
 def did_you_mean(written: Iterable[str], known: Iterable[str]) -> str:

@@ -53,9 +53,10 @@ def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
 def _saved(report: Report, paths: Sequence[Path]) -> str:
     """What a session has saved that an error ended, in words."""
     where = str(paths[-1]) if len(paths) == 1 else f"{len(paths)} files, the last of them {paths[-1]}"
-    if not report.exposures:
+    exposures = max(report.exposures, report.frames_received)  # also those whose inputs were not reported any more
+    if not exposures:
         return f"no exposure had come by then, {where} holds none"
-    return f"the {report.exposures} exposure(s) that had come by then are saved in {where}"
+    return f"the {exposures} exposure(s) that had come by then are saved in {where}"
 
 
 def record(

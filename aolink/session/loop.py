@@ -437,7 +437,8 @@ class SessionLoop:
             return
         margin = 0 if self._time.virtual else round(MARGIN_S * 1e9) // self._step_ns + 1
         change = self._controlling.see(exposure, estimate, self._device_step() + margin)
-        self._queued_until = min(self._queued_until, change.first_step)
+        if change.first_step < self._queued_until:
+            self._queued_until = max(self._device_step() + 1, self._mirror.withdraw(change.first_step))
         self._record(topics.CONTROL, change.message, log_time_ns)
         if change.warning:
             self.report.warnings.append(change.warning)

@@ -275,10 +275,8 @@ class SimulatedDevices:
             if k < self.step:
                 ack.late_steps += 1
             else:
-                queued = self._queue.get(k)
-                ack.superseded_steps += queued is not None
-                if queued is None or queued[0] < block.block_id:  # an earlier block may come again, and late
-                    self._queue[k] = (block.block_id, applied[k - block.first_step])
+                ack.superseded_steps += k in self._queue
+                self._queue[k] = (block.block_id, applied[k - block.first_step])
         ack.queue_end_step = self.queue_end
         self._reporting = self.armed = True
         return ack

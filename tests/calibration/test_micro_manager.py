@@ -17,9 +17,10 @@ from scipy import stats
 
 from aolink.calibration import Calibration, Frames, calibrate
 from aolink.rig import load_rig, parse_rig
+from tests.needs import needed
 
-pymmcore = pytest.importorskip("pymmcore")
-mm_test_adapters = pytest.importorskip("mm_test_adapters")
+pymmcore = needed("pymmcore")
+mm_test_adapters = needed("mm_test_adapters")
 
 PIXELS = 256
 FRAMES = 150

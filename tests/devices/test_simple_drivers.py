@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Frame
 from aolink.devices import discovery
-from aolink.devices.adapted import AdaptedCamera, AdaptedMirror
-from aolink.devices.interfaces import CommandAnswered, Event
+from aolink.devices.adapted_camera import AdaptedCamera
+from aolink.devices.adapted_mirror import AdaptedMirror
+from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event
 from aolink.devices.opening import open_devices
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.simple import ClockAnswer, Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.rig import load_rig
 from aolink.rig.device_tables import Delay, DeviceTable
@@ -32,6 +33,14 @@ STEP_NS = RIG.timing.fast_step_ns
 EXPOSURE_NS, PERIOD_NS = RIG.timing.exposure_steps * STEP_NS, RIG.timing.frame_period_steps * STEP_NS
 EPOCH_NS = 1_767_225_600_000_000_000
 CAMERA_ZERO_NS = 777_000_000
+PATIENCE_S = 10.0
+
+
+def eventually(happened: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not happened():
+        assert time.monotonic() < until_s
+        time.sleep(0.001)
 
 
 class Bench:
@@ -185,9 +194,13 @@ def bench() -> CameraBench:
 
 @pytest.fixture
 def camera(bench: CameraBench) -> AdaptedCamera:
-    """Started at fast step 100."""
-    mirror_bench = Bench()
-    camera = AdaptedCamera(RIG, bench, mirror_of(mirror_bench), Delay(), bench.now_ns)
+    return started(bench)
+
+
+def started(bench: CameraBench) -> AdaptedCamera:
+    """Started at fast step 100; frames arrive by the clock that the camera tells, or would tell."""
+    monotonic_ns = lambda: CameraBench.time_ns(bench)  # noqa: E731
+    camera = AdaptedCamera(RIG, bench, mirror_of(Bench()), Delay(), bench.now_ns, monotonic_ns)
     camera.query_clock(bench.host_ns)
     camera.poll()
     assert camera.start(100, 0)
@@ -220,8 +233,18 @@ def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench:
     assert all(f.last_step + 1 - f.first_step == RIG.timing.exposure_steps for f in frames)
 
 
-def test_arrivals_before_a_session_are_apart_from_its_own(camera: AdaptedCamera, bench: CameraBench) -> None:
+def test_exposures_without_a_pause_do_not_overlap_by_the_clocks_error(
+    camera: AdaptedCamera, bench: CameraBench
+) -> None:
+    """Each begins with the end of the one before, as well as the clocks can be compared."""
+    bench.taken = [frame((100 + 200 * k) * STEP_NS - k % 3 * STEP_NS // 40) for k in range(9)]
+    frames = [event for event in camera.poll() if isinstance(event, Frame)]
+    assert [(f.first_step, f.exposure_offset_ns) for f in frames] == [(100 + 200 * k, 0) for k in range(9)]
+
+
+def test_arrivals_before_a_session_are_apart_from_its_own() -> None:
     """Of a camera that counts its frames and tells no time, which runs before the session does."""
+    camera = started(bench := CameraWithoutTime())
     ends_ns = [100 * STEP_NS + (k + 1) * PERIOD_NS for k in range(-6, 2)]
     bench.taken = [
         frame(0, start_ns=None, arrived_ns=CAMERA_ZERO_NS + end_ns, number=9 + k) for k, end_ns in enumerate(ends_ns)
@@ -236,6 +259,7 @@ def test_arrivals_before_a_session_are_apart_from_its_own(camera: AdaptedCamera,
         ({"pixels": np.zeros((2, 3), np.uint16)}, r"the camera gives \(2, 3\) pixels from 0 to 0, the rig file says"),
         ({"exposure_ns": EXPOSURE_NS + STEP_NS}, r"the camera exposes for 0.201 s, the rig file says 0.2 s: correct"),
         ({"start_ns": CAMERA_ZERO_NS + 10**12}, "a frame whose exposure ends in the future"),
+        ({"start_ns": None}, r"the driver of bench gives a frame without start_ns although its time_ns\(\) tells"),
     ],
 )
 def test_a_frame_that_is_not_of_this_rig_is_refused(
@@ -281,9 +305,8 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     mirror.query_clock(bench.host_ns)
     mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
     mirror.poll()
-    assert parked.wait(30.0)
-    while not mirror.latched:
-        pass
+    assert parked.wait(PATIENCE_S)
+    eventually(lambda: mirror.latched)
     time.sleep(0.2)
     mirror.poll()
     assert mirror.outage_s > 0.25  # until the session is back, not until it was parked
@@ -296,6 +319,40 @@ def test_a_mirror_that_the_session_leaves_alone_is_parked_by_the_hosts_watchdog(
     mirror.send_block(41, np.full((4, 1), 0.01), 0, 0)
     bench.reports = [(10, np.concatenate([held(10), np.tile(rig.mirror.park, (21, 1)), held(4)]))]
     assert ends(mirror) == [(1, 10, 10, 0), (0, 20, 21, pb.Applied.WATCHDOG), (3, 41, 4, 0)]
+    mirror.close()
+
+
+def test_a_mirror_that_the_session_serves_is_left_alone_by_the_watchdog() -> None:
+    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=1.0))
+    bench, parked = Bench(), []
+    bench.park = lambda: parked.append(True) or 0  # type: ignore[method-assign, func-returns-value]
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
+    until_s = time.monotonic() + 0.6
+    while time.monotonic() < until_s:
+        mirror.poll()
+        time.sleep(0.005)  # as a session
+    assert (parked, mirror.latched) == ([], False)
+    mirror.close()
+
+
+def test_the_watchdog_watches_again_once_it_was_re_armed_and_no_longer_once_the_session_has_parked() -> None:
+    rig = replace(RIG, mirror=replace(RIG.mirror, watchdog_s=0.05))
+    bench, parked = Bench(), []
+    bench.park = lambda: parked.append(True) or 0  # type: ignore[method-assign, func-returns-value]
+    mirror = AdaptedMirror(rig, bench, Delay(), bench.now_ns)
+    mirror.query_clock(bench.host_ns)
+    mirror.send_block(10, np.full((20, 1), 0.01), 0, 0)
+    for times in (1, 2):
+        eventually(lambda: mirror.latched)
+        time.sleep(0.1)
+        assert len(parked) == times  # it parks once
+        mirror.rearm()
+    mirror.park()
+    before = len(parked)
+    time.sleep(0.3)
+    assert len(parked) == before
     mirror.close()
 
 
@@ -362,11 +419,57 @@ def test_a_delay_says_how_late_inputs_are_and_not_how_well_a_queues_time_is_know
     assert mirror.step_sigma_ns(bench.host_ns) == pytest.approx(expected, abs=2e3)
 
 
+def test_a_clock_that_a_driver_corrects_by_as_much_as_it_doubts_it_was_not_set() -> None:
+    """The PlayzerX's driver infers its device's clock from counts of samples."""
+    bench = Bench()
+    bench.timing_sigma_ns = 1e6  # type: ignore[attr-defined]
+    mirror, events = AdaptedMirror(RIG, bench, Delay(), bench.now_ns), []
+    for k in range(40):
+        bench.host_ns += 10**9
+        bench.time_ns = lambda by=k // 20: bench.host_ns - EPOCH_NS + 150_000 * by  # type: ignore[method-assign, misc]
+        mirror.query_clock(bench.host_ns)
+        events += mirror.poll()
+    assert all(event.accepted and event.step is None for event in events if isinstance(event, ClockSampled))
+    assert not mirror.clock.suspected
+
+
 class CameraWithoutTime(CameraBench):
     lacks = (Lacks.TIME, Lacks.COUNT)
 
     def time_ns(self) -> int | None:  # type: ignore[override]
         return None
+
+
+class CameraWithASlowClock(CameraBench):
+    """Whose answer is under way until the test lets it come."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answers: list[ClockAnswer] = []
+
+    def ask_time(self) -> bool:
+        return True
+
+    def time_answers(self) -> list[ClockAnswer]:
+        answers, self.answers = self.answers, []
+        return answers
+
+
+def test_a_clock_that_answers_late_is_compared_with_the_time_at_which_it_was_asked() -> None:
+    bench = CameraWithASlowClock()
+    monotonic_ns = lambda: bench.host_ns - EPOCH_NS + 5_000  # noqa: E731
+    camera = AdaptedCamera(RIG, bench, mirror_of(Bench()), Delay(), bench.now_ns, monotonic_ns)
+    for _ in range(8):
+        bench.host_ns += 10**9
+        camera.query_clock(bench.host_ns)
+        assert camera.poll() == []
+        answer = ClockAnswer(monotonic_ns() - 20_000, bench.time_ns(), monotonic_ns() + 20_000)
+        bench.host_ns += 3 * 10**8
+        bench.answers = [answer]
+        (sampled,) = camera.poll()
+        assert isinstance(sampled, ClockSampled)
+        assert sampled.accepted
+    assert camera.clock.host_ns(bench.time_ns())[0] == pytest.approx(bench.host_ns, abs=100)
 
 
 def test_arrival_stands_for_the_time_that_a_camera_does_not_tell() -> None:

@@ -71,16 +71,6 @@ def test_late_and_superseded_steps_are_counted() -> None:
     assert [(r.block_id, r.first_step, r.n_steps) for r in reports] == [(2, 20, 50)]
 
 
-def test_an_older_block_that_comes_again_does_not_undo_a_newer_one() -> None:
-    """A loop has replaced what was queued, and then the first try of the older block, which was lost, is repeated."""
-    device = devices()
-    ask(device, block(2, 10, 60))
-    ack = ask(device, block(1, 0))
-    assert (ack.code, ack.superseded_steps) == (pb.OK, 40)
-    reports = applied(device, 70)
-    assert [(r.block_id, r.first_step, r.n_steps) for r in reports] == [(1, 0, 10), (2, 10, 50), (2, 60, 10)]
-
-
 @pytest.mark.parametrize(
     ("bad", "code"),
     [

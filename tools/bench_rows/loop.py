@@ -31,8 +31,8 @@ def residual(rig: Rig, controller: str, estimator: str, exposures: int, seed: in
 def residual_slopes(effort: Effort) -> list[Row]:
     """Drift and a line of equal sd, as the rig file's model has them: 5 seeds of 120 exposures, four gains tried.
 
-    The integrator's gain is the best for all seeds together, with hindsight. In brackets: the mean over the seeds of ours over the
-    integrator's, and its one-sided 95 % bound.
+    The integrator's gain is the best for all seeds together, with hindsight. In brackets: the mean over the seeds of
+    ours over the integrator's, and its one-sided 95 % bound.
     """
     seeds, exposures = range(101, 101 + effort.of(5, 2)), effort.of(120, 6)
     gains = _GAINS if effort.share >= 1 else _GAINS[:1]

@@ -136,7 +136,7 @@ def facts(values: Mapping[str, Any]) -> Table:
     flat = readable | {name: value for name, value in values.items() if name not in left_out}
     flat["estimates"] = ", ".join(f"{name} {each['count']}" for name, each in values["estimates"].items()) or "none"
     for name, value in (flat | {k: v for k, v in values["session"].items() if k != "estimators"}).items():
-        if name in ("damage", "warnings", "commands") and not value:
+        if name in ("damage", "warnings", "commands", "camera_lacks", "mirror_lacks") and not value:
             continue
         if isinstance(value, Mapping):
             value = ", ".join(f"{key} {count}" for key, count in value.items()) or "none"

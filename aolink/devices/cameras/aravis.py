@@ -7,17 +7,18 @@ picture whose counts take two bytes goes to the session as it lies there, withou
 from __future__ import annotations
 
 import ctypes
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from concurrent.futures import Future
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from aolink.devices.cameras.aravis_library import Aravis, Refused
 from aolink.devices.cameras.aravis_stream import Picture, PictureStream
 from aolink.devices.cameras.pictures import checked_corner
 from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
-from aolink.devices.simple import Lacks, SimpleFrame
+from aolink.devices.cameras.requests import Requests
+from aolink.devices.simple import ClockAnswer, Lacks, SimpleFrame
 from aolink.errors import DeviceError, RigError
 from aolink.rig import Rig
 
@@ -31,6 +32,7 @@ _TIMESTAMP_CONTROL, _TIMESTAMP_LATCH, _TIMESTAMP_VALUE = 0x0944, 2, 0x0948
 _UNSURE_S = 1.0
 """How much later than others a frame may come whose arrival stands for its time."""
 _RELEASE_S = 2.0
+"""How long a camera that no longer answers is waited for: Aravis asks it again for many seconds."""
 
 
 def discover() -> list[tuple[str, str]]:
@@ -106,6 +108,9 @@ class AravisCamera:
         self._aravis = Aravis()
         self._address = address or self._only_camera()
         self._camera = None
+        self._requests = Requests("aolink-aravis")
+        self._asked: Future[ClockAnswer] | None = None
+        """The clock's answer that is under way."""
         self._running = False
         self._start_ns = 0
         self._before: tuple[int, int, int] | None = None
@@ -134,11 +139,23 @@ class AravisCamera:
         """The camera's clock, latched now; None where it has no latch, so that nothing compares it with the host's."""
         return self._latched_ns(self._latch) if self._latch else None
 
+    def ask_time(self) -> bool:
+        if self._latch and self._asked is None:
+            self._asked = self._requests.send(self._answer)
+        return bool(self._latch)
+
+    def time_answers(self) -> list[ClockAnswer]:
+        if self._asked is None or not self._asked.done():
+            return []
+        answered, self._asked = self._asked, None
+        return [answered.result()]
+
     def start(self, start_ns: int, exposures: int) -> None:
         for _ in self._stream.pictures():
             pass  # what is left from before
         self._start_ns, self._before = start_ns, None
-        self._do("arv_camera_start_acquisition", self._camera, to="be started")
+        # After an answer that is under way: Aravis does not say that features may be used by two threads at once.
+        self._requests.send(lambda: self._do("arv_camera_start_acquisition", self._camera, to="be started")).result()
         self._running = True
 
     def frames(self) -> Iterator[SimpleFrame]:
@@ -151,7 +168,13 @@ class AravisCamera:
     def stop(self) -> None:
         if self._running:
             self._running = False
-            self._do("arv_camera_stop_acquisition", self._camera, to="be stopped")
+            stopping = self._requests.send(
+                lambda: self._do("arv_camera_stop_acquisition", self._camera, to="be stopped")
+            )
+            try:
+                stopping.result(_RELEASE_S)
+            except TimeoutError:
+                raise DeviceError(f"the camera {self._address} does not answer when it is told to stop") from None
 
     def statistics(self) -> dict[str, int]:
         """Counts of its packets by the fields of ``LinkStatistics``, empty for a camera that is not on a network.
@@ -172,10 +195,10 @@ class AravisCamera:
                 self._stream.release()
             self._aravis("g_object_unref", camera)
 
-        if camera:  # one that no longer answers is asked again for many seconds, which nobody need wait for
-            releasing = threading.Thread(target=release, name="aolink-aravis-release", daemon=True)
-            releasing.start()
-            releasing.join(_RELEASE_S)
+        if camera:
+            with suppress(TimeoutError):
+                self._requests.send(release).result(_RELEASE_S)
+        self._requests.end()
 
     # Opening
 
@@ -184,7 +207,8 @@ class AravisCamera:
         try:
             return self._aravis(name, *arguments)
         except Refused as refused:
-            raise DeviceError(f"the camera {self._address} cannot {to}: {refused}") from None
+            advice = ", is it connected, and is its power on?" if "timeout" in str(refused) else ""
+            raise DeviceError(f"the camera {self._address} cannot {to}: {refused}{advice}") from None
 
     def _set(self, name: str, *arguments: Any, to: str) -> None:
         self._do(f"arv_camera_{name}", self._camera, *arguments, to=to)
@@ -312,15 +336,18 @@ class AravisCamera:
             if packet_size:
                 self._set("gv_set_packet_size", packet_size, to=f"send packets of {packet_size} bytes")
         stream = self._do("arv_camera_create_stream", self._camera, None, None, to="be read")
-        if self._is_gige:
-            has = int(self._get("gv_get_packet_size"))
-            block = has - (_PACKET_OVERHEAD_EXTENDED if self._extended_ids() else _PACKET_OVERHEAD)
-        pictures = PictureStream(
-            self._aravis, stream, name=self._address, shape=self._shape, pixel_format=self._format,
-            payload=int(self._get("get_payload")), block=block, period_s=self._period_ns / 1e9,
-        )  # fmt: skip
-        if self._is_gige:
-            pictures.set_resend(resend)
+        with ExitStack() as opened:
+            opened.callback(self._aravis, "g_object_unref", stream)
+            if self._is_gige:
+                has = int(self._get("gv_get_packet_size"))
+                block = has - (_PACKET_OVERHEAD_EXTENDED if self._extended_ids() else _PACKET_OVERHEAD)
+            pictures = PictureStream(
+                self._aravis, stream, name=self._address, shape=self._shape, pixel_format=self._format,
+                payload=int(self._get("get_payload")), block=block, period_s=self._period_ns / 1e9,
+            )  # fmt: skip
+            if self._is_gige:
+                pictures.set_resend(resend)
+            opened.pop_all()
         return pictures
 
     def _extended_ids(self) -> bool:
@@ -374,6 +401,10 @@ class AravisCamera:
             except DeviceError:
                 continue
         return ""
+
+    def _answer(self) -> ClockAnswer:
+        asked_ns = time.monotonic_ns()
+        return ClockAnswer(asked_ns, self._latched_ns(self._latch), time.monotonic_ns())
 
     def _latched_ns(self, how: str) -> int:
         if how == "feature":

@@ -11,14 +11,14 @@ from typing import Any, ClassVar
 
 from numpy.typing import NDArray
 
-from aolink.devices.cameras.pictures import FrameThread, as_counts, checked_corner, sensor_part
+from aolink.devices.cameras.pictures import FrameThread, ThreadCamera, as_counts, checked_corner, sensor_part
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError, ImportingError
 from aolink.importing.readers import open_film
 from aolink.rig import Rig
 
 
-class FolderCamera:
+class FolderCamera(ThreadCamera):
     """Plays pictures at the rig file's frame rate, by this computer's clock, as if each were exposed when it is due.
 
     Parameters
@@ -41,13 +41,12 @@ class FolderCamera:
     def __init__(self, rig: Rig, *, path: str, repeat: bool = True, corner: Sequence[int] | None = None) -> None:
         self._rig, self._repeat, self._corner = rig, repeat, checked_corner(corner)
         try:
-            self._film = open_film(rig.folder / Path(path).expanduser())
+            self._film = open_film(rig.path_of(Path(path).expanduser(), "devices.camera.path"))
             self._counts(next(self._film.frames()))
         except ImportingError as error:
             raise DeviceError(str(error)) from error
         odd = f"; {self._film.nonlinear}" if self._film.nonlinear else ""
         self.description = f"{self._film.count} pictures of {self._film.name}{', repeated' if repeat else ''}{odd}"
-        self._thread: FrameThread | None = None
 
     def time_ns(self) -> int:
         """This computer's clock, ns."""
@@ -56,21 +55,6 @@ class FolderCamera:
     def start(self, start_ns: int, exposures: int) -> None:
         """Play ``exposures`` pictures (0: until stopped), the first as exposed from ``start_ns`` on."""
         self._thread = FrameThread(lambda stopped: self._play(start_ns, exposures, stopped))
-
-    def frames(self) -> list[SimpleFrame]:
-        """The pictures that have been played since the last call. Raises DeviceError where they have ended."""
-        return self._thread.take() if self._thread else []
-
-    def stop(self) -> None:
-        """Play no more."""
-        if self._thread:
-            self._thread.stop()
-
-    def close(self) -> None:
-        """End the thread that plays."""
-        if self._thread:
-            self._thread.stop()
-            self._thread.join()
 
     def _play(self, start_ns: int, exposures: int, stopped: threading.Event) -> Iterator[SimpleFrame]:
         timing = self._rig.timing

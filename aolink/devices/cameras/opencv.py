@@ -5,10 +5,18 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar
 
-from aolink.devices.cameras.pictures import FrameThread, as_counts, check_within, checked_corner, sensor_part
+from aolink.devices.cameras.pictures import (
+    FrameThread,
+    ThreadCamera,
+    as_counts,
+    check_within,
+    checked_corner,
+    sensor_part,
+)
 from aolink.devices.simple import Lacks, SimpleFrame
 from aolink.errors import DeviceError
 from aolink.extensions import needs_extra
@@ -22,7 +30,7 @@ _V4L2_MANUAL, _V4L2_UNIT_S = 1, 1e-4
 _DEVICES = Path("/sys/class/video4linux")
 
 
-class OpenCVCamera:
+class OpenCVCamera(ThreadCamera):
     """Whatever ``cv2.VideoCapture`` opens, 8 bits a colour, its colours averaged.
 
     It tells no time and does not count, so frames have the time of their arrival. A thread reads it and notes that
@@ -47,7 +55,7 @@ class OpenCVCamera:
         with needs_extra("opencv", DeviceError):
             import cv2
         self._rig, self._corner, timing = rig, checked_corner(corner), rig.timing
-        beside = rig.folder / str(source)
+        beside = rig.path_of(str(source), "devices.camera.source")
         opened = int(source) if str(source).isdecimal() else str(beside) if beside.exists() else source
         self._name = f"camera {source}" if isinstance(opened, int) else str(source)
         said = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it better
@@ -55,23 +63,21 @@ class OpenCVCamera:
         cv2.utils.logging.setLogLevel(said)
         if not self._capture.isOpened():
             raise DeviceError(f"OpenCV cannot open {self._name}: is it connected, not in use, and may you read it?")
-        self._is_file = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0
         self._rate = 1 / (timing.frame_period_steps * timing.fast_step_s)
         self._exposure_ns = timing.exposure_steps * timing.fast_step_ns
-        believed = self._is_file or not self._set_exposure(cv2)
-        if not self._is_file:
-            if corner is None:
-                self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, rig.sensor.shape[0])
-                self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, rig.sensor.shape[1])
-            self._capture.set(cv2.CAP_PROP_FPS, self._rate)
-        try:
+        with ExitStack() as stack:
+            stack.callback(self._capture.release)
+            self._is_file = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) > 0
+            believed = self._is_file or not self._set_exposure(cv2)
+            if not self._is_file:
+                if corner is None:
+                    self._capture.set(cv2.CAP_PROP_FRAME_HEIGHT, rig.sensor.shape[0])
+                    self._capture.set(cv2.CAP_PROP_FRAME_WIDTH, rig.sensor.shape[1])
+                self._capture.set(cv2.CAP_PROP_FPS, self._rate)
             self._check(cv2)
-        except DeviceError:
-            self._capture.release()
-            raise
-        exposure = f"exposure {self._exposure_ns / 1e9:g} s{' as the rig file says' if believed else ''}"
-        self.description = f"OpenCV {cv2.__version__} {self._capture.getBackendName()} {self._name}, {exposure}"
-        self._thread: FrameThread | None = None
+            exposure = f"exposure {self._exposure_ns / 1e9:g} s{' as the rig file says' if believed else ''}"
+            self.description = f"OpenCV {cv2.__version__} {self._capture.getBackendName()} {self._name}, {exposure}"
+            stack.pop_all()
 
     def time_ns(self) -> None:
         """OpenCV gives no time of the camera's."""
@@ -80,22 +86,11 @@ class OpenCVCamera:
         """Read frames until stopped: a file's from ``start_ns`` on, others as they come, before it as well."""
         self._thread = FrameThread(lambda stopped: self._read(start_ns, stopped))
 
-    def frames(self) -> list[SimpleFrame]:
-        """The frames that have arrived since the last call. Raises DeviceError where the camera gives no more."""
-        return self._thread.take() if self._thread else []
-
-    def stop(self) -> None:
-        """Read no more."""
-        if self._thread:
-            self._thread.stop()
-
     def close(self) -> None:
-        """Release the camera, once the frame that is under way has come."""
+        """Release the camera, once the frame that is under way has come: the thread does it, where there is one."""
         if self._thread is None:
             self._capture.release()
-        else:
-            self._thread.stop()
-            self._thread.join()
+        super().close()
 
     def _set_exposure(self, cv2: Any) -> bool:
         """Set the exposure time where its unit is known, and read it back; whether that was possible."""

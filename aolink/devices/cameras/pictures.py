@@ -66,6 +66,27 @@ class FrameThread(Arrived):
             self.fail(failure)
 
 
+class ThreadCamera:
+    """What cameras have in common whose frames come from a thread, which begins when they are started."""
+
+    _thread: FrameThread | None = None
+
+    def frames(self) -> list[SimpleFrame]:
+        """The frames since the last call. Raises DeviceError where there are no more to come."""
+        return self._thread.take() if self._thread else []
+
+    def stop(self) -> None:
+        """Take no more frames."""
+        if self._thread:
+            self._thread.stop()
+
+    def close(self) -> None:
+        """End the thread, once the frame that is under way has come."""
+        if self._thread:
+            self._thread.stop()
+            self._thread.join()
+
+
 def checked_corner(corner: Sequence[int] | None) -> tuple[int, int] | None:
     """The key ``corner`` of a rig file as row and column. Raises DeviceError."""
     if corner is None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 from contextlib import ExitStack, suppress
 from typing import ClassVar
 
@@ -23,6 +24,8 @@ from aolink.rig import Rig
 
 _BAUD_RATE = 256_000
 _USB_ID = 0x0483, 0xA31E
+"""The maker's Python package looks for an MR-E-2 by it."""
+NOT_LISTED = "no device found by the USB id of the MR-E-2 (0483:a31e): if yours has another, give devices.mirror.port"
 _LIMIT_DEG = 50.0
 _LIMIT = math.tan(math.radians(_LIMIT_DEG))
 """Tangent of the optical angle at the edge of the unit circle."""
@@ -34,13 +37,15 @@ already takes it for a command that it does not know."""
 _FIRST_ANSWER_S = 0.3
 _QUIET_S = 0.05
 """A line on which nothing has come for so long has no late answers on it."""
+_STATUS_S = 1.0
+"""How often it is asked for its status while inputs are sent."""
 _TROUBLE = {
     0: "no mirror is connected to it",
     1: "the mirror's electronics are too hot",
     2: "the mirror is too hot",
     3: "the mirror's memory cannot be read",
 }
-"""Bits of its status with which it moves nothing, or not as commanded."""
+"""Bits of its status with which it moves nothing, or not as commanded. They stay set until the status is read."""
 _REFUSED = {
     "NO": "it does not take commands in its present state; Optotune Cockpit shows what is wrong",
     "OL": "it went to its lower limit instead; make the rig's limits smaller",
@@ -72,11 +77,15 @@ class OptotuneMirror:
             self._start()
             model, serial_number, firmware = (self._ask(what) for what in ("GETID", "GETSN", "GETVERSION"))
             self.description = f"Optotune {model}, serial number {serial_number}, firmware {firmware}"
-            self._check_status()
+            self._check_status(self._ask("STATUS"))
+            self._status_asked, self._status_due_s = False, time.monotonic() + _STATUS_S
             self.park()
             opened.pop_all()
 
     def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._status_asked:  # while the input before was held, so that no input waits for the answer
+            self._status_asked = False
+            self._check_status(self._text("STATUS", self._line.read_until(b"\r\n")))
         steps = 10**_DECIMALS
         # Towards zero, so never beyond the circle.
         xy: NDArray[np.float64] = np.trunc(np.tan(self._unit_rad * u) / _LIMIT * steps) / steps
@@ -86,10 +95,14 @@ class OptotuneMirror:
                 f"the Optotune mirror driver answers XY={request} with {answer!r}, not with OK:"
                 f" {_REFUSED.get(answer, 'give the port of a mirror driver, MR-E-3 or MR-E-2')}"
             )
+        if time.monotonic() > self._status_due_s:
+            self._line.tell(b"STATUS\r\n")
+            self._status_asked, self._status_due_s = True, time.monotonic() + _STATUS_S
         return np.arctan(xy * _LIMIT) / self._unit_rad
 
     def park(self) -> None:
         self._line.drain(_QUIET_S)
+        self._status_asked = False
         self.put(self._park)
 
     def close(self) -> None:
@@ -120,8 +133,8 @@ class OptotuneMirror:
                 " `aolink devices` lists the ports of this machine"
             )
 
-    def _check_status(self) -> None:
-        answer = self._ask("STATUS")
+    def _check_status(self, answer: str) -> None:
+        """Raises DeviceError where the mirror does not move as commanded."""
         try:
             status = int(answer, 16)
         except ValueError:
@@ -132,7 +145,9 @@ class OptotuneMirror:
             raise DeviceError(f"the Optotune mirror driver says that {' and '.join(trouble)} (STATUS {answer})")
 
     def _ask(self, request: str, timeout_s: float = 1.0) -> str:
-        answer = self._line.ask(f"{request}\r\n".encode(), b"\r\n", timeout_s)
+        return self._text(request, self._line.ask(f"{request}\r\n".encode(), b"\r\n", timeout_s))
+
+    def _text(self, request: str, answer: bytes) -> str:
         if not answer.isascii():
             raise DeviceError(f"the Optotune mirror driver answers {request} with {shown(answer)}: is the cable good?")
         return answer.decode().strip()

@@ -24,6 +24,7 @@ from aolink.devices.simple import Held, Lacks
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig
 
+NOT_LISTED = "it does not look for devices, whose ports look like any other: give devices.mirror.port"
 BAUD_RATE = 921_600
 RATES = range(50, 50_001)
 """Samples a second."""

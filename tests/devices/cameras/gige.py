@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from aolink.devices.cameras.aravis import AravisCamera
@@ -18,6 +16,7 @@ from aolink.devices.cameras.pixel_formats import PIXEL_FORMATS, PixelFormat
 from aolink.devices.simple import SimpleFrame
 from aolink.rig import Rig, load_rig, parse_rig
 from tests.devices.simulators.gige import FIRST_ID, LIBRARY, RELAY
+from tests.needs import missing
 
 PICTURES = 64
 LONGEST_S = 60.0
@@ -28,10 +27,8 @@ def need_aravis() -> None:
     """Skip the module where Aravis is missing; in CI it must not be."""
     try:
         ctypes.CDLL(LIBRARY)
-    except OSError:
-        if os.environ.get("AOLINK_REQUIRE_ARAVIS"):
-            raise
-        pytest.skip("Aravis is missing (Debian: libaravis-0.8-0)", allow_module_level=True)
+    except OSError as error:
+        missing("Aravis (Debian: libaravis-0.8-0)", error)
 
 
 def fast_rig(bits: int = 16, size: int = 16, period_steps: int = 10) -> Rig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ def test_a_session_is_recorded_estimated_and_replayed(tmp_path: Path, address: s
     The camera's clock is latched, or the arrival of its frames stands for their time.
     """
     rig = lenslet(address, packet_size=136, resend="false")
+    rig = replace(rig, mirror=replace(rig.mirror, watchdog_s=10.0))  # a busy machine may hold a session up for long
     truth = simulate(rig, PICTURES, seed=4)
     frames = packed(np.array([each.pixels for each in truth]), PIXEL_FORMATS["Mono12p"])
     with gige_camera(tmp_path, frames, codes("Mono12p"), Faults(loss=0.05, seed=1)):

@@ -14,8 +14,9 @@ from aolink.errors import DeviceError
 from aolink.recording.reader import Recording
 from aolink.session import record
 from tests.devices.cameras.bench import counted, pictures, recorded, rig_of, save
+from tests.needs import needed
 
-pytest.importorskip("pypylon")
+needed("pypylon")
 
 SERIAL = "0815-0000"
 

@@ -16,8 +16,9 @@ from aolink.errors import DeviceError
 from aolink.recording.reader import Recording
 from aolink.session import record
 from tests.devices.cameras.bench import BITS_8, EXPOSURE_STEPS, pictures, recorded, rig_of, shown_in
+from tests.needs import needed
 
-cv2 = pytest.importorskip("cv2")
+cv2 = needed("cv2")
 
 RATE = 1000 / EXPOSURE_STEPS
 CORNER = (20, 10)

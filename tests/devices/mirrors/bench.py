@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from aolink import estimate
 from aolink.extensions import installed
+from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
+from aolink.session import Report
 from tests.devices.simulators import spot_camera
 
 FAST_STEP_S = 0.01
@@ -59,3 +62,24 @@ def watch(
         return inputs(np.array(held[max(now - 1, 0)][1]))
 
     spot_camera.mirror.held = at
+
+
+def check_session(report: Report, path: Path, mirror: str) -> None:
+    """Ten exposures with a mirror whose description begins so: complete, each step accounted for, well estimated."""
+    assert (report.ended, report.frames_received) == ("complete", 10)
+    ends = (report.steps_applied, report.steps_late, report.steps_superseded, report.steps_not_reported)
+    assert (sum(ends), report.steps_clipped) == (report.steps_commanded, 0)
+    recording = Recording(path)
+    assert recording.metadata["mirror"].startswith(mirror)
+    exposures = list(recording)
+    assert max(np.abs(each.inputs).max() for each in exposures) > 0.2
+    for exposure, found in zip(exposures, estimate(path, "o1"), strict=True):
+        assert exposure.truth is not None
+        assert np.abs(found.path - exposure.truth.path).max() < 0.05  # a step is late on a busy machine
+
+
+def check_ended(report: Report, path: Path) -> None:
+    """A session that an error has ended: what was recorded until then is whole."""
+    recording = Recording(path)
+    assert recording.complete
+    assert len(list(recording)) >= report.exposures > 0

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("microscope")
-
 from aolink import estimate
 from aolink.devices.mirrors.microscope import MicroscopeMirror
 from aolink.errors import DeviceError, RigError

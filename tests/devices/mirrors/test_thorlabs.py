@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("thorlabs_apt_protocol")
-
 from aolink import estimate
 from aolink.devices.mirrors.thorlabs import ThorlabsAligner, ThorlabsPiezo
 from aolink.errors import AolinkError, DeviceError, RigError
@@ -23,6 +21,9 @@ from aolink.session import Report, record
 from tests.devices.mirrors import bench
 from tests.devices.simulators.serial_device import Faults
 from tests.devices.simulators.thorlabs import Aligner, Piezo
+from tests.needs import needed
+
+needed("thorlabs_apt_protocol")
 
 KEYS = {"unit": 30.0, "zero": 35.0}
 """Inputs from -1 to 1 as 5 V to 65 V."""

@@ -6,8 +6,13 @@ import time
 from typing import Any, ClassVar
 
 import numpy as np
-from microscope.simulators import SimulatedDeformableMirror
 from numpy.typing import NDArray
+
+from tests.needs import needed
+
+needed("microscope")
+
+from microscope.simulators import SimulatedDeformableMirror  # noqa: E402
 
 
 class WatchedMirror(SimulatedDeformableMirror):  # type: ignore[misc]

@@ -2,7 +2,7 @@
 
 At 127.0.0.1 the fake camera itself answers, which has no clock to ask for and sends nothing again. At 127.0.0.2 a relay
 stands before it: it latches a clock as the standard's registers say, drops packets of pictures by seed and counts them,
-sends them again if it is to, and plays the faults of `Faults`.
+sends them again if it is to, has the camera's clock run fast, and plays the faults of `Faults`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -38,6 +38,8 @@ LIBRARY = "libaravis-0.8.so.0"
 WRITE_REGISTER, RESEND = 0x0082, 0x0040
 STREAM_PORT, STREAM_ADDRESS, CLOCK_CONTROL, CLOCK_VALUE = 0x0D00, 0x0D18, 0x0944, 0x0948
 LEADER, TRAILER, PAYLOAD = 1, 2, 3
+Show = Callable[[int, int], NDArray[np.uint8]]
+"""Gives the bytes of the picture with a frame id that is taken at a time, ns since 1970: the end of its exposure."""
 KINDS = {LEADER: "leaders", TRAILER: "trailers", PAYLOAD: "payloads"}
 
 
@@ -51,6 +53,8 @@ class Faults:
     resend: bool = False
     """Whether packets are sent again that are asked for."""
     latch: bool = True
+    clock_fast: float = 0.0
+    """By how much the camera's clock is faster than this machine's, as a part."""
     stop_after: int = 0
     """Frames after which no more come."""
     unplug_after: int = 0
@@ -85,6 +89,7 @@ class Relay:
         self._kept: dict[tuple[int, int], bytes] = {}
         """Packets that were dropped, by frame id and packet id."""
         self._frames = 0
+        self._zero_ns = time.time_ns()
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
@@ -112,7 +117,7 @@ class Relay:
             elif register == STREAM_PORT:
                 self._port, value = value & 0xFFFF, self._stream.getsockname()[1] if value & 0xFFFF else value
             elif register == CLOCK_CONTROL and value == 2 and self._faults.latch:
-                now_ns = time.time_ns()  # the clock that the fake camera stamps its frames with
+                now_ns = self._clock_ns(time.time_ns())
                 self._write_register(CLOCK_VALUE, now_ns >> 32)
                 self._write_register(CLOCK_VALUE + 4, now_ns & 0xFFFFFFFF)
             data = data[:8] + struct.pack(">2I", register, value) + data[16:]
@@ -128,6 +133,8 @@ class Relay:
         packet_id = struct.unpack_from(">I", data, 4)[0] & 0xFFFFFF
         if kind == LEADER:
             self._frames += 1
+            stamp_ns = self._clock_ns(struct.unpack_from(">Q", data, 12)[0])
+            data = data[:12] + struct.pack(">Q", stamp_ns) + data[20:]
         if faults.stop_after and self._frames > faults.stop_after:
             return
         if faults.resize_after and self._frames > faults.resize_after and kind == LEADER:
@@ -143,6 +150,10 @@ class Relay:
             return
         self._stream.sendto(data, (self._host, self._port))
 
+    def _clock_ns(self, time_ns: int) -> int:
+        """The camera's clock at a time since 1970, by which the fake camera stamps its frames."""
+        return time_ns + round(self._faults.clock_fast * (time_ns - self._zero_ns))
+
     def _send_again(self, data: bytes) -> None:
         _, frame_id, first, last = struct.unpack_from(">2H2I", data, 8)
         self.counts["requests"] += 1
@@ -152,8 +163,14 @@ class Relay:
                 self._stream.sendto(kept, (self._host, self._port))
 
 
-def _serve(pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults) -> None:
-    """Run the camera until standard input ends; answers each line on it with the relay's counts."""
+def serve(
+    show: Show, formats: dict[str, int], faults: Faults, beside: str = "", told: Callable[[], dict[str, Any]] = dict
+) -> None:
+    """Run the camera until standard input ends.
+
+    It prints ``beside``, what else there is in this process, when it is ready, and answers each line on standard input
+    with the relay's counts and what ``told`` gives.
+    """
     aravis = ctypes.CDLL(LIBRARY)
     pointer = ctypes.c_void_p
     for name, result, arguments in (
@@ -165,6 +182,7 @@ def _serve(pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults)
         ("arv_fake_camera_write_register", ctypes.c_int, [pointer, ctypes.c_uint32, ctypes.c_uint32]),
         ("arv_fake_camera_set_fill_pattern", None, [pointer, pointer, pointer]),
         ("arv_buffer_get_frame_id", ctypes.c_uint64, [pointer]),
+        ("arv_buffer_get_timestamp", ctypes.c_uint64, [pointer]),
         ("arv_buffer_get_data", pointer, [pointer, pointer]),
     ):
         function = getattr(aravis, name)
@@ -184,15 +202,15 @@ def _serve(pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults)
     inner = aravis.arv_gv_fake_camera_get_fake_camera(camera)
 
     def fill(buffer: int, _data: int, _exposure_us: int, _gain: int, _format: int) -> None:
-        picture = pictures[(aravis.arv_buffer_get_frame_id(buffer) - FIRST_ID) % 65535 % len(pictures)]
+        picture = show(aravis.arv_buffer_get_frame_id(buffer), aravis.arv_buffer_get_timestamp(buffer))
         ctypes.memmove(aravis.arv_buffer_get_data(buffer, None), picture.ctypes.data, picture.nbytes)
 
     callback = ctypes.CFUNCTYPE(None, pointer, pointer, *[ctypes.c_uint32] * 3)(fill)
     aravis.arv_fake_camera_set_fill_pattern(inner, ctypes.cast(callback, pointer), None)
     relay = Relay(faults, lambda register, value: aravis.arv_fake_camera_write_register(inner, register, value))
-    print("ready", flush=True)
+    print(f"ready {beside}", flush=True)
     for _ in sys.stdin:
-        print(json.dumps({"counts": relay.counts, "dropped": relay.dropped}), flush=True)
+        print(json.dumps({"counts": relay.counts, "dropped": relay.dropped, **told()}), flush=True)
 
 
 class Camera:
@@ -200,45 +218,57 @@ class Camera:
 
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
+        ready, _, self.beside = self.asked().strip().partition(" ")
+        assert ready == "ready"
 
-    def said(self) -> tuple[Counter[str], dict[int, list[int]]]:
-        """Packets that the relay dropped and sent again by kind, and the dropped ones' ids by the ids of frames."""
+    def asked(self) -> str:
+        """Its answer to a line."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write("\n")
         self._process.stdin.flush()
-        said = json.loads(self._process.stdout.readline())
+        return self._process.stdout.readline()
+
+    def said(self) -> tuple[Counter[str], dict[int, list[int]]]:
+        """Packets that the relay dropped and sent again by kind, and the dropped ones' ids by the ids of frames."""
+        said = json.loads(self.asked())
         return Counter(said["counts"]), {int(key): ids for key, ids in said["dropped"].items()}
 
 
 @contextmanager
-def gige_camera(
-    folder: Path, pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults | None = None
-) -> Iterator[Camera]:
-    """Run a camera that sends ``pictures`` (frames, bytes) over and over; one at a time on a machine has the port.
-
-    ``formats`` are the codes of pixel formats that it offers besides Mono8 and Mono16.
-    """
-    np.save(folder / "pictures.npy", pictures)
-    arguments = json.dumps({"pictures": str(folder / "pictures.npy"), "formats": formats, **asdict(faults or Faults())})
-    command = [sys.executable, "-m", "tests.devices.simulators.gige", arguments]
+def camera_process(module: str, **arguments: Any) -> Iterator[Camera]:
+    """Run a module that serves a camera, with these arguments; one at a time on a machine has the port."""
+    command = [sys.executable, "-m", module, json.dumps(arguments)]
     with (
         open(Path(tempfile.gettempdir()) / "aolink-gige.lock", "w") as lock,
         subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process,
     ):
         fcntl.flock(lock, fcntl.LOCK_EX)
         try:
-            assert process.stdin is not None
-            assert process.stdout is not None
-            process.stdin.write("\n")
-            process.stdin.flush()
-            assert process.stdout.readline() == "ready\n"
             yield Camera(process)
         finally:
             process.kill()
 
 
+@contextmanager
+def gige_camera(
+    folder: Path, pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults | None = None
+) -> Iterator[Camera]:
+    """Run a camera that sends ``pictures`` (frames, bytes) over and over.
+
+    ``formats`` are the codes of pixel formats that it offers besides Mono8 and Mono16.
+    """
+    np.save(folder / "pictures.npy", pictures)
+    where = str(folder / "pictures.npy")
+    with camera_process(__name__, pictures=where, formats=formats, faults=asdict(faults or Faults())) as camera:
+        yield camera
+
+
+def _serve_pictures(pictures: NDArray[np.uint8], formats: dict[str, int], faults: Faults) -> None:
+    serve(lambda frame_id, _: pictures[(frame_id - FIRST_ID) % 65535 % len(pictures)], formats, faults)
+
+
 if __name__ == "__main__":
     given = json.loads(sys.argv[1])
     sys.stdin.readline()  # it is its turn
-    _serve(np.load(given.pop("pictures")), given.pop("formats"), Faults(**given))
+    _serve_pictures(np.load(given["pictures"]), given["formats"], Faults(**given["faults"]))

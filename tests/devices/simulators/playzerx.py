@@ -103,7 +103,7 @@ class PlayzerX(SerialDevice):
         """What it puts out at a host time, from -1 to 1, (2,)."""
         with self.lock:
             self._pass_time()
-            period = int((host_ns - self.zero_ns) // self._period_ns) if self.zero_ns else -1
+            period = int((host_ns - self.zero_ns) // self.period_ns) if self.zero_ns else -1
             x, y, _ = self.put_out[min(period, len(self.put_out) - 1)] if period >= 0 else Sample(*ORIGIN, ())
         return np.array([x, y]) / 2047.5 - 1
 
@@ -116,7 +116,7 @@ class PlayzerX(SerialDevice):
                 self.zero_ns = self.zero_ns or int(self._tick_ns)
             if self.zero_ns and self.output:
                 self.put_out.append(self.output)
-            self._tick_ns += self._period_ns
+            self._tick_ns += self.period_ns
 
     def _execute(self, code: str, request: bytes) -> bytes:
         match code, len(request):
@@ -140,5 +140,5 @@ class PlayzerX(SerialDevice):
         return b""
 
     def _set_rate(self, rate: int) -> None:
-        self._period_ns = 1e9 / rate / (1 + self._rate_error)
-        self._tick_ns = time.monotonic_ns() + self._period_ns
+        self.period_ns = 1e9 / rate / (1 + self._rate_error)
+        self._tick_ns = time.monotonic_ns() + self.period_ns

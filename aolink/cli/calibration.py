@@ -1,0 +1,164 @@
+"""The command that measures a camera, or the interaction matrix of a mirror."""
+
+from __future__ import annotations
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from aolink.cli.common import JsonOption, OverwriteOption, app, progress, stderr, stdout
+from aolink.cli.terminal import ask, progress_bar
+from aolink.errors import AolinkError, CalibrationError
+from aolink.files import check_target, writing
+from aolink.signals import stop_after
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from aolink.rig import Rig
+
+
+@app.command(
+    epilog="Example: aolink calibrate dark.mcap flat.mcap still.mcap --rig my.toml -o calibrated.toml,"
+    " or aolink calibrate --interaction --camera PORT --mirror PORT --rig my.toml -o interaction.npz"
+)
+def calibrate(
+    rig: Annotated[
+        str,
+        typer.Option(
+            metavar="RIG.toml", help="The rig file to start from, or the name of a rig that comes with aolink."
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FILE", help="The rig file to write; with --interaction a .npz file."),
+    ],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="[FILE]...", help="Recordings made with `aolink record --calibration`, or with pokes."),
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar="PORT", help="Port of the camera, to record the frames now.")
+    ] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror.")] = None,
+    frames: Annotated[int, typer.Option(help="How many frames of each light to record.")] = 100,
+    interaction: Annotated[
+        bool, typer.Option("--interaction", help="Poke the mirror, and measure its interaction matrix instead.")
+    ] = False,
+    poke: Annotated[
+        float, typer.Option(min=1e-6, max=1.0, help="How far to poke, as a share of each input's range.")
+    ] = 0.1,
+    repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each input is pushed and pulled.")] = 2,
+    keep: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the recordings in this folder.")] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure black level, noise, gain, scale and kernel width, and write them into a copy of the rig file.
+
+    It takes recordings of dark, flat and still light, or records from the devices, asking for each in turn. With
+    --interaction it pushes and pulls each of the mirror's inputs, and writes where the spots went.
+    """
+    from shutil import rmtree
+    from tempfile import mkdtemp
+
+    from aolink.jobs import calibrate
+    from aolink.rig import load_rig
+
+    loaded = load_rig(rig)
+    if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
+        raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
+    if interaction:
+        check_target(output, overwrite=overwrite, sources=files or [], suffix=".npz", error=CalibrationError)
+    else:
+        check_target(output, overwrite=overwrite, sources=files or [])
+    folder = keep or Path(mkdtemp(prefix="aolink-"))
+    try:
+        if files:
+            paths = files
+        elif interaction:
+            paths = [folder / "pokes.mcap"]
+            folder.mkdir(parents=True, exist_ok=True)
+            with stop_after() as stop, progress("exposures", None) as tell:
+                calibrate.record_pokes(
+                    loaded, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
+                    progress=tell,
+                )  # fmt: skip
+        else:
+            paths = calibrate.record_frames(
+                loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
+                ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
+            )  # fmt: skip
+        if interaction:
+            _write_interaction(loaded, paths, output, overwrite=overwrite, as_json=as_json)
+        else:
+            _write_calibrated(loaded, rig, paths, output, overwrite=overwrite, as_json=as_json)
+    except AolinkError as error:
+        # Somebody has covered and lit the camera for them.
+        if not keep and (made := sorted(map(str, folder.glob("*.mcap")))):
+            keep = folder
+            raise type(error)(f"{error}; `aolink calibrate` takes what was recorded: {' '.join(made)}") from None
+        raise
+    finally:
+        if not keep:
+            rmtree(folder, ignore_errors=True)
+    if not as_json:
+        stdout.print(f"written: {output}")
+
+
+def _write_calibrated(
+    loaded: Rig, rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool
+) -> None:  # fmt: skip
+    from aolink.cli.tables import rigs as tables
+    from aolink.jobs.calibrate import calibrate_recordings, rig_text
+
+    result = calibrate_recordings(loaded, rig_text(rig, loaded), paths)
+    with writing(output, overwrite=overwrite, sources=paths) as unfinished:
+        unfinished.write_text(result.text, newline="")  # with the line ends that the rig file had
+    if as_json:
+        print(json.dumps(tables.calibration_as_json(result)))
+        return
+    stdout.print(tables.calibration(result))
+    for note in result.calibration.notes:
+        stdout.print(f"note: {escape(note)}")
+
+
+def _write_interaction(loaded: Rig, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool) -> None:
+    import numpy as np
+
+    from aolink.jobs.calibrate import interaction
+
+    if len(paths) != 1:
+        raise typer.BadParameter(f"an interaction matrix is of one recording, not of {len(paths)}")
+    found = interaction(loaded, paths[0])
+    measured = found.measured
+    with writing(output, overwrite=overwrite, sources=paths) as unfinished, unfinished.open("wb") as file:
+        np.savez(
+            file, matrix=measured.matrix, offset=measured.offset, singular_values=measured.singular_values,
+            sd=measured.sd, residual_rms=measured.residual_rms, exposures=measured.exposures,
+            plant_matrix=found.modelled.matrix,
+        )  # fmt: skip
+    facts = {
+        "outputs": len(measured.matrix),
+        "inputs": measured.matrix.shape[1],
+        "exposures": measured.exposures,
+        "singular_values": measured.singular_values.tolist(),
+        "condition": measured.condition,
+        "residual_rms": measured.residual_rms,
+        "difference_from_plant": found.difference,
+        "noise": None if np.isnan(found.noise) else found.noise,
+    }
+    if as_json:
+        print(json.dumps(facts))
+        return
+    largest, smallest = measured.singular_values[0], measured.singular_values[-1]
+    off = ": a sign, the order of the inputs or a scale is wrong" if found.difference > 0.3 + 3 * found.noise else ""
+    stdout.print(
+        f"{facts['outputs']} slopes for {facts['inputs']} inputs from {measured.exposures} exposures; singular values"
+        f" {largest:.4g} to {smallest:.4g}, condition {measured.condition:.3g}; residual {measured.residual_rms:.3g}"
+        f" slope units (rms)\nthe rig file's plant is off by {100 * found.difference:.3g} % of the matrix, noise"
+        f" explains {100 * found.noise:.3g} %{off}"
+    )

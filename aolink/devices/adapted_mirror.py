@@ -1,0 +1,255 @@
+"""The adapter that makes a session's mirror of a simple driver.
+
+It gives each command its answer and its report, and parks a mirror that the session has left alone for too long.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from itertools import count, groupby
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.devices.adapted import Adapted
+from aolink.devices.drivers import calling
+from aolink.devices.gate import CommandLimits, converter_margin, printable
+from aolink.devices.interfaces import CommandAnswered, Event, Lacks
+from aolink.devices.simple import Held, SimpleMirror
+from aolink.errors import AolinkError, DeviceError
+from aolink.rig import Rig
+from aolink.rig.device_tables import Delay
+from aolink.wire import messages_pb2 as pb
+
+_PATIENCE_NS = 1_000_000_000
+"""How long the end of a session waits for reports."""
+
+
+class AdaptedMirror(Adapted):
+    """A mirror with a simple driver; each command is answered when it is sent.
+
+    Its watchdog is a thread of the host: where the session has not polled the mirror for ``mirror.watchdog_s``, it
+    parks the mirror, which takes no command until `rearm`. ``delay`` is the time from a fast step of the driver's clock
+    to the mirror's following its input.
+    """
+
+    commanded = True
+    in_flight = 0
+
+    def __init__(self, rig: Rig, driver: SimpleMirror, delay: Delay, now_ns: Callable[[], int]) -> None:
+        super().__init__("mirror", driver, delay, now_ns)
+        self._rig, self._driver, self._limits = rig, driver, CommandLimits(rig)
+        self._lock = threading.Lock()
+        """Held while the driver is called."""
+        self._watchdog_ns = round(rig.mirror.watchdog_s * 1e9)
+        self._polled_ns = time.monotonic_ns()
+        self._left_ns: int | None = None
+        """When it was polled last before the watchdog parked it; None while it is not latched."""
+        self._safe: tuple[float, float] = (math.inf, math.inf)
+        """First fast step of the safe state that the watchdog asked for, and the step at which it was re-armed."""
+        self._closed, self._guarding = threading.Event(), False
+        self._step_ns = rig.timing.fast_step_ns
+        self._margin = converter_margin(rig.mirror)
+        self._block_ids = count(1)
+        self._commanded: dict[int, tuple[int, NDArray[np.float64]]] = {}
+        """Block and input of steps that have not been reported."""
+        self._next: int | None = None
+        """The first step that has not been reported, from the first command on."""
+        self._parked_from: float = math.inf
+        self._awaited = self._deadline_ns = 0
+        self.last_sent_ns = 0
+
+    @property
+    def latched(self) -> bool:
+        return self._safe[0] < math.inf == self._safe[1]
+
+    @property
+    def outage_s(self) -> float:
+        return 0.0 if self._left_ns is None else (time.monotonic_ns() - self._left_ns) / 1e9
+
+    def _read_clock(self) -> int:
+        with self._call("when it was asked for the time"):
+            return int(self._driver.time_ns())
+
+    def query_clock(self, now_ns: int) -> None:
+        super().query_clock(now_ns)
+        self.last_sent_ns = now_ns
+
+    def _clock_doubt_ns(self) -> int:
+        # A driver that infers its device's clock corrects it by as much. Without a queue the clock is the host's.
+        return 0 if Lacks.QUEUE in self.lacks else round(self._driver_sigma_ns())
+
+    def since_zero_ns(self, host_ns: int) -> int:
+        return self.clock.device_ns(host_ns)[0] - self._delay_ns
+
+    def step_sigma_ns(self, host_ns: int) -> float:
+        clock_ns, driver_ns = self.clock.device_ns(host_ns)[1], self._driver_sigma_ns()
+        if Lacks.QUEUE in self.lacks:
+            return math.hypot(clock_ns, self._delay_sd_ns, driver_ns)
+        return math.hypot(max(clock_ns, driver_ns), self._delay_sd_ns)  # the clock's has part of the driver's
+
+    def _driver_sigma_ns(self) -> float:
+        """What the driver knows of its own inexactness.
+
+        Of a mirror without a queue that is how late its inputs are, which the rig file may say instead.
+        """
+        if self._delay_ns and Lacks.QUEUE in self.lacks:
+            return 0.0
+        with self._call("when it was asked for its timing"):
+            return float(getattr(self._driver, "timing_sigma_ns", 0.0))
+
+    def start_step(self, now_ns: int) -> int:
+        return self.since_zero_ns(now_ns) // self._step_ns
+
+    def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
+        self._limits.check(first_step, u)
+        block = pb.CommandBlock(
+            block_id=next(self._block_ids), first_step=first_step, n_steps=len(u), u=u.ravel(),
+            cause_frame_id=cause_frame_id,
+        )  # fmt: skip
+        ack = pb.CommandAck(block_id=block.block_id)
+        try:
+            with self._call("when it was sent a command"):
+                if not self.latched:
+                    ack.late_steps = min(max(int(self._driver.send(first_step, u)), 0), len(u))
+        except DeviceError as error:
+            ack.code, ack.text = pb.NOT_SUPPORTED, printable(str(error))
+        else:
+            ack.code = pb.LATCHED if self.latched else pb.TOO_LATE if ack.late_steps == len(u) else pb.OK
+        if ack.code == pb.OK:
+            self._guard()
+            rows = self._rig.mirror.quantise(u)
+            self._commanded.update((first_step + k, (block.block_id, rows[k])) for k in range(ack.late_steps, len(u)))
+        self._next = first_step if self._next is None else self._next
+        self.last_sent_ns = now_ns
+        self._events.append(CommandAnswered(ack, block))
+        return block
+
+    def withdraw(self, step: int) -> int:
+        return step  # each block is taken or refused when it is sent
+
+    def poll(self) -> list[Event]:
+        """What has happened since the last call."""
+        events = self._take_events()
+        with self._call("when it was asked what it applied"):
+            self._polled_ns = time.monotonic_ns()
+            for first_step, u, *rest in self._driver.applied():
+                u = np.asarray(u, dtype=np.float64)
+                late = rest[0] if rest and rest[0] is not None else np.zeros(len(u), dtype=np.bool_)
+                events += self._take(Held(first_step, u, late))
+        return events
+
+    def _take(self, held: Held) -> list[Event]:
+        """Each step from the first command to the parking once, in order."""
+        first_step, u, late = held
+        assert late is not None
+        if u.ndim != 2 or u.shape[1] != self._rig.n_inputs or not np.isfinite(u).all():
+            raise DeviceError(
+                f"the mirror gives an array of {u.shape} as what it applied, expected (steps, {self._rig.n_inputs}) of"
+                " finite numbers"
+            )
+        end = min(first_step + len(u), self._parked_from)
+        if self._next is None or end <= self._next:
+            return []
+        events = self._give_up(first_step)
+        begin, end = self._next, int(end)
+        self._next = end
+        for (block_id, source), run in groupby(
+            range(begin, end), lambda step: self._what_held(step, u[step - first_step], bool(late[step - first_step]))
+        ):
+            steps = [*run]
+            events.append(
+                pb.Applied(
+                    block_id=block_id,
+                    first_step=steps[0],
+                    n_steps=len(steps),
+                    u=u[steps[0] - first_step : steps[-1] + 1 - first_step].ravel(),
+                    source=source,
+                    device_ns=(steps[-1] + 1) * self._step_ns,
+                )
+            )
+        for step in range(begin, end):
+            self._commanded.pop(step, None)
+        return events
+
+    def _what_held(self, step: int, held: NDArray[np.float64], late: bool) -> tuple[int, pb.Applied.Source]:
+        block_id, commanded = self._commanded.get(step, (0, held))
+        if self._safe[0] <= step < self._safe[1]:
+            return 0, pb.Applied.WATCHDOG
+        if not block_id:
+            return 0, pb.Applied.PARKED
+        if late:
+            return block_id, pb.Applied.LATE
+        as_told = bool((np.abs(held - commanded) <= self._margin).all())
+        return block_id, pb.Applied.COMMAND if as_told else pb.Applied.CLIPPED
+
+    def _give_up(self, end: int) -> list[Event]:
+        """``NOT_REPORTED`` for the steps before ``end`` that were not reported."""
+        if self._next is None or end <= self._next:
+            return []
+        unknown = pb.Applied(first_step=self._next, n_steps=end - self._next, source=pb.Applied.NOT_REPORTED)
+        for step in range(self._next, end):
+            self._commanded.pop(step, None)
+        self._next = end
+        return [unknown]
+
+    def await_reports(self, end_step: int, now_ns: int) -> list[Event]:
+        self._awaited, self._deadline_ns = end_step, now_ns + _PATIENCE_NS
+        return []
+
+    def next_due_ns(self) -> int | None:
+        return self._deadline_ns if self._next is not None and self._next < self._awaited else None
+
+    def serve(self, now_ns: int) -> list[Event]:
+        return self._give_up(self._awaited)
+
+    def park(self) -> int:
+        self._guarding = False
+        with self._call("when it was told to park"):
+            step = int(self._driver.park())
+        self._parked_from = step
+        return step
+
+    def rearm(self) -> int:
+        with self._call("when it was asked for the time"):
+            step = int(self._driver.time_ns()) // self._step_ns + 1
+        self._safe, self._left_ns = (self._safe[0], step), None
+        return step
+
+    def close(self) -> None:
+        """Give the device back, parked."""
+        self._guarding = False
+        self._closed.set()
+        if self._next is not None and self._parked_from == math.inf:  # parking it failed, or was interrupted
+            with suppress(AolinkError), self._call("when it was told to park"):
+                self._driver.park()
+        with self._call("when it was closed"):
+            self._driver.close()
+
+    @contextmanager
+    def _call(self, when: str) -> Iterator[None]:
+        """Call the driver: never from two threads at once, and with its exceptions as DeviceErrors."""
+        with self._lock, calling(self.name, when):
+            yield
+
+    def _guard(self) -> None:
+        """Have the watchdog watch from the first command on, until the mirror is parked."""
+        if not self._guarding:
+            self._guarding = True
+            threading.Thread(target=self._watch, name="aolink-watchdog", daemon=True).start()
+
+    def _watch(self) -> None:
+        while self._guarding and not self._closed.wait(self._watchdog_ns / 4e9):
+            if time.monotonic_ns() - self._polled_ns <= self._watchdog_ns or self.latched:
+                continue
+            with suppress(AolinkError), self._call("when its watchdog parked it"):
+                # The session may have had the driver until now: have polled, parked or closed it.
+                left_ns = self._polled_ns
+                if self._guarding and time.monotonic_ns() - left_ns > self._watchdog_ns:
+                    step = int(self._driver.park())
+                    self._left_ns = left_ns
+                    self._safe = step, math.inf
