@@ -33,7 +33,7 @@ class Options:
     """Orders of the moments that `moments` takes, in its basis; 0 is the light in the window."""
     basis: Basis = "monomial"
     """Basis of `moments`: "monomial", "legendre" or "fourier"."""
-    particles: int = 3000
+    particles: int = 2000
     """Number of particles of `sampled`."""
     seed: int = 0
     """Seed of `sampled`: the same one gives the same estimates, bit for bit."""
