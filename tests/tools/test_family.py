@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from aolink.estimation import make_estimator
+from aolink.estimation.assumptions import broken_assumptions
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -103,3 +104,10 @@ def test_it_is_stopped_and_continued(tmp_path: Path) -> None:
     again = judged(2)
     assert again[:2] == both[:2]
     assert [line.partition('"seconds"')[0] for line in again] == [line.partition('"seconds"')[0] for line in both]
+
+
+def test_its_scenes_are_what_the_check_of_a_rig_file_says_nothing_of() -> None:
+    from paper_report.family import SEEDS, draw, rig_of
+
+    for seed in SEEDS["tuning"][:60]:
+        assert list(broken_assumptions(rig_of(draw(seed), 1, 24))) == []
