@@ -343,7 +343,7 @@ def figure_family(path: Path, given: Sequence[Row], dpi: int) -> None:
         left.set(yscale="log", ylabel="path RMSE / sampled's")
         for end in SCENE_INSIDE:
             right.axhline(end, color="0.5", linewidth=0.9, linestyle=":")
-        right.set(ylim=(0.5, 1), ylabel="coverage of 95 % intervals")
+        right.set(ylim=(0, 1.02), ylabel="coverage of 95 % intervals")
         for ax in (left, right):
             ax.set(xscale="log", xlabel="swings of the fastest mode in an exposure")
             ax.grid(**_GRID)

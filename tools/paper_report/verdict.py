@@ -153,10 +153,10 @@ def goals(rows: Rows) -> list[Goal]:
                 bool(_within(median, MEDIAN_INSIDE) and share >= SHARE_INSIDE),
             )
         )
-        share = float(np.mean([nees_inside(row) for row in judged]))
-        found.append(
-            Goal(f"{name}: end NEES inside its bounds in {SHARE_NEES:.0%}", f"{share:.0%}", share >= SHARE_NEES)
-        )
+        share = share_of_nees(judged)
+        if math.isfinite(share):
+            text = f"{name}: end NEES inside its bounds in {SHARE_NEES:.0%} of scenes"
+            found.append(Goal(text, f"{share:.0%}", share >= SHARE_NEES))
         for reference in REFERENCES:
             bound = family_ratio(rows, name, reference)
             if bound is not None:
