@@ -38,7 +38,7 @@ class Options:
     tempered: int | None = None
     """Most points that `profile` and `mixture` temper for an axis and exposure where importance sampling is not enough:
     the budget of work. None: 600 and 1200. 0: none, such estimates are as wide as their few effective points make them."""
-    particles: int = 3000
+    particles: int = 2000
     """Number of particles of `sampled`."""
     seed: int = 0
     """Seed of `sampled`: the same one gives the same estimates, bit for bit."""

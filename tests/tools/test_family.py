@@ -66,7 +66,7 @@ def test_the_path_has_the_sd_and_the_peak_the_snr_that_were_drawn(seed: int) -> 
     assert still == pytest.approx(sum(mode.sd**2 for mode in free) + walk / 10)
     assert sum(mode.sd**2 for mode in scene.modes) == pytest.approx((scene.path_widths * 0.05) ** 2)
     assert sensor.peak_density / np.sqrt(sensor.noise_density / sensor.pixel_size) == pytest.approx(scene.peak_snr)
-    assert np.sqrt(sensor.kernel.variance) / sensor.pixel_width == pytest.approx(scene.kernel_pixels)
+    assert sensor.kernel.sigma / sensor.pixel_width == pytest.approx(scene.kernel_pixels)
 
 
 @pytest.mark.parametrize("seed", [0, 3, 9])

@@ -43,7 +43,7 @@ STEPS = (20, 400)
 STEPS_IN_SWING = 8
 """Fast steps in one swing of the fastest mode, at least."""
 KERNEL_PIXELS = (0.8, 4.0)
-"""Sd of the kernel."""
+"""The kernel's sigma in the paper's convention, sqrt(2) times its sd."""
 _LARGEST_WINDOW = 64
 """Pixels along a side of a spot's window on a plane."""
 _REACH = 4.5
@@ -82,6 +82,7 @@ class Scene:
     period: int
     """Fast steps from one exposure's start to the next one's."""
     kernel_pixels: float
+    """sigma, pixels."""
     command: Literal["none", "sine", "steps"]
     command_sd: float
     """Largest response to the commands, in sds of the path."""
@@ -166,7 +167,7 @@ def _mode(rng: np.random.Generator, steps: int, period: int, share: float, path_
 
 def _half_pixels(kernel_pixels: float, path_widths: float, command_sd: float) -> int:
     """Pixels on either side of the middle."""
-    return math.ceil(kernel_pixels * (path_widths * (_REACH + command_sd) + 4)) + 1
+    return math.ceil(kernel_pixels / math.sqrt(2) * (path_widths * (_REACH + command_sd) + 4)) + 1
 
 
 def plant_of(scene: Scene, axes: int, exposures: int) -> Plant:
@@ -210,7 +211,7 @@ def rig_of(scene: Scene, runs: int, exposures: int) -> Rig:
     """The rig whose axes are so many runs of a scene; frames of a line sensor have a row for each run."""
     kernel = Kernel(shape="gaussian", sigma=_KERNEL_SD * math.sqrt(2))
     half = _half_pixels(scene.kernel_pixels, scene.path_widths, scene.command_sd)
-    pixel = _KERNEL_SD / scene.kernel_pixels
+    pixel = kernel.sigma / scene.kernel_pixels
     common = {
         "field": (-half * pixel, half * pixel), "kernel": kernel, "bit_depth": 16, "black_level": 20_000.0,
         "noise_density": 0.0, "counts_per_density": 1.0,

@@ -109,7 +109,7 @@ class MixtureFilter(Filter):
         one = slice(0, 1)
         twice = joined(self.prior.part(one), self.prior.part(one))
         n = self.plant.n_states
-        twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1)
+        twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1).log_density(twice.mean)
         drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
         if self.plant.n_outputs > 1:
             return

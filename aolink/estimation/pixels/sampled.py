@@ -1,6 +1,6 @@
 """The estimator `sampled`: tempered sequential Monte Carlo. Slow, for offline use; the limit of all other estimators.
 
-All fast steps are nodes, and less of the path is left out.
+Less of the path is left out than for the others; the nodes in time are those of `profile`.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _COMPONENTS = 8
 class TemperedUpdater:
     """Particles of one axis after another; a mixture of Gaussians is fitted to their end states."""
 
-    particles: int = 3000
+    particles: int = 2000
     seed: int = 0
 
     when_poor = ""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
-        return reduction(model, sensor, left_out=_LEFT_OUT, all_steps=True)
+        return reduction(model, sensor, left_out=_LEFT_OUT)
 
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
         """The posterior of axes with a prior of their start states."""
