@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from aolink.estimation import make_estimator
+from aolink.estimation.assumptions import broken_assumptions
+
+if TYPE_CHECKING:
+    from paper_report.judge import Row
 
 TOOLS = Path(__file__).parents[2] / "tools"
 
@@ -103,3 +109,61 @@ def test_it_is_stopped_and_continued(tmp_path: Path) -> None:
     again = judged(2)
     assert again[:2] == both[:2]
     assert [line.partition('"seconds"')[0] for line in again] == [line.partition('"seconds"')[0] for line in both]
+
+
+def test_its_scenes_are_what_the_check_of_a_rig_file_says_nothing_of() -> None:
+    from paper_report.family import SEEDS, draw, rig_of
+
+    for seed in SEEDS["tuning"][:60]:
+        assert list(broken_assumptions(rig_of(draw(seed), 1, 24))) == []
+
+
+def rows_of(estimator: str, path: Sequence[Sequence[float]], nees: float = 2.0) -> list[Row]:
+    """Rows by seed, with these squared errors of each run."""
+    from paper_report.judge import Row
+
+    return [
+        Row(seed=seed, estimator=estimator, states=2, scored=100, path=list(each), inside=[0.95] * len(each),
+            nees=[nees + 0.1 * (-1) ** k for k in range(len(each))], several=0.0, statuses={"OK": 5}, seconds=0.01)
+        for seed, each in enumerate(path)
+    ]  # fmt: skip
+
+
+def test_ratios_over_the_family_are_paired_by_run() -> None:
+    from paper_report.verdict import by_estimator, family_ratio, ratios
+
+    common = np.random.default_rng(1).gamma(1.0, size=(30, 20))
+    rows = by_estimator([*rows_of("moments", (0.81 * common[:, :8]).tolist()), *rows_of("o1", common.tolist())])
+    assert list(ratios(rows, "moments", "o1").values()) == pytest.approx([0.9] * 30)
+    bound = family_ratio(rows, "moments", "o1")
+    assert bound is not None
+    assert bound.low == pytest.approx(0.9)
+    assert bound.high == pytest.approx(0.9)
+
+
+def test_a_scene_that_is_worse_is_found_and_chance_is_not() -> None:
+    """Holm: of 300 scenes without a difference hardly one in twenty families has one that is called worse."""
+    from paper_report.verdict import by_estimator, significantly_worse
+
+    rng = np.random.default_rng(2)
+    reference = rng.gamma(4.0, size=(300, 24))
+    same = reference * rng.lognormal(0.0, 0.1, reference.shape)
+    rows = by_estimator([*rows_of("moments", same.tolist()), *rows_of("o1", reference.tolist())])
+    assert significantly_worse(rows, "moments", "o1") == []
+    same[17] *= 1.5
+    worse = by_estimator([*rows_of("moments", same.tolist()), *rows_of("o1", reference.tolist())])
+    assert significantly_worse(worse, "moments", "o1") == [17]
+
+
+def test_goals_are_held_or_not() -> None:
+    from paper_report.verdict import by_estimator, goals
+
+    errors = np.random.default_rng(3).gamma(4.0, size=(40, 12))
+    one, near, limit, far = ((share * errors).tolist() for share in (1.0, 0.9, 0.88, 1.3))
+    rows = [*rows_of("o1", one), *rows_of("mixture", near), *rows_of("sampled", limit)]
+    held = goals(by_estimator(rows))
+    assert held
+    assert all(goal.held for goal in held)
+    too_sure = [*rows_of("mixture", far, nees=3.0), *rows_of("o1", one), *rows_of("sampled", limit)]
+    judged = goals(by_estimator(too_sure))
+    assert [goal.held for goal in judged] == [False, True, False, False]  # limit, coverage, NEES, o1

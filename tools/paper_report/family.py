@@ -16,6 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from aolink.estimation.assumptions import (
+    LEAST_KERNEL_PIXELS,
+    LEAST_PEAK_SNR,
+    MOST_MODES,
+    MOST_PATH_WIDTHS,
+    MOST_SWINGS,
+    STEPS_IN_SWING,
+)
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
@@ -29,20 +37,18 @@ FloatArray = NDArray[np.float64]
 SEEDS = {"tuning": range(100_000), "reporting": range(100_000, 200_000)}
 """By name; each judgement takes the first ones of its range."""
 
-MODES = (1, 3)
-SWINGS = (0.05, 8.0)
+MODES = (1, MOST_MODES)
+SWINGS = (0.05, MOST_SWINGS)
 """Of a resonance, in an exposure."""
 DAMPING = (0.002, 1.0)
 MEMORY = (0.1, 20.0)
 """Exposures in which an Ornstein-Uhlenbeck process forgets all but 1/e."""
-PATH_WIDTHS = (0.3, 8.0)
+PATH_WIDTHS = (0.3, MOST_PATH_WIDTHS)
 """Sd of the path, in sds of the kernel."""
-PEAK_SNR = (1.0, 300.0)
+PEAK_SNR = (LEAST_PEAK_SNR, 300.0)
 """Of the brightest pixel of a resting spot."""
 STEPS = (20, 400)
-STEPS_IN_SWING = 8
-"""Fast steps in one swing of the fastest mode, at least."""
-KERNEL_PIXELS = (0.8, 4.0)
+KERNEL_PIXELS = (LEAST_KERNEL_PIXELS, 4.0)
 """The kernel's sigma in the paper's convention, sqrt(2) times its sd."""
 _LARGEST_WINDOW = 64
 """Pixels along a side of a spot's window on a plane."""

@@ -7,7 +7,7 @@ import itertools
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +18,14 @@ from aolink.exposure import Exposure
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
 from paper_report.ensemble import SensorRows
-from paper_report.family import Scene, draw, exposures_of
+from paper_report.family import SEEDS, Scene, draw, exposures_of
 
 FloatArray = NDArray[np.float64]
 
 QUICK_NAMES = ("open-loop", "o1", "o3", "moments")
 PIXEL_NAMES = ("profile", "mixture")
-LIMIT_NAMES = ("sampled", "sampled again")
-"""The second with other random numbers: where the two disagree, neither is the limit."""
-NAMES = (*QUICK_NAMES, *PIXEL_NAMES, *LIMIT_NAMES)
+LIMIT = "sampled"
+NAMES = (*QUICK_NAMES, *PIXEL_NAMES, LIMIT)
 BEYOND_95 = 1.959964
 """Standard deviations on either side of a 95 % interval."""
 
@@ -48,7 +47,7 @@ class Size:
 
     def runs_of(self, name: str) -> int:
         """Runs for an estimator."""
-        wanted = self.limit_runs if name in LIMIT_NAMES else self.pixel_runs if name in PIXEL_NAMES else self.runs
+        wanted = self.limit_runs if name == LIMIT else self.pixel_runs if name in PIXEL_NAMES else self.runs
         return min(wanted, self.runs)
 
 
@@ -92,8 +91,8 @@ def judge(scene: Scene, names: Sequence[str], size: Size) -> Iterator[Row]:
     for name in names:
         runs = size.runs_of(name)
         some = first_runs(rig, exposures, runs)
-        options = {"particles": size.particles, "seed": LIMIT_NAMES.index(name)} if name in LIMIT_NAMES else {}
-        estimator = make_estimator(some[0], name.removesuffix(" again"), **options)
+        options = {"particles": size.particles} if name == LIMIT else {}
+        estimator = make_estimator(some[0], name, **options)
         start = time.perf_counter()
         estimates, several = [], []
         for exposure in some[1]:
@@ -169,8 +168,30 @@ def read_rows(path: Path) -> list[Row]:
     return rows
 
 
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """Which scenes are judged by which estimators."""
+
+    scenes: int = 200
+    """By all but the slow ones; the first of the reporting seeds."""
+    pixel_scenes: int = 40
+    """Of these, by `profile` and `mixture`, stratified."""
+    limit_scenes: int = 18
+    """Of those, by `sampled`."""
+    size: Size = field(default_factory=lambda: Size(pixel_runs=6))
+
+
+def judge_plan(path: Path, plan: Plan) -> list[Row]:
+    """Judge what a plan says, on reporting seeds; what the file has already is not judged again."""
+    seeds = SEEDS["reporting"][: plan.scenes]
+    rows = judge_all(path, seeds, QUICK_NAMES, plan.size)
+    for count, names in ((plan.pixel_scenes, PIXEL_NAMES), (plan.limit_scenes, (LIMIT,))):
+        rows = judge_all(path, stratified(seeds, count), names, plan.size)
+    return rows
+
+
 def judge_all(
-    path: Path, seeds: Iterable[int], names: Sequence[str], size: Size, say: Callable[[str], None] = print
+    path: Path, seeds: Iterable[int], names: Sequence[str], size: Size, say: Callable[[str], None] = lambda text: None
 ) -> list[Row]:
     """Judge scenes one after the other; rows that the file has already are not made again.
 
@@ -192,7 +213,7 @@ def judge_all(
                 file.write(f"{json.dumps(dataclasses.asdict(row))}\n")
                 file.flush()
                 say(
-                    f"  {row.estimator:13} path rms {np.sqrt(np.mean(row.path)):.4f}  inside {np.mean(row.inside):.3f}"
+                    f"  {row.estimator:9} path rms {np.sqrt(np.mean(row.path)):.4f}  inside {np.mean(row.inside):.3f}"
                     f"  NEES {np.mean(row.nees):.2f} of {row.states}  {1e3 * row.seconds:.2f} ms"
                 )
     return rows
