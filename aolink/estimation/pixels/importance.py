@@ -43,10 +43,8 @@ _ENOUGH = 100.0
 # If less than this share of it is reached, points are tempered: number of components fitted to their end states.
 _TOO_FEW = 0.5
 _COMPONENTS = 6
-# Modes are scattered if the windowed moments leave so many directions of the path uncertain by this many variances of
-# the kernel.
-_SCATTERED_DIRECTIONS = 3
-_SCATTERED = 2.0
+# Modes are scattered if the windowed moments leave the path uncertain by a variance of so many variances of the kernel.
+_SCATTERED = 2.5
 # Least effective sample size when a mixture is fitted; weights are raised to a power below one to reach it, since a fit
 # to a handful of points is too sure. And steps of the search for that power.
 _LEAST_EFFECTIVE = 128.0
@@ -114,17 +112,8 @@ def scattered(view: PixelView, weight: FloatArray, wide: Gaussian) -> BoolArray:
 
     ``weight`` are the logarithms of their weights; light ones do not count.
     """
-    heavy = weight > math.log(_HEAVY)
-    least = _SCATTERED * view.kernel_variance
-    # The sum of the squares of which the third is to be large: it is quickly had.
-    squares = np.einsum("ij,acij->ac", view.gram, wide.covariance)
-    some = np.nonzero(heavy & (squares > _SCATTERED_DIRECTIONS * least))
-    found = np.zeros(len(weight), dtype=bool)
-    if len(some[0]) and view.reduced.size >= _SCATTERED_DIRECTIONS:
-        L = cholesky(wide.covariance[some])
-        values = np.linalg.eigvalsh(batched.symmetric(batched.congruence(batched.transpose(L), view.gram)))
-        np.logical_or.at(found, some[0], values[:, -_SCATTERED_DIRECTIONS] > least)
-    return found
+    variance = np.einsum("ij,acij->ac", view.gram, wide.covariance) / view.outputs
+    return np.asarray(((weight > math.log(_HEAVY)) & (variance > _SCATTERED * view.kernel_variance)).any(axis=1))
 
 
 def importance_corrected(
