@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.pixels.filter import MixtureUpdate
@@ -31,6 +33,8 @@ class TemperedUpdater:
     particles: int = 2000
     seed: int = 0
 
+    when_poor = ""
+
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
         return reduction(model, sensor, left_out=_LEFT_OUT)
@@ -46,7 +50,8 @@ class TemperedUpdater:
         new = innovation(view, before, modes)
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         end = reduced.end(Gaussian(fit.mean, fit.covariance))
-        return MixtureUpdate(after, GaussianMixture(fit.log_weight, end.mean, end.covariance), new, has_several(modes))
+        carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)
+        return MixtureUpdate(after, carried, new, has_several(modes), np.zeros(len(mean), dtype=bool))
 
     def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> FloatArray:
         """Equally likely particles of the posterior, (axes, particles, n).
