@@ -36,8 +36,8 @@ class Options:
     basis: Basis = "monomial"
     """Basis of `moments`: "monomial", "legendre" or "fourier"."""
     tempered: int | None = None
-    """Most points that `profile` and `mixture` temper for an axis and exposure where importance sampling is not enough:
-    the budget of work. None: 600 and 1200. 0: none, such estimates are as wide as their few effective points make them."""
+    """Points that `profile` and `mixture` temper for an axis and exposure where importance sampling is not enough: the
+    budget of work. None: 600 and 1200. 0: none; such estimates are as wide as their few effective points make them."""
     particles: int = 2000
     """Number of particles of `sampled`."""
     seed: int = 0

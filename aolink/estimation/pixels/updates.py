@@ -4,8 +4,8 @@ Modes are not Gaussian: the blur fixes how much a path moves and leaves open whi
 bent. So the modes, and the wide Gaussians of windowed moments about them, only make the proposal density; the
 posterior comes from importance weights (`aolink.estimation.pixels.importance`).
 
-Where that is not enough (`aolink.estimation.pixels.importance`), points are tempered: no more for an axis than the option
-``points`` allows. Without any left the fit stays as wide as its few effective points make it.
+Where that is not enough (`aolink.estimation.pixels.importance`), points are tempered, as many for an axis as ``points``
+says. If that is none, the fit stays as wide as its few effective points make it.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched where the NIS is larger than chance makes it.
