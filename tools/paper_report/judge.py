@@ -72,7 +72,7 @@ class Row:
     statuses: dict[str, int]
     """Exposures by their status."""
     seconds: float
-    """For an exposure of one run."""
+    """Of the processor, for an exposure of one run."""
 
 
 def stratified(seeds: Sequence[int], count: int) -> list[int]:
@@ -93,12 +93,12 @@ def judge(scene: Scene, names: Sequence[str], size: Size) -> Iterator[Row]:
         some = first_runs(rig, exposures, runs)
         options = {"particles": size.particles} if name == LIMIT else {}
         estimator = make_estimator(some[0], name, **options)
-        start = time.perf_counter()
+        start = time.process_time()
         estimates, several = [], []
         for exposure in some[1]:
             estimates.append(estimator.step(exposure))
             several.append(0.0 if estimator.several is None else float(estimator.several.mean()))
-        seconds = (time.perf_counter() - start) / (len(estimates) * runs)
+        seconds = (time.process_time() - start) / (len(estimates) * runs)
         yield _row(
             scene.seed, name, some[1][size.skip :], estimates[size.skip :], runs, float(np.mean(several)), seconds
         )
