@@ -163,7 +163,9 @@ def test_goals_are_held_or_not() -> None:
     rows = [*rows_of("o1", one), *rows_of("mixture", near), *rows_of("sampled", limit)]
     held = goals(by_estimator(rows))
     assert held
-    assert all(goal.held for goal in held)
+    assert all(goal.held and goal.verdict == "held (40 scenes)" for goal in held)
+    few = goals(by_estimator([row for row in rows if row.seed < 5]))
+    assert {goal.verdict for goal in few} == {"too few scenes to tell (5)"}
     too_sure = [*rows_of("mixture", far, nees=3.0), *rows_of("o1", one), *rows_of("sampled", limit)]
     judged = goals(by_estimator(too_sure))
     assert [goal.held for goal in judged] == [False, True, False, False]  # limit, coverage, NEES, o1

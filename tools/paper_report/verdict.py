@@ -30,6 +30,8 @@ SHARE_NEES = 0.90
 MOST_RATIO = 1.02
 """Upper bound of the family's ratio to a reference."""
 _RESAMPLES = 1000
+_FEWEST_SCENES = 20
+"""Scenes from which a goal is said to be held: a 95th percentile of fewer is the largest of them."""
 _FEWEST_RUNS = 4
 """Runs from which anything is said of a scene alone."""
 
@@ -112,9 +114,14 @@ def nees_inside(row: Row) -> bool:
     return bool(low <= row.states <= high)
 
 
+def told_of_nees(row: Row) -> bool:
+    """Whether there are enough runs to say anything of the NEES."""
+    return len(row.nees) >= _FEWEST_RUNS
+
+
 def share_of_nees(rows: Sequence[Row]) -> float:
     """Share of scenes with `nees_inside`, of those with enough runs to tell; NaN if there is none."""
-    told = [nees_inside(row) for row in rows if len(row.nees) >= _FEWEST_RUNS]
+    told = [nees_inside(row) for row in rows if told_of_nees(row)]
     return float(np.mean(told)) if told else math.nan
 
 
@@ -125,6 +132,14 @@ class Goal:
     text: str
     measured: str
     held: bool
+    scenes: int
+
+    @property
+    def verdict(self) -> str:
+        """Held or not, of so many scenes; of few, only that it is not."""
+        if self.held and self.scenes < _FEWEST_SCENES:
+            return f"too few scenes to tell ({self.scenes})"
+        return f"{'held' if self.held else 'not held'} ({self.scenes} scenes)"
 
 
 def goals(rows: Rows) -> list[Goal]:
@@ -137,8 +152,9 @@ def goals(rows: Rows) -> list[Goal]:
             Goal(
                 f"mixture's path RMSE over sampled's at most {NEAR_LIMIT[0]:g} in the median and {NEAR_LIMIT[1]:g} at"
                 " the 95th percentile",
-                f"{median:.3f} and {high:.3f} in {len(to_limit)} scenes",
+                f"{median:.3f} and {high:.3f}",
                 bool(median <= NEAR_LIMIT[0] and high <= NEAR_LIMIT[1]),
+                len(to_limit),
             )
         )
     for name in (each for each in JUDGED if rows[each]):
@@ -151,12 +167,13 @@ def goals(rows: Rows) -> list[Goal]:
                 f" {SHARE_INSIDE:.0%} of scenes",
                 f"{median:.3f}, {share:.0%}",
                 bool(_within(median, MEDIAN_INSIDE) and share >= SHARE_INSIDE),
+                len(judged),
             )
         )
         share = share_of_nees(judged)
         if math.isfinite(share):
             text = f"{name}: end NEES inside its bounds in {SHARE_NEES:.0%} of scenes"
-            found.append(Goal(text, f"{share:.0%}", share >= SHARE_NEES))
+            found.append(Goal(text, f"{share:.0%}", share >= SHARE_NEES, sum(map(told_of_nees, judged))))
         for reference in REFERENCES:
             bound = family_ratio(rows, name, reference)
             if bound is not None:
@@ -166,6 +183,7 @@ def goals(rows: Rows) -> list[Goal]:
                         f"{name} over {reference}: upper bound at most {MOST_RATIO:g}, no scene significantly worse",
                         f"{bound}, {len(worse)} scenes" + (f" ({', '.join(map(str, worse[:8]))})" if worse else ""),
                         bound.high <= MOST_RATIO and not worse,
+                        len(squares(rows, name, reference)),
                     )
                 )
     return found
@@ -186,7 +204,7 @@ def family_section(given: Sequence[Row], picture: Picture | None = None) -> list
     seeds = "reporting" if all(reporting) else "tuning" if not any(reporting) else "both tuning and reporting"
     table = [_quantiles(rows, name) for name in NAMES if rows[name]]
     measured = [
-        f"{goal.text}: {goal.measured}: {'held' if goal.held else 'not held'}" for goal in goals(rows)
+        f"{goal.text}: {goal.measured}: {goal.verdict}" for goal in goals(rows)
     ]  # fmt: skip
     return [
         Heading("A family of plants that nobody tuned for"),
