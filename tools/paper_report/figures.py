@@ -340,7 +340,7 @@ def figure_family(path: Path, given: Sequence[Row], dpi: int) -> None:
             found = rows[name]
             right.plot([_swings(seed) for seed in found], [np.mean(row.inside) for row in found.values()], **style)
         left.axhline(1, color=_colour(LIMIT), linewidth=1.2)
-        left.set(yscale="log", ylabel="path RMSE / sampled's")
+        left.set(ylabel="path RMSE / sampled's", ylim=(0.5, 4))
         for end in SCENE_INSIDE:
             right.axhline(end, color="0.5", linewidth=0.9, linestyle=":")
         right.set(ylim=(0, 1.02), ylabel="coverage of 95 % intervals")

@@ -12,7 +12,7 @@ from scipy import stats
 
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
 from paper_report.family import SEEDS
-from paper_report.judge import NAMES, Row
+from paper_report.judge import LIMIT, NAMES, Row
 
 FloatArray = NDArray[np.float64]
 Rows = Mapping[str, Mapping[int, Row]]
@@ -30,6 +30,8 @@ SHARE_NEES = 0.90
 MOST_RATIO = 1.02
 """Upper bound of the family's ratio to a reference."""
 _RESAMPLES = 1000
+_LIMIT_INSIDE = 0.8
+"""Coverage of sampled's own intervals below which its particles were too few for a scene: it is no limit there."""
 _FEWEST_SCENES = 20
 """Scenes from which a goal is said to be held: a 95th percentile of fewer is the largest of them."""
 _FEWEST_RUNS = 4
@@ -55,8 +57,11 @@ def squares(rows: Rows, name: str, reference: str) -> dict[int, tuple[FloatArray
 
 
 def ratios(rows: Rows, name: str, reference: str) -> dict[int, float]:
-    """Ratio of the path's RMSE to a reference's by seed."""
-    return {seed: math.sqrt(a.mean() / b.mean()) for seed, (a, b) in squares(rows, name, reference).items()}
+    """Ratio of the path's RMSE to a reference's by seed; to the limit's where it is one."""
+    pairs = squares(rows, name, reference)
+    if reference == LIMIT:
+        pairs = {seed: each for seed, each in pairs.items() if np.mean(rows[LIMIT][seed].inside) >= _LIMIT_INSIDE}
+    return {seed: math.sqrt(a.mean() / b.mean()) for seed, (a, b) in pairs.items()}
 
 
 @dataclass(frozen=True)
@@ -213,7 +218,8 @@ def family_section(given: Sequence[Row], picture: Picture | None = None) -> list
             " plane or both axes of one plant, commands, dead time, lost frames, masked pixels. Seeds from"
             f" {SEEDS['tuning'][0]} on are for tuning, from {SEEDS['reporting'][0]} on for reporting; these rows are"
             f" of {seeds} seeds. Slow estimators are judged on fewer scenes and runs, paired with the others on the"
-            " same frames. Ratios are of the path's RMSE: to sampled's in each scene, and over the family, the root of"
+            " same frames. Ratios are of the path's RMSE: to sampled's in each scene where its own"
+            f" intervals hold {_LIMIT_INSIDE:.0%} of the path at least, and over the family, the root of"
             " the scenes' mean squared ratio with the 95 % interval of a bootstrap over scenes and runs. In brackets"
             " are scenes that are significantly worse (t-tests over runs, Holm's correction, 5 %). Coverage is the"
             " share of the path inside its 95 % intervals; open-loop, whose covariance is exact, shows what chance"
