@@ -1,0 +1,291 @@
+"""The likelihood of a recording's readings under a model of the disturbance.
+
+A path theta = r + b + d has the known response r to the inputs, an unknown constant b for each output, and the
+disturbance d, a Gaussian process. In runs of consecutive exposures ("blocks"), with y the means of the path over the
+exposures and s its mean squares about c, as measured,
+
+    p(y, s) = p(y) p(s | y).
+
+p(y) is Gaussian, exactly, and taken over long runs. Given y the path is Gaussian, with mean m and covariance S, so that s is a quadratic form of
+a Gaussian: E s_j = mean of ((m - c)^2 + diag S), Cov(s_j, s_k) = 2 mean of S^2 + 4 mean of (m - c) S (m - c), means
+over both exposures' steps. p(s | y) is taken as the Gaussian of these moments: that, and that blocks are taken as
+independent, is all that is not exact. What it costs is found by simulation (`curvature`), and intervals allow for it.
+
+Sums over the steps of an exposure are Gauss's quadrature.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg
+
+from aolink.estimation.model.quadrature import blocks, gauss
+from aolink.identification.models import DisturbanceModel
+from aolink.identification.readings import Readings
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
+
+_FEWEST_NODES = 12
+_NODES_PER_CYCLE = 3.2
+"""Nodes in an exposure for each cycle of the fastest process in it, beside half of the fewest."""
+_WALK_START = 4.0
+"""Variance of where a random walk starts in a block, in squares of half the field."""
+_RUN = 128
+"""Exposures whose means are taken together."""
+_AT_ONCE = 128
+"""Blocks that are computed together: what they need stays in the processor's cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Readings cut into blocks, (blocks, L); blocks of one pattern of usable exposures."""
+
+    usable: BoolArray
+    """(L,)"""
+    mean: FloatArray
+    square: FloatArray
+    square_noise: FloatArray
+    centre: FloatArray
+    response: FloatArray
+    """At the nodes, (blocks, L, nodes)."""
+    output: np.ndarray[tuple[int], np.dtype[np.int64]]
+    """Which output each block is of."""
+
+
+class Likelihood:
+    """Log-likelihood of readings, for many models one after the other.
+
+    Parameters
+    ----------
+    seen:
+        The readings; those of all outputs have one model, each output being a draw of its own.
+    length:
+        Exposures in a block.
+    """
+
+    def __init__(self, seen: Readings, length: int) -> None:
+        self.seen, self.length = seen, min(length, seen.slots)
+        self._blocks: dict[int, list[Blocks]] = {}
+        self._means: dict[int, list[tuple[BoolArray, Indices, FloatArray]]] = {}
+        good = seen.usable
+        self.mean_noise = float(seen.mean_noise[good].mean())
+        """Variance of a mean by the pixels' noise, that of all exposures."""
+        self.exposure_s = seen.n_steps * seen.step_s
+
+    def __call__(
+        self, model: DisturbanceModel, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
+    ) -> float:
+        """Log-likelihood, -inf where the model's covariance is none.
+
+        Parameters
+        ----------
+        noise:
+            Factor of the pixels' noise variance.
+        wider:
+            By how much the kernel's variance is larger than the rig file's, slope units squared.
+        nodes:
+            Nodes in an exposure; `nodes` of the model where None.
+        """
+        return float(self.of_outputs(model, noise, wider, nodes).sum())
+
+    def of_outputs(
+        self, model: DisturbanceModel, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
+    ) -> FloatArray:
+        """The log-likelihood of each output, (outputs,)."""
+        nodes = nodes or self.nodes(model)
+        out = np.zeros(len(self.seen.mean))
+        try:
+            constants = self._of_means(model, nodes, noise, out)
+            for each in self._groups(nodes):
+                joint = self._joint(model, nodes, each.usable, noise)
+                np.add.at(out, each.output, joint.log_densities(each, constants[each.output], noise, wider))
+        except linalg.LinAlgError:
+            return np.full(len(out), -math.inf)
+        return out if np.isfinite(out).all() else np.full(len(out), -math.inf)
+
+    def nodes(self, model: DisturbanceModel) -> int:
+        """Nodes in an exposure that the model's paths need."""
+        fastest = max(float(np.abs(process.poles.imag).max()) for process in model.processes) / (2 * math.pi)
+        wanted = math.ceil(_FEWEST_NODES / 2 + _NODES_PER_CYCLE * fastest * self.exposure_s)
+        return min(max(_FEWEST_NODES, -(-wanted // 4) * 4), self.seen.n_steps)
+
+    def _rule(self, nodes: int) -> tuple[FloatArray, FloatArray]:
+        """Rows that give a path at the nodes, (nodes, N), and the nodes' weights."""
+        n = self.seen.n_steps
+        rule = blocks(n, n) if nodes >= n else gauss(n, nodes)
+        return rule.rows, rule.weights
+
+    def _groups(self, nodes: int) -> list[Blocks]:
+        if nodes not in self._blocks:
+            rows, _ = self._rule(nodes)
+            seen, L = self.seen, self.length
+            response = seen.response[:, :, :-1] @ rows.T
+            patterns: dict[bytes, list[tuple[int, slice]]] = {}
+            for o in range(len(seen.mean)):
+                for first in range(0, seen.slots, L):
+                    some = slice(first, min(first + L, seen.slots))
+                    if seen.usable[o, some].any():
+                        patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
+            self._blocks[nodes] = [
+                Blocks(
+                    seen.usable[where[0]],
+                    *(np.array([values[at] for at in where]) for values in
+                      (seen.mean, seen.square, seen.square_noise, seen.centre, response)),
+                    np.array([o for o, _ in where]),
+                )
+                for where in patterns.values()
+            ]  # fmt: skip
+        return self._blocks[nodes]
+
+    def _of_means(self, model: DisturbanceModel, nodes: int, noise: float, out: FloatArray) -> FloatArray:
+        """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
+        rows, weights = self._rule(nodes)
+        seen = self.seen
+        at = (rows @ np.arange(seen.n_steps)) * seen.step_s
+        run = min(_RUN, seen.slots)
+        begin = np.arange(run) * (seen.period_steps * seen.step_s)
+        table = np.zeros(run)
+        for process in model.processes:
+            if process.is_stationary:
+                table[1:] += process.covariance_of_means(begin[1:], at, weights)
+                table[0] += weights @ process.covariance(np.abs(at[:, None] - at)) @ weights
+        sigma = linalg.toeplitz(table)
+        if walk := _walk(model):
+            inside = walk * (np.minimum(at[:, None], at) @ weights @ weights - weights @ at)
+            sigma += walk * (np.minimum(begin[:, None], begin) + weights @ at) + _WALK_START * seen.reach**2
+            sigma[np.diag_indices(run)] += inside
+        top, count = np.zeros(len(out)), np.zeros(len(out))
+        whitened = []
+        for usable, output, y in self._runs(nodes, run):
+            n = np.flatnonzero(usable)
+            root = linalg.cholesky(
+                sigma[np.ix_(n, n)] + noise * self.mean_noise * np.eye(len(n)), lower=True, check_finite=False
+            )
+            both = np.concatenate([y.T, np.ones((len(n), 1))], axis=1)
+            both = linalg.solve_triangular(root, both, lower=True, check_finite=False)
+            white, ones = both[:, :-1], both[:, -1]
+            np.add.at(top, output, ones @ white)
+            np.add.at(count, output, ones @ ones)
+            scale = np.log(np.diagonal(root)).sum() + 0.5 * len(n) * math.log(2 * math.pi)
+            whitened.append((output, white, ones, scale))
+        constants = np.asarray(top / np.maximum(count, 1e-300))
+        for output, white, ones, scale in whitened:
+            left = white - ones[:, None] * constants[output]
+            np.add.at(out, output, -0.5 * (left**2).sum(axis=0) - scale)
+        return constants
+
+    def _runs(self, nodes: int, run: int) -> list[tuple[BoolArray, Indices, FloatArray]]:
+        """The means without the inputs' response in long runs: usable (run,), outputs (runs,), means (runs, good)."""
+        if nodes not in self._means:
+            rows, weights = self._rule(nodes)
+            seen = self.seen
+            y = seen.mean + seen.centre - (seen.response[:, :, :-1] @ rows.T) @ weights
+            patterns: dict[bytes, list[tuple[int, slice]]] = {}
+            for o in range(len(y)):
+                for first in range(0, seen.slots, run):
+                    some = slice(first, min(first + run, seen.slots))
+                    if seen.usable[o, some].any():
+                        patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
+            self._means[nodes] = [
+                (seen.usable[where[0]], np.array([o for o, _ in where]),
+                 np.array([y[each][seen.usable[each]] for each in where]))
+                for where in patterns.values()
+            ]  # fmt: skip
+        return self._means[nodes]
+
+    def _joint(self, model: DisturbanceModel, nodes: int, usable: BoolArray, noise: float) -> _Joint:
+        rows, weights = self._rule(nodes)
+        seen = self.seen
+        at = (rows @ np.arange(seen.n_steps)) * seen.step_s
+        slots = np.arange(len(usable))
+        period = seen.period_steps * seen.step_s
+        # Of equal lags only one each, then spread over all pairs of exposures.
+        table = _stationary(model, slots * period, at)
+        apart = slots[:, None] - slots
+        C = table[np.abs(apart)]
+        C = np.where((apart >= 0)[:, :, None, None], C, C.swapaxes(2, 3)).swapaxes(1, 2)
+        if walk := _walk(model):
+            times = (slots[:, None] * period + at).ravel()
+            from_walk = walk * np.minimum(times[:, None], times) + _WALK_START * seen.reach**2
+            C = C + from_walk.reshape(C.shape)
+        return _Joint(np.ascontiguousarray(C), weights, usable, noise * self.mean_noise)
+
+
+def _stationary(model: DisturbanceModel, apart: FloatArray, at: FloatArray) -> FloatArray:
+    """Covariances of the stationary processes at places ``at`` of an exposure with those of exposures ``apart``, s.
+
+    ``apart`` (m,) begins with zero; (m, nodes, nodes), the later exposure's nodes first.
+    """
+    out = np.zeros((len(apart), len(at), len(at)))
+    for process in model.processes:
+        if process.is_stationary:
+            out[0] += process.covariance(np.abs(at[:, None] - at))
+            out[1:] += process.covariance_across(apart[1:], at)
+    return out
+
+
+def _walk(model: DisturbanceModel) -> float:
+    """Intensity of the random walks of a model together."""
+    return sum(process["intensity"] for process in model.processes if not process.is_stationary)
+
+
+class _Joint:
+    """A block's path and readings as the model has them.
+
+    Parameters
+    ----------
+    C:
+        Covariance of the path at the nodes, (L, nodes, L, nodes).
+    """
+
+    def __init__(self, C: FloatArray, weights: FloatArray, usable: BoolArray, mean_noise: float) -> None:
+        L, K = C.shape[:2]
+        self.weights, self.good = weights, np.flatnonzero(usable)
+        over = np.tensordot(weights, C, axes=(0, 1))[self.good]  # Cov(y_j, path), (good, L, K)
+        sigma = (over @ weights)[:, self.good]
+        sigma[np.diag_indices(len(sigma))] += mean_noise
+        self.root = linalg.cholesky(sigma, lower=True, check_finite=False)
+        flat = over.reshape(len(self.good), L * K)
+        self.gain = linalg.solve_triangular(self.root, flat, lower=True, check_finite=False)
+        self.S = C.reshape(L * K, L * K) - self.gain.T @ self.gain
+        self.shape = (L, K)
+
+    @cached_property
+    def _from_variance(self) -> tuple[FloatArray, FloatArray]:
+        """What S alone adds to the mean squares' mean (good,) and covariance (good, good)."""
+        w, (L, K) = self.weights, self.shape
+        diagonal = np.einsum("ii->i", self.S).reshape(L, K)[self.good] @ w
+        squares = (self.S * self.S).reshape(L, K, L, K)
+        spread = np.tensordot(np.tensordot(squares, w, axes=(3, 0)), w, axes=(1, 0))
+        return diagonal, 2 * spread[np.ix_(self.good, self.good)]
+
+    def log_densities(self, data: Blocks, constants: FloatArray, noise: float, wider: float) -> FloatArray:
+        """Log-density of each block's mean squares, given its means, (blocks,); ``constants`` b of each block."""
+        good, w = self.good, self.weights
+        y = data.mean - data.response @ w + data.centre - constants[:, None]
+        white = linalg.solve_triangular(self.root, y[:, good].T, lower=True, check_finite=False)
+        return self._squares(data, white, constants, noise, wider) - 0.5 * len(good) * math.log(2 * math.pi)
+
+    def _squares(self, data: Blocks, white: FloatArray, b: FloatArray, noise: float, wider: float) -> FloatArray:
+        L, K = self.shape
+        good, w = self.good, self.weights
+        m = (white.T @ self.gain).reshape(-1, L, K) + data.response + b[:, None, None] - data.centre[:, :, None]
+        diagonal, spread = self._from_variance
+        expected = (m[:, good] ** 2) @ w + diagonal + wider
+        e = data.square[:, good] - expected
+        out = np.empty(len(e))
+        S = self.S.reshape(L, K, L * K)[good]
+        wm = m * w
+        for first in range(0, len(e), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            rows = np.matmul(wm[some][:, good].swapaxes(0, 1), S).reshape(len(good), -1, L, K)[:, :, good]
+            cross = np.einsum("jbkn,bkn->bjk", rows, wm[some][:, good], optimize=False)
+            V = spread + 4 * cross
+            V[:, np.arange(len(good)), np.arange(len(good))] += noise * data.square_noise[some][:, good]
+            root = np.linalg.cholesky(V)
+            left = np.linalg.solve(root, e[some][:, :, None])[..., 0]
+            out[some] = -0.5 * (left**2).sum(axis=1) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+        return out
