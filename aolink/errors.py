@@ -84,4 +84,4 @@ class ExportError(AolinkError):
 class IdentificationError(AolinkError):
     """A model that cannot be identified: not from this recording, or not of this kind."""
 
-    exit_code = 13
+    exit_code = 14

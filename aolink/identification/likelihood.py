@@ -24,7 +24,7 @@ import numpy as np
 from scipy import linalg
 
 from aolink.estimation.model.quadrature import blocks, gauss
-from aolink.identification.models import DisturbanceModel
+from aolink.identification.models import ProcessSum
 from aolink.identification.readings import Readings
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 
@@ -76,7 +76,7 @@ class Likelihood:
         self.exposure_s = seen.n_steps * seen.step_s
 
     def __call__(
-        self, model: DisturbanceModel, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
+        self, model: ProcessSum, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
     ) -> float:
         """Log-likelihood, -inf where the model's covariance is none.
 
@@ -92,7 +92,7 @@ class Likelihood:
         return float(self.of_outputs(model, noise, wider, nodes).sum())
 
     def of_outputs(
-        self, model: DisturbanceModel, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
+        self, model: ProcessSum, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
     ) -> FloatArray:
         """The log-likelihood of each output, (outputs,)."""
         nodes = nodes or self.nodes(model)
@@ -106,7 +106,7 @@ class Likelihood:
             return np.full(len(out), -math.inf)
         return out if np.isfinite(out).all() else np.full(len(out), -math.inf)
 
-    def nodes(self, model: DisturbanceModel) -> int:
+    def nodes(self, model: ProcessSum) -> int:
         """Nodes in an exposure that the model's paths need."""
         fastest = max(float(np.abs(process.poles.imag).max()) for process in model.processes) / (2 * math.pi)
         wanted = math.ceil(_FEWEST_NODES / 2 + _NODES_PER_CYCLE * fastest * self.exposure_s)
@@ -140,7 +140,7 @@ class Likelihood:
             ]  # fmt: skip
         return self._blocks[nodes]
 
-    def _of_means(self, model: DisturbanceModel, nodes: int, noise: float, out: FloatArray) -> FloatArray:
+    def _of_means(self, model: ProcessSum, nodes: int, noise: float, out: FloatArray) -> FloatArray:
         """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
         rows, weights = self._rule(nodes)
         seen = self.seen
@@ -196,7 +196,7 @@ class Likelihood:
             ]  # fmt: skip
         return self._means[nodes]
 
-    def _joint(self, model: DisturbanceModel, nodes: int, usable: BoolArray, noise: float) -> _Joint:
+    def _joint(self, model: ProcessSum, nodes: int, usable: BoolArray, noise: float) -> _Joint:
         rows, weights = self._rule(nodes)
         seen = self.seen
         at = (rows @ np.arange(seen.n_steps)) * seen.step_s
@@ -214,7 +214,7 @@ class Likelihood:
         return _Joint(np.ascontiguousarray(C), weights, usable, noise * self.mean_noise)
 
 
-def _stationary(model: DisturbanceModel, apart: FloatArray, at: FloatArray) -> FloatArray:
+def _stationary(model: ProcessSum, apart: FloatArray, at: FloatArray) -> FloatArray:
     """Covariances of the stationary processes at places ``at`` of an exposure with those of exposures ``apart``, s.
 
     ``apart`` (m,) begins with zero; (m, nodes, nodes), the later exposure's nodes first.
@@ -227,7 +227,7 @@ def _stationary(model: DisturbanceModel, apart: FloatArray, at: FloatArray) -> F
     return out
 
 
-def _walk(model: DisturbanceModel) -> float:
+def _walk(model: ProcessSum) -> float:
     """Intensity of the random walks of a model together."""
     return sum(process["intensity"] for process in model.processes if not process.is_stationary)
 

@@ -148,7 +148,7 @@ class StateSpace:
 
 
 @dataclass(frozen=True)
-class DisturbanceModel:
+class ProcessSum:
     """A sum of independent processes."""
 
     processes: tuple[Process, ...]

@@ -12,7 +12,7 @@ from scipy import optimize
 
 from aolink.errors import IdentificationError
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import PARAMETERS, DisturbanceModel, Process
+from aolink.identification.models import PARAMETERS, ProcessSum, Process
 from aolink.identification.readings import Readings
 from aolink.numerics.arrays import FloatArray
 
@@ -59,7 +59,7 @@ class Space:
         ]
         return (*names, *(["noise"] if self.with_noise else []), *(["kernel"] if self.with_kernel else []))
 
-    def model(self, x: FloatArray) -> DisturbanceModel:
+    def model(self, x: FloatArray) -> ProcessSum:
         """The model of a vector."""
         values = np.exp(x).tolist()
         processes = []
@@ -67,7 +67,7 @@ class Space:
             n = len(PARAMETERS[kind])
             processes.append(Process(kind, tuple(values[:n])))
             values = values[n:]
-        return DisturbanceModel(tuple(processes))
+        return ProcessSum(tuple(processes))
 
     def others(self, x: FloatArray) -> tuple[float, float]:
         """Factor of the pixels' noise variance, and what the kernel's variance has over the rig file's."""

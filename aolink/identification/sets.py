@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import DisturbanceModel
+from aolink.identification.models import ProcessSum
 from aolink.identification.readings import Readings
 from aolink.identification.search import BLOCK, Maximum, Space
 from aolink.identification.simulate import simulated

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from aolink.identification.models import DisturbanceModel
+from aolink.identification.models import ProcessSum
 from aolink.identification.readings import Readings, before
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
@@ -16,7 +16,7 @@ _POINTS_PER_CYCLE = 12
 _FEWEST_POINTS = 24
 
 
-def simulated(seen: Readings, model: DisturbanceModel, count: int, seed: int, noise: float = 1.0) -> Readings:
+def simulated(seen: Readings, model: ProcessSum, count: int, seed: int, noise: float = 1.0) -> Readings:
     """Readings like ``seen`` with other disturbances and noise: ``count`` draws of each output, draw by draw.
 
     Parameters
@@ -47,7 +47,7 @@ def simulated(seen: Readings, model: DisturbanceModel, count: int, seed: int, no
     )  # fmt: skip
 
 
-def _points(seen: Readings, model: DisturbanceModel) -> int:
+def _points(seen: Readings, model: ProcessSum) -> int:
     """Points in an exposure that are drawn: a divisor of its fast steps, enough for the fastest process."""
     fastest = max(float(np.abs(process.poles.imag).max()) for process in model.processes) / (2 * math.pi)
     wanted = max(_FEWEST_POINTS, _POINTS_PER_CYCLE * fastest * seen.n_steps * seen.step_s)
@@ -55,7 +55,7 @@ def _points(seen: Readings, model: DisturbanceModel) -> int:
 
 
 def _paths(
-    seen: Readings, model: DisturbanceModel, count: int, points: int, random: np.random.Generator
+    seen: Readings, model: ProcessSum, count: int, points: int, random: np.random.Generator
 ) -> FloatArray:
     """Disturbances at the middles of equal parts of the exposures, (count, slots, points)."""
     stride = seen.n_steps // points
