@@ -19,15 +19,23 @@ from aolink.optics.sensor import BaseSensor
 from aolink.rig.device_tables import DeviceTable, read_devices
 from aolink.rig.disturbance import Disturbance, read_disturbance
 from aolink.rig.optical_plant import Optics, read_optics
-from aolink.rig.parts import Drive, MirrorDriver, Plant, Simulation, Timing
+from aolink.rig.parts import Control, Drive, MirrorDriver, Plant, Simulation, Timing
 from aolink.rig.scene_table import read_scene
 from aolink.rig.sensor_tables import CalibrationTable, read_calibration, read_grid, read_sensor
-from aolink.rig.tables import read_drive, read_mirror, read_plant, read_simulation, read_timing
+from aolink.rig.tables import (
+    read_control,
+    read_drive,
+    read_mirror,
+    read_plant,
+    read_simulation,
+    read_timing,
+    with_disturbance,
+)
 from aolink.rig.toml_table import Table
 
 _TABLES = (
     "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
-    "lenslets", "disturbance", "scene", "calibration", "devices",
+    "lenslets", "disturbance", "scene", "calibration", "devices", "control",
 )  # fmt: skip
 """The top-level keys of a rig file."""
 
@@ -43,6 +51,7 @@ class Rig:
     sensor: BaseSensor
     mirror: MirrorDriver
     drive: Drive
+    control: Control
     simulation: Simulation
     calibration: CalibrationTable | None
     """None where the sensor's values were not measured."""
@@ -131,15 +140,18 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     n_inputs = plant.axes * plant.n_inputs
     mirror = root.read("mirror", read_mirror, n_inputs, timing)
     drive = root.read("drive", read_drive, n_inputs, mirror, optional=True)
-    disturbance = root.read_any("disturbance", read_disturbance)
+    control = root.read("control", read_control, timing, optional=True)
+    disturbance = root.read_any("disturbance", read_disturbance, plant.n_outputs, timing.fast_step_s)
     if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
         raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
+    if disturbance and disturbance.model:
+        plant = with_disturbance(plant, disturbance.model)
     scene = root.read_any("scene", read_scene)
     simulation = root.read("simulation", read_simulation, optional=True)
     calibration = root.read_any("calibration", read_calibration)
     devices = root.read("devices", read_devices, optional=True)
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
-        mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,
+        mirror=mirror, drive=drive, control=control, simulation=simulation, calibration=calibration,
         optics=optics, disturbance=disturbance, scene=scene, devices=devices, folder=folder or Path(), toml=text,
     )  # fmt: skip
