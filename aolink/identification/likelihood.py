@@ -8,8 +8,9 @@ exposures and s its mean squares about c, as measured,
 
 p(y) is Gaussian, exactly, and taken over long runs. Given y the path is Gaussian, with mean m and covariance S, so that s is a quadratic form of
 a Gaussian: E s_j = mean of ((m - c)^2 + diag S), Cov(s_j, s_k) = 2 mean of S^2 + 4 mean of (m - c) S (m - c), means
-over both exposures' steps. p(s | y) is taken as the Gaussian of these moments: that, and that blocks are taken as
-independent, is all that is not exact. What it costs is found by simulation (`curvature`), and intervals allow for it.
+over both exposures' steps; its third cumulant is as exact. p(s | y) is taken as gamma distributions of these cumulants, with
+the pixels' noise, joined by the Gaussian copula of their covariance: of a spot that swings several times in an exposure
+the mean square is an exponential variable. That, and that blocks are taken as independent, is all that is not exact. What it costs is found by simulation (`curvature`), and intervals allow for it.
 
 Sums over the steps of an exposure are Gauss's quadrature.
 """
@@ -17,11 +18,11 @@ Sums over the steps of an exposure are Gauss's quadrature.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, special
 
 from aolink.estimation.model.quadrature import blocks, gauss
 from aolink.identification.models import ProcessSum
@@ -35,6 +36,14 @@ _WALK_START = 4.0
 """Variance of where a random walk starts in a block, in squares of half the field."""
 _RUN = 128
 """Exposures whose means are taken together."""
+_CELLS = np.linspace(0.0, 1.0, 41) ** 1.5
+_SPAN = 5.0
+"""Standard deviations that the cells of a gamma distribution reach to on the lower side; 1.6 times as far above."""
+_LEAST_SKEWNESS, _MOST_SKEWNESS = 0.05, 2.8
+_SMOOTH = 0.05
+"""Of a gamma distribution, in standard deviations: where it begins it is not so right as it is steep."""
+_RARE, _WIDE = 1e-3, 3.0
+"""Share of a Gaussian so many times as wide that is in every distribution."""
 _AT_ONCE = 128
 """Blocks that are computed together: what they need stays in the processor's cache."""
 
@@ -74,6 +83,10 @@ class Likelihood:
         self.mean_noise = float(seen.mean_noise[good].mean())
         """Variance of a mean by the pixels' noise, that of all exposures."""
         self.exposure_s = seen.n_steps * seen.step_s
+
+    def with_response(self, response: FloatArray) -> Likelihood:
+        """The same readings with another response to the inputs, (outputs, slots, N + 1)."""
+        return Likelihood(replace(self.seen, response=response), self.length)
 
     def __call__(
         self, model: ProcessSum, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
@@ -254,38 +267,88 @@ class _Joint:
         self.shape = (L, K)
 
     @cached_property
-    def _from_variance(self) -> tuple[FloatArray, FloatArray]:
-        """What S alone adds to the mean squares' mean (good,) and covariance (good, good)."""
+    def _from_variance(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """What S alone adds to the mean squares' mean (good,), covariance (good, good) and third cumulant (good,).
+
+        Before the last: S of each exposure with itself, weighted, (good, nodes, nodes).
+        """
         w, (L, K) = self.weights, self.shape
         diagonal = np.einsum("ii->i", self.S).reshape(L, K)[self.good] @ w
         squares = (self.S * self.S).reshape(L, K, L, K)
         spread = np.tensordot(np.tensordot(squares, w, axes=(3, 0)), w, axes=(1, 0))
-        return diagonal, 2 * spread[np.ix_(self.good, self.good)]
+        root_w = np.sqrt(w)
+        own = self.S.reshape(L, K, L, K)[self.good, :, self.good] * root_w[:, None] * root_w
+        cubes = 8 * np.einsum("jab,jba->j", own @ own, own)
+        return diagonal, 2 * spread[np.ix_(self.good, self.good)], own, cubes
 
     def log_densities(self, data: Blocks, constants: FloatArray, noise: float, wider: float) -> FloatArray:
         """Log-density of each block's mean squares, given its means, (blocks,); ``constants`` b of each block."""
         good, w = self.good, self.weights
         y = data.mean - data.response @ w + data.centre - constants[:, None]
         white = linalg.solve_triangular(self.root, y[:, good].T, lower=True, check_finite=False)
-        return self._squares(data, white, constants, noise, wider) - 0.5 * len(good) * math.log(2 * math.pi)
+        return self._squares(data, white, constants, noise, wider)
 
     def _squares(self, data: Blocks, white: FloatArray, b: FloatArray, noise: float, wider: float) -> FloatArray:
         L, K = self.shape
         good, w = self.good, self.weights
         m = (white.T @ self.gain).reshape(-1, L, K) + data.response + b[:, None, None] - data.centre[:, :, None]
-        diagonal, spread = self._from_variance
+        diagonal, spread, own, cubes = self._from_variance
         expected = (m[:, good] ** 2) @ w + diagonal + wider
-        e = data.square[:, good] - expected
-        out = np.empty(len(e))
+        measured, read = data.square[:, good], noise * data.square_noise[:, good]
+        out = np.empty(len(expected))
         S = self.S.reshape(L, K, L * K)[good]
-        wm = m * w
-        for first in range(0, len(e), _AT_ONCE):
+        wm = (m * w)[:, good]
+        root_w = np.sqrt(w)
+        for first in range(0, len(out), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
-            rows = np.matmul(wm[some][:, good].swapaxes(0, 1), S).reshape(len(good), -1, L, K)[:, :, good]
-            cross = np.einsum("jbkn,bkn->bjk", rows, wm[some][:, good], optimize=False)
+            rows = np.matmul(wm[some].swapaxes(0, 1), S).reshape(len(good), -1, L, K)[:, :, good]
+            cross = np.einsum("jbkn,bkn->bjk", rows, wm[some], optimize=False)
             V = spread + 4 * cross
-            V[:, np.arange(len(good)), np.arange(len(good))] += noise * data.square_noise[some][:, good]
-            root = np.linalg.cholesky(V)
-            left = np.linalg.solve(root, e[some][:, :, None])[..., 0]
-            out[some] = -0.5 * (left**2).sum(axis=1) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+            variance = np.einsum("bjj->bj", V)
+            pushed = np.matmul(own, (m[some][:, good] * root_w)[..., None])[..., 0]
+            third = cubes + 24 * (pushed**2).sum(axis=2)
+            density, z = _shifted_gamma(measured[some] - expected[some], variance, third, read[some])
+            # Gaussian copula: the correlation of what is measured, noise and all.
+            sd = np.sqrt(variance + read[some])
+            C = V / (sd[:, :, None] * sd[:, None, :])
+            C[:, np.arange(len(good)), np.arange(len(good))] = 1.0
+            root = np.linalg.cholesky(C)
+            left = np.linalg.solve(root, z[:, :, None])[..., 0]
+            joint = -0.5 * (left**2).sum(axis=1) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
+            out[some] = density.sum(axis=1) + joint + 0.5 * (z**2).sum(axis=1)
         return out
+
+
+def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Log-density of a gamma variable, shifted to mean zero, with Gaussian noise; and the normal quantile of its value.
+
+    Parameters
+    ----------
+    e:
+        Values, any shape.
+    variance, third:
+        Second and third cumulant of the gamma variable, the latter above zero.
+    read:
+        Variance of the noise.
+    """
+    sd = np.sqrt(variance)
+    skewness = np.clip(third / (variance * sd), _LEAST_SKEWNESS, _MOST_SKEWNESS)
+    k = 4 / skewness**2
+    # In standard deviations: from where the gamma variable begins, in equal cells.
+    low = -2 / skewness
+    begin = np.maximum(low, -_SPAN)
+    edges = begin[..., None] + (_SPAN * 1.6 - begin)[..., None] * _CELLS
+    below = special.gammainc(k[..., None], np.maximum((edges - low[..., None]) * (2 / skewness)[..., None], 0.0))
+    mass = np.diff(below, axis=-1)
+    places = (edges[..., 1:] + edges[..., :-1]) / 2
+    # A cell is as good as a Gaussian of its width.
+    width = np.sqrt((read / variance + _SMOOTH**2)[..., None] + np.diff(edges, axis=-1) ** 2 / 12)
+    u = (e / sd)[..., None] - places
+    bell = np.exp(-0.5 * (u / width) ** 2)
+    density = (mass * bell / width).sum(axis=-1) / math.sqrt(2 * math.pi)
+    share = (mass * special.ndtr(u / width)).sum(axis=-1) / mass.sum(axis=-1)
+    # Far outside it falls off as a Gaussian of the whole variance does, not to nothing.
+    whole = 1 + read / variance
+    rare = _RARE * np.exp(-0.5 * (e / sd) ** 2 / (_WIDE**2 * whole)) / np.sqrt(2 * math.pi * _WIDE**2 * whole)
+    z = special.ndtri(np.clip(share, 1e-6, 1 - 1e-6))
+    return np.log((1 - _RARE) * density + rare) - np.log(sd), z

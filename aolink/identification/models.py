@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, signal
 
 from aolink.errors import IdentificationError
 from aolink.numerics.arrays import FloatArray
@@ -37,6 +37,7 @@ the modulus of a pair of poles over 2 pi, Hz, and their damping ratio.
 UNITS: Mapping[str, str] = {"intensity": "slope^2/s", "sd": "slope", "damping": "", "second_damping": ""} | dict.fromkeys(
     ("frequency_hz", "second_frequency_hz"), "Hz"
 ) | dict.fromkeys(("correlation_s", "second_correlation_s"), "s")
+_FASTEST = 300.0
 _APART = 1e-4
 """Least distance of two poles, as a share of their modulus: a double pole has no partial fractions."""
 
@@ -117,13 +118,19 @@ class Process:
         -------
         (m, k, k), a first.
         """
-        inside = self.shares[:, None, None] * np.exp(self.poles[:, None, None] * (at_s[:, None] - at_s))
-        return np.asarray(np.tensordot(np.exp(np.outer(apart_s, self.poles)), inside, axes=1).real)
+        poles = self._tamed(at_s)
+        inside = self.shares[:, None, None] * np.exp(poles[:, None, None] * (at_s[:, None] - at_s))
+        return np.asarray(np.tensordot(np.exp(np.outer(apart_s, poles)), inside, axes=1).real)
 
     def covariance_of_means(self, apart_s: FloatArray, at_s: FloatArray, weights: FloatArray) -> FloatArray:
         """The same for means with these ``weights`` over ``at``, (m,)."""
-        means = np.exp(np.outer(self.poles, at_s)) @ weights, np.exp(-np.outer(self.poles, at_s)) @ weights
-        return np.asarray((np.exp(np.outer(apart_s, self.poles)) @ (self.shares * means[0] * means[1])).real)
+        poles = self._tamed(at_s)
+        means = np.exp(np.outer(poles, at_s)) @ weights, np.exp(-np.outer(poles, at_s)) @ weights
+        return np.asarray((np.exp(np.outer(apart_s, poles)) @ (self.shares * means[0] * means[1])).real)
+
+    def _tamed(self, at_s: FloatArray) -> ComplexArray:
+        """The poles, none of which decays so fast within ``at`` that its inverse is no number: nothing is left of it."""
+        return np.asarray(np.maximum(self.poles.real, -_FASTEST / float(np.ptp(at_s))) + 1j * self.poles.imag)
 
 
 def _pair(omega: float, damping: float) -> list[complex]:
@@ -197,6 +204,54 @@ def _sampled(process: Process, step_s: float, start_variance: float) -> tuple[Fl
     W = P - A @ P @ A.T
     values, vectors = np.linalg.eigh((W + W.T) / 2)
     return A, (vectors * np.maximum(values, 0.0)) @ vectors.T, P
+
+
+PLANTS: Mapping[str, tuple[str, ...]] = {
+    "first-order": ("gain", "correlation_s", "sd"),
+    "second-order": ("gain", "frequency_hz", "damping", "sd"),
+}
+"""The parameters of each kind of plant whose input moves one output.
+
+``gain`` is the slope for a resting input of one, slope units; the poles are as of `PARAMETERS`; ``sd`` is the standard
+deviation of the slope by noise at the plant's input, slope units.
+"""
+
+
+@dataclass(frozen=True)
+class IdentifiedPlant:
+    """A plant from one input to one output, with white noise at its input."""
+
+    kind: str
+    values: tuple[float, ...]
+    """In the order of `PLANTS`."""
+
+    def __getitem__(self, name: str) -> float:
+        return self.values[PLANTS[self.kind].index(name)]
+
+    @property
+    def noise(self) -> Process:
+        """What the noise does to the output."""
+        if self.kind == "first-order":
+            tau = self["correlation_s"]
+            return Process("ornstein-uhlenbeck", (tau, 2 * self["sd"] ** 2 / tau))
+        return Process("resonance", (self["frequency_hz"], self["damping"], abs(self["sd"])))
+
+    def state_space(self, step_s: float) -> tuple[StateSpace, FloatArray]:
+        """The plant sampled at the fast rate, with inputs held for a step, and its B, (n_states, 1)."""
+        space = ProcessSum((self.noise,)).state_space(step_s)
+        # At rest the first state is the gain times the input and the others, its derivatives, are zero.
+        rest = np.eye(len(space.A), 1) * self["gain"]
+        return space, rest - space.A @ rest
+
+    def response(self, inputs: FloatArray, step_s: float) -> FloatArray:
+        """Outputs from rest at each fast step and one more, (outputs, steps + 1), from inputs (outputs, steps)."""
+        space, B = self.state_space(step_s)
+        # C (z - A)^-1 B as a difference equation.
+        poles = np.poly(space.A)
+        impulse = [float((space.C @ np.linalg.matrix_power(space.A, k) @ B)[0, 0]) for k in range(len(space.A))]
+        numerator = np.append(0.0, np.convolve(poles, impulse)[: len(space.A)])
+        padded = np.concatenate([inputs, np.zeros((len(inputs), 1))], axis=1)
+        return np.asarray(signal.lfilter(numerator, poles, padded, axis=1))
 
 
 def kinds_of(name: str) -> tuple[str, ...]:

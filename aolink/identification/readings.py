@@ -73,6 +73,8 @@ class Readings:
     inputs: FloatArray
     """Inputs of the copy of the plant that the output belongs to, at each fast step from the first slot on, (outputs,
     n_inputs, steps)."""
+    offset: float
+    """How far into a fast step the exposures start, in fast steps."""
     motion: float
     """Standard deviation of the path about c, slope units."""
     follows: bool
@@ -98,8 +100,13 @@ class Readings:
         return replace(self, **{name: getattr(self, name)[list(which)] for name in names})
 
 
-def readings(rig: Rig, exposures: Sequence[Exposure]) -> Readings:
-    """The readings of a recording's exposures, whose inputs the rig's plant responds to.
+def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = True) -> Readings:
+    """The readings of a recording's exposures.
+
+    Parameters
+    ----------
+    plant_known:
+        Whether the inputs' response is that of the rig's plant; if not, none is taken off where the spot is expected.
 
     Raises
     ------
@@ -133,12 +140,15 @@ def readings(rig: Rig, exposures: Sequence[Exposure]) -> Readings:
                 mask[~np.repeat(found.usable, rig.plant.n_outputs), k] = False
     if mask.any(axis=(0, 2)).sum() < FEWEST:
         raise IdentificationError(f"{int(mask.any(axis=(0, 2)).sum())} exposures show a spot, {FEWEST} or more are needed")
-    response = _response(rig, inputs, slots, n_steps, period, exposures[0].start_offset)
+    response = np.zeros((rig.n_outputs, slots, n_steps + 1))
+    if plant_known:
+        response = _response(rig, inputs, slots, n_steps, period, exposures[0].start_offset)
     empty = np.zeros(density.shape[:2])
     blank = Readings(
         step_s=rig.timing.fast_step_s, n_steps=n_steps, period_steps=period, mean=empty, square=empty,
         mean_noise=empty, square_noise=empty, centre=empty, usable=mask.any(axis=2), response=response,
-        inputs=np.repeat(inputs, rig.plant.n_outputs, axis=0), motion=0.0, follows=False,
+        inputs=np.repeat(inputs, rig.plant.n_outputs, axis=0), offset=exposures[0].start_offset,
+        motion=0.0, follows=False,
         reach=(rig.sensor.field[1] - rig.sensor.field[0]) / 2,
     )  # fmt: skip
     return _measured(rig.sensor.profile, density, mask, blank)
@@ -172,10 +182,14 @@ def _response(rig: Rig, inputs: FloatArray, slots: int, n_steps: int, period: in
         state = state @ transition.T + d
     after = (state @ plant.C.T)[:, :, None]
     flat = np.concatenate([out.reshape(plant.axes, plant.n_outputs, -1), after], axis=2)
+    return by_slot(flat.reshape(rig.n_outputs, -1), slots, n_steps, period, offset)
+
+
+def by_slot(path: FloatArray, slots: int, n_steps: int, period: int, offset: float) -> FloatArray:
+    """Outputs at each fast step and one more (outputs, steps + 1), as exposures see them, (outputs, slots, N + 1)."""
     if offset:
-        flat = np.concatenate([(1 - offset) * flat[..., :-1] + offset * flat[..., 1:], flat[..., -1:]], axis=2)
-    at = np.arange(slots)[:, None] * period + np.arange(n_steps + 1)
-    return np.asarray(flat.reshape(rig.n_outputs, -1)[:, at])
+        path = np.concatenate([(1 - offset) * path[:, :-1] + offset * path[:, 1:], path[:, -1:]], axis=1)
+    return np.asarray(path[:, np.arange(slots)[:, None] * period + np.arange(n_steps + 1)])
 
 
 def _measured(sensor: Sensor, density: FloatArray, mask: BoolArray, blank: Readings) -> Readings:

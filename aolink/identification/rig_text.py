@@ -1,14 +1,65 @@
-"""What was identified, written into the text of a rig file as ``[[disturbance.model]]``."""
+"""What was identified, written into the text of a rig file: ``[[disturbance.model]]``, and the plant where it is new."""
 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from aolink.identification.models import Process, ProcessSum
+from aolink.identification.models import IdentifiedPlant, Process, ProcessSum
+from aolink.rig import Rig, parse_rig
+from aolink.rig.edit import with_tables, with_value
+
+_COMMENT = "by `aolink identify`"
+
+
+def identified_text(
+    text: str, rig: Rig, models: Sequence[ProcessSum], *, plant: IdentifiedPlant | None = None, noise: float = 1.0,
+    wider: float = 0.0,
+) -> str:  # fmt: skip
+    """The text of a rig file with what was identified, which says all that disturbs: the plant's own noise becomes zero.
+
+    Parameters
+    ----------
+    text:
+        The file's text, whatever its line ends, which ``rig`` was read from.
+    models:
+        The disturbance of each output of a copy of the plant, or one for all.
+    plant:
+        The plant, where it was identified; its own noise then stays in ``[plant]``.
+    noise, wider:
+        Factor of the pixels' noise variance, and what the kernel's variance has over the file's, slope units squared.
+
+    Raises
+    ------
+    RigError
+        The file cannot have it.
+    """
+    step = rig.timing.fast_step_s
+    if plant is not None:
+        space, B = plant.state_space(step)
+        values, vectors = np.linalg.eigh(space.W)
+        kept = values > values.max() * 1e-12
+        for key, value in (
+            ("A", _rows(space.A)), ("B", _rows(B)), ("B_w", _rows(vectors[:, kept])), ("C", _rows(space.C)),
+            ("process_noise", np.diag(values[kept]).tolist()), ("initial_covariance", "stationary"),
+        ):  # fmt: skip
+            text = with_value(text, f"plant.{key}", value, may_be_new=True)
+    else:
+        written = tomllib.loads(rig.toml)["plant"]["process_noise"]
+        text = with_value(text, "plant.process_noise", np.zeros_like(written, dtype=np.float64).tolist())
+    if noise != 1:
+        text = with_value(text, "sensor.noise_density", _written(rig.sensor.noise_density * noise))
+    if wider:
+        sigma = math.sqrt(rig.sensor.kernel.sigma**2 + 2 * wider)
+        text = with_value(text, "sensor.kernel.sigma", _written(sigma))
+    tables = for_outputs([as_tables(model, step) for model in models])
+    text = with_tables(text, "disturbance.model", tables, _COMMENT) if tables else text
+    parse_rig(text)
+    return text
 
 
 def as_tables(model: ProcessSum, step_s: float) -> list[dict[str, Any]]:

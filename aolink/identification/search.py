@@ -12,8 +12,8 @@ from scipy import optimize
 
 from aolink.errors import IdentificationError
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import PARAMETERS, ProcessSum, Process
-from aolink.identification.readings import Readings
+from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Process, ProcessSum
+from aolink.identification.readings import Readings, by_slot
 from aolink.numerics.arrays import FloatArray
 
 BLOCK = 8
@@ -27,10 +27,11 @@ _DECAY = 0.4
 _STARTS = 8
 _MOST = 3000
 """Most points of a grid of several processes."""
-KEPT = 8.0
+KEPT = 12.0
 """Local maxima that are lower than the highest by more than this, in nats, are forgotten."""
 _SAME = 0.02
 """Maxima whose parameters differ by less than this share are one."""
+_RIDGE = 0.5
 _STEP = 1e-3
 _NEVER = 1e12
 Told = Callable[[int], None]
@@ -47,6 +48,10 @@ class Space:
     """... and the kernel's variance over the rig file's another."""
     kernel_variance: float
     bounds: tuple[tuple[float, float], ...]
+    plant: str | None = None
+    """The kind of plant that is fitted as well; its parameters come first. None: the plant is known."""
+    sign: float = 1.0
+    """Of the plant's gain."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -57,12 +62,25 @@ class Space:
             for k, kind in enumerate(self.kinds)
             for name in PARAMETERS[kind]
         ]
+        names = [f"plant.{name}" for name in self._of_plant] + names
         return (*names, *(["noise"] if self.with_noise else []), *(["kernel"] if self.with_kernel else []))
 
+    @property
+    def _of_plant(self) -> tuple[str, ...]:
+        return PLANTS[self.plant] if self.plant else ()
+
+    def fitted_plant(self, x: FloatArray) -> IdentifiedPlant | None:
+        """The plant of a vector, where one is fitted."""
+        if self.plant is None:
+            return None
+        gain, *rest = np.exp(x[: len(self._of_plant)]).tolist()
+        return IdentifiedPlant(self.plant, (self.sign * gain, *rest))
+
     def model(self, x: FloatArray) -> ProcessSum:
-        """The model of a vector."""
-        values = np.exp(x).tolist()
-        processes = []
+        """The disturbance of a vector, with that by the fitted plant's own noise before the others."""
+        plant = self.fitted_plant(x)
+        values = np.exp(x[len(self._of_plant) :]).tolist()
+        processes = [plant.noise] if plant else []
         for kind in self.kinds:
             n = len(PARAMETERS[kind])
             processes.append(Process(kind, tuple(values[:n])))
@@ -71,7 +89,8 @@ class Space:
 
     def others(self, x: FloatArray) -> tuple[float, float]:
         """Factor of the pixels' noise variance, and what the kernel's variance has over the rig file's."""
-        rest = np.exp(x[sum(len(PARAMETERS[kind]) for kind in self.kinds) :]).tolist()
+        own = len(self._of_plant) + sum(len(PARAMETERS[kind]) for kind in self.kinds)
+        rest = np.exp(x[own:]).tolist()
         noise = rest.pop(0) if self.with_noise else 1.0
         return noise, (rest[0] - 1) * self.kernel_variance if self.with_kernel else 0.0
 
@@ -80,14 +99,38 @@ class Space:
         if any(not low <= value <= high for value, (low, high) in zip(x, self.bounds, strict=True)):
             return -math.inf
         model, (noise, wider) = self.model(x), self.others(x)
-        return sum(each(model, noise, wider, nodes) for each in of)
+        return sum(self.driven(x, each)(model, noise, wider, nodes) for each in of)
+
+    def driven(self, x: FloatArray, of: Likelihood, draws: int = 1) -> Likelihood:
+        """A recording's likelihood with the fitted plant's response to its inputs, where a plant is fitted.
+
+        ``draws``: how often the recording's outputs are there, with the same inputs.
+        """
+        if self.plant is None:
+            return of
+        first = of.seen.of_outputs(range(len(of.seen.mean) // draws))
+        return of.with_response(np.tile(self.response(x, first), (draws, 1, 1)))
+
+    def response(self, x: FloatArray, seen: Readings) -> FloatArray:
+        """Response to the inputs of a recording, (outputs, slots, N + 1)."""
+        plant = self.fitted_plant(x)
+        if plant is None:
+            return seen.response
+        path = plant.response(seen.inputs[:, 0], seen.step_s)
+        return by_slot(path, seen.slots, seen.n_steps, seen.period_steps, seen.offset)
 
 
 def space_of(
     kinds: Sequence[str], seen: Sequence[Readings], kernel_variance: float, *, with_noise: bool, with_kernel: bool,
-    highest_hz: float | None = None,
+    highest_hz: float | None = None, plant: str | None = None,
 ) -> Space:  # fmt: skip
-    """The parameters of a sum of processes, within limits that the recordings set."""
+    """The parameters of a sum of processes, and of a plant, within limits that the recordings set.
+
+    Raises
+    ------
+    IdentificationError
+        A frequency is asked for that the fast rate cannot follow, or a plant, and the inputs say nothing of it.
+    """
     one = seen[0]
     exposure, period = one.n_steps * one.step_s, one.period_steps * one.step_s
     whole = max(each.slots for each in seen) * period
@@ -101,12 +144,38 @@ def space_of(
         "correlation_s": (exposure / 100, 10 * whole),
         "intensity": (1e-8 * one.reach**2 / whole, 100 * one.reach**2 / exposure),
     }
-    bounds = [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
+    span = max(float(np.ptp(each.inputs)) for each in seen)
+    if plant is not None and span == 0:
+        raise IdentificationError(
+            "the inputs of the recording never change, so it holds no input to identify a plant from: record with a"
+            " [drive], or take the plant as known"
+        )
+    if plant is not None and any(each.inputs.shape[1] != 1 for each in seen):
+        raise IdentificationError(
+            f"a plant is identified where one input moves one output, here {one.inputs.shape[1]} inputs move a copy of it"
+        )
+    of_plant = [] if plant is None else [limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span),
+                                                   "damping": (1e-4, 30.0)}]
+    bounds = [each[name] for each in of_plant for name in PLANTS[plant or ""]]
+    bounds += [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
     bounds += [(0.1, 10.0)] * with_noise + [(0.25, 4.0)] * with_kernel
     return Space(
         tuple(kinds), with_noise, with_kernel, kernel_variance,
-        tuple((math.log(low), math.log(high)) for low, high in bounds),
+        tuple((math.log(low), math.log(high)) for low, high in bounds), plant, _sign(seen) if plant else 1.0,
     )  # fmt: skip
+
+
+def _sign(seen: Sequence[Readings]) -> float:
+    """Of the gain of a plant that hardly delays: that of the covariance of the means with the inputs'."""
+    total = 0.0
+    for each in seen:
+        u = np.cumsum(each.inputs[:, 0], axis=1)
+        smooth = by_slot(np.pad(u, ((0, 0), (1, 0))), each.slots, each.n_steps, each.period_steps, 0.0)
+        mean = (smooth[:, :, -1] - smooth[:, :, 0]) / each.n_steps
+        y = each.mean + each.centre
+        good = each.usable
+        total += float(((mean - mean[good].mean()) * (y - y[good].mean()))[good].sum())
+    return math.copysign(1.0, total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,8 +215,13 @@ def maxima(space: Space, seen: Sequence[Readings], tell: Told | None = None) -> 
             _add(space, best, climb(space, each.x, of))
     if not best:
         raise IdentificationError("no model of this kind has a likelihood here: are there readings at all?")
-    best.sort(key=lambda each: -each.log_likelihood)
-    return best
+    apart: list[Maximum] = []
+    for each in sorted(best, key=lambda each: -each.log_likelihood):
+        # Halfway along a ridge it is no lower: that is one maximum, not yet reached from both ends.
+        middles = (space.log_likelihood((each.x + other.x) / 2, of, other.nodes) for other in apart)
+        if not any(middle > each.log_likelihood - _RIDGE for middle in middles):
+            apart.append(each)
+    return apart
 
 
 def _aliases(space: Space, x: FloatArray, one: Readings) -> list[FloatArray]:
@@ -216,7 +290,7 @@ def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
     one = seen[0]
     exposure, period = one.n_steps * one.step_s, one.period_steps * one.step_s
     variance = max(each.motion for each in seen) ** 2
-    share = variance / len(space.kinds)
+    share = variance / max(len(space.kinds) + (space.plant is not None), 1)
     sd = math.sqrt(share)
     at = [name for kind in space.kinds for name in PARAMETERS[kind]]
     low, high = next(
@@ -245,15 +319,41 @@ def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
         ]  # ar4: two pairs, whose order does not matter
 
     each = [points(kind) for kind in space.kinds]
+    if space.plant is not None:
+        each.insert(0, _plant_grid(space, seen, sd))
     while math.prod(len(some) for some in each) > _MOST:
         longest = max(range(len(each)), key=lambda k: len(each[k]))
         each[longest] = each[longest][::2]
     grid = []
     for product in itertools.product(*each):
         # Of equal processes, the order of the frequencies does not matter.
+        own = product[1:] if space.plant is not None else product
         if all(
-            a[0] < b[0] or self_kind != other
-            for (a, self_kind), (b, other) in itertools.pairwise(zip(product, space.kinds, strict=True))
+            a[0] < b[0] or kind != other
+            for (a, kind), (b, other) in itertools.pairwise(zip(own, space.kinds, strict=True))
         ):
             grid.append(tuple(math.log(value) for part in product for value in part))
     return grid
+
+
+def _plant_grid(space: Space, seen: Sequence[Readings], sd: float) -> list[tuple[float, ...]]:
+    """Points of the coarse grid of a plant; gains are those of least squares of the means."""
+    low, high = np.exp(space.bounds[1])
+    scales = np.geomspace(low, high, 24)
+    if space.plant == "first-order":
+        shapes: list[tuple[float, ...]] = [(scale,) for scale in scales]
+    else:
+        shapes = [(scale, damping) for scale in scales for damping in (0.02, 0.3, 1.5, 6.0)]
+    points = []
+    for shape in shapes:
+        top = bottom = 0.0
+        for each in seen:
+            path = IdentifiedPlant(space.plant or "", (1.0, *shape, sd)).response(each.inputs[:, 0], each.step_s)
+            slots = by_slot(path, each.slots, each.n_steps, each.period_steps, each.offset)
+            mean, y, good = slots[:, :, :-1].mean(axis=2), each.mean + each.centre, each.usable
+            mean = mean - mean[good].mean()
+            top += float((mean * y)[good].sum())
+            bottom += float((mean * mean)[good].sum())
+        gain = abs(top) / max(bottom, 1e-300)
+        points.append((min(max(gain, 1e-300), 1e300), *shape, sd / 2))
+    return points

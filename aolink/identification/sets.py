@@ -4,14 +4,15 @@ The set is that of the values whose profile log-likelihood, the highest with tha
 less than 1.92 a. With the true likelihood a = 1 (Wilks). `likelihood` takes exposures that depend on each other for
 independent and what is not Gaussian for Gaussian, so that a is the ratio of the parameter's variance as it is, H^-1 J
 H^-1, to the H^-1 that the curvature H shows (Kent, Biometrika 69 (1982)); J is the covariance of the gradient at the
-maximum over recordings that the model makes (`simulate`).
+maximum over recordings that the model makes (`simulate`). An alias is a maximum of its own, far from the highest: it is
+in the set as well if recordings that it makes itself put it as far below the highest one in a twentieth of them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +26,8 @@ from aolink.numerics.arrays import FloatArray
 QUANTILE = 3.841
 """Of chi-square with one degree of freedom, at 95 %."""
 _DRAWS = 96
+_MOST = 8
+"""Local maxima that are looked at."""
 _STEP = 0.02
 _WIDEST = 3.0
 """Farthest step along a profile at once, logarithm of the parameter."""
@@ -73,18 +76,37 @@ def identified(
     top = found[0]
     curvature = _curvature(space, top, of)
     factors = _factors(space, top, seen, curvature)
+    found = found[:_MOST]
+    allowed = [0.0, *(_allowed(space, top, each, seen) for each in found[1:])]
+    curvatures = [curvature] + [np.zeros(0)] * (len(found) - 1)
     out = []
     for k, name in enumerate(space.names):
         if tell:
             tell(k)
-        least = top.log_likelihood - QUANTILE / 2 * factors[k]
-        pieces = [
-            _piece(space, each, k, least, of, curvature if each is top else _curvature(space, each, of))
-            for each in found
-            if each.log_likelihood > least
-        ]
+        pieces = []
+        for number, each in enumerate(found):
+            least = top.log_likelihood - max(QUANTILE / 2 * factors[k], allowed[number])
+            if each.log_likelihood > least:
+                if not curvatures[number].size:
+                    curvatures[number] = _curvature(space, each, of)
+                pieces.append(_piece(space, each, k, least, of, curvatures[number]))
         out.append(Identified(name, math.exp(top.x[k]), _joined(pieces), float(factors[k])))
     return tuple(out)
+
+
+def _allowed(space: Space, top: Maximum, other: Maximum, seen: Sequence[Readings]) -> float:
+    """By how much ``other`` may be below the highest maximum if it is the truth, nats: one time in twenty it is more."""
+    below = np.zeros(_DRAWS)
+    for number, each in enumerate(seen):
+        noise, _ = space.others(other.x)
+        drawn = simulated(
+            replace(each, response=space.response(other.x, each)), space.model(other.x), _DRAWS, number, noise
+        )
+        likelihood = Likelihood(drawn, BLOCK)
+        for sign, at in ((1, top), (-1, other)):
+            values = space.driven(at.x, likelihood, _DRAWS).of_outputs(space.model(at.x), *space.others(at.x), at.nodes)
+            below += sign * values.reshape(_DRAWS, -1).sum(axis=1)
+    return float(np.quantile(below, 0.95))
 
 
 def _curvature(space: Space, at: Maximum, of: Sequence[Likelihood]) -> FloatArray:
@@ -136,14 +158,15 @@ def _factors(space: Space, top: Maximum, seen: Sequence[Readings], H: FloatArray
     J = np.zeros((n, n))
     for number, each in enumerate(seen):
         noise, _ = space.others(top.x)
-        drawn = simulated(each, space.model(top.x), _DRAWS, number, noise)
+        own = replace(each, response=space.response(top.x, each))
+        drawn = simulated(own, space.model(top.x), _DRAWS, number, noise)
         likelihood = Likelihood(drawn, BLOCK)
         scores = np.empty((n, _DRAWS))
         for k in range(n):
             h = 0.1 / math.sqrt(H[k, k])
             ends = [np.clip(top.x + sign * h * np.eye(n)[k], low, high) for sign in (1, -1)]
             two = [
-                likelihood.of_outputs(space.model(x), *space.others(x), top.nodes).reshape(_DRAWS, -1).sum(axis=1)
+                space.driven(x, likelihood, _DRAWS).of_outputs(space.model(x), *space.others(x), top.nodes).reshape(_DRAWS, -1).sum(axis=1)
                 for x in ends
             ]
             scores[k] = (two[0] - two[1]) / (ends[0][k] - ends[1][k])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import tomlkit
@@ -58,6 +58,27 @@ def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) ->
             document[name] = table
         for key, value in values.items():
             document[name][key] = value
+
+    return _edited(text, edit)
+
+
+def with_tables(text: str, name: str, tables: Sequence[Mapping[str, Any]], comment: str) -> str:
+    """The text with these as the list of tables of a key such as ``disturbance.model``, in the place of any before."""
+    top, key = name.split(".")
+
+    def edit(document: tomlkit.TOMLDocument) -> None:
+        made = tomlkit.aot()
+        for values in tables:
+            table = tomlkit.table()
+            for each, value in values.items():
+                table[each] = value
+            made.append(table)
+        if tables:
+            made[0].comment(comment)
+        if top not in document:
+            document[top] = tomlkit.table(is_super_table=True)
+        document[top].pop(key, None)
+        document[top][key] = made
 
     return _edited(text, edit)
 
