@@ -42,7 +42,8 @@ def identify(
         ),
     ] = None,
     plant: Annotated[
-        PlantKind, typer.Option(help="Whether the rig file's plant is right, or the kind of plant to fit to the inputs.")
+        PlantKind,
+        typer.Option(help="Whether the rig file's plant is right, or the kind of plant to fit to the inputs."),
     ] = PlantKind.KNOWN,
     noise: Annotated[bool, typer.Option("--noise", help="Fit the pixels' noise too.")] = False,
     kernel: Annotated[bool, typer.Option("--kernel", help="Fit the kernel's width too.")] = False,

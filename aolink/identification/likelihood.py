@@ -1,16 +1,16 @@
 """The likelihood of a recording's readings under a model of the disturbance.
 
 A path theta = r + b + d has the known response r to the inputs, an unknown constant b for each output, and the
-disturbance d, a Gaussian process. In runs of consecutive exposures ("blocks"), with y the means of the path over the
-exposures and s its mean squares about c, as measured,
+disturbance d, a Gaussian process. With y the means of the path over the exposures and s its mean squares about c, as
+measured, p(y, s) = p(y) p(s | y).
 
-    p(y, s) = p(y) p(s | y).
-
-p(y) is Gaussian, exactly, and taken over long runs. Given y the path is Gaussian, with mean m and covariance S, so that s is a quadratic form of
-a Gaussian: E s_j = mean of ((m - c)^2 + diag S), Cov(s_j, s_k) = 2 mean of S^2 + 4 mean of (m - c) S (m - c), means
-over both exposures' steps; its third cumulant is as exact. p(s | y) is taken as gamma distributions of these cumulants, with
-the pixels' noise, joined by the Gaussian copula of their covariance: of a spot that swings several times in an exposure
-the mean square is an exponential variable. That, and that blocks are taken as independent, is all that is not exact. What it costs is found by simulation (`curvature`), and intervals allow for it.
+p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y of a block of consecutive exposures the path
+is Gaussian, with mean m and covariance S, and s is a quadratic form of it: E s_j = mean of ((m - c)^2 + diag S), and
+Cov(s_j, s_k) = 2 mean of S^2 + 4 mean of (m - c) S (m - c), over both exposures' steps; the third cumulant is as exact.
+p(s | y) is taken as gamma distributions of these cumulants, with the pixels' noise, joined by the Gaussian copula of
+their covariance: where a spot swings several times in an exposure, its mean square is an exponential variable. That,
+and that s of a block depends on y of that block alone, is all that is not exact. What it costs is found by simulation
+(`sets`), and the sets allow for it.
 
 Sums over the steps of an exposure are Gauss's quadrature.
 """
@@ -18,6 +18,7 @@ Sums over the steps of an exposure are Gauss's quadrature.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -88,9 +89,7 @@ class Likelihood:
         """The same readings with another response to the inputs, (outputs, slots, N + 1)."""
         return Likelihood(replace(self.seen, response=response), self.length)
 
-    def __call__(
-        self, model: ProcessSum, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None
-    ) -> float:
+    def __call__(self, model: ProcessSum, noise: float = 1.0, wider: float = 0.0, nodes: int | None = None) -> float:
         """Log-likelihood, -inf where the model's covariance is none.
 
         Parameters
@@ -144,22 +143,25 @@ class Likelihood:
                         patterns.setdefault(seen.usable[o, some].tobytes(), []).append((o, some))
             self._blocks[nodes] = [
                 Blocks(
-                    seen.usable[where[0]],
-                    *(np.array([values[at] for at in where]) for values in
-                      (seen.mean, seen.square, seen.square_noise, seen.centre, response)),
-                    np.array([o for o, _ in where]),
+                    usable=seen.usable[where[0]],
+                    mean=_taken(seen.mean, where),
+                    square=_taken(seen.square, where),
+                    square_noise=_taken(seen.square_noise, where),
+                    centre=_taken(seen.centre, where),
+                    response=_taken(response, where),
+                    output=np.array([o for o, _ in where]),
                 )
                 for where in patterns.values()
-            ]  # fmt: skip
+            ]
         return self._blocks[nodes]
 
     def _of_means(self, model: ProcessSum, nodes: int, noise: float, out: FloatArray) -> FloatArray:
         """Add the log-density of each output's means to ``out``; the constants of the outputs that make it largest."""
         rows, weights = self._rule(nodes)
         seen = self.seen
-        at = (rows @ np.arange(seen.n_steps)) * seen.step_s
+        at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
         run = min(_RUN, seen.slots)
-        begin = np.arange(run) * (seen.period_steps * seen.step_s)
+        begin = np.arange(float(run)) * (seen.period_steps * seen.step_s)
         table = np.zeros(run)
         for process in model.processes:
             if process.is_stationary:
@@ -212,12 +214,12 @@ class Likelihood:
     def _joint(self, model: ProcessSum, nodes: int, usable: BoolArray, noise: float) -> _Joint:
         rows, weights = self._rule(nodes)
         seen = self.seen
-        at = (rows @ np.arange(seen.n_steps)) * seen.step_s
-        slots = np.arange(len(usable))
+        at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
+        slots = np.arange(float(len(usable)))
         period = seen.period_steps * seen.step_s
         # Of equal lags only one each, then spread over all pairs of exposures.
         table = _stationary(model, slots * period, at)
-        apart = slots[:, None] - slots
+        apart = (slots[:, None] - slots).astype(np.intp)
         C = table[np.abs(apart)]
         C = np.where((apart >= 0)[:, :, None, None], C, C.swapaxes(2, 3)).swapaxes(1, 2)
         if walk := _walk(model):
@@ -225,6 +227,11 @@ class Likelihood:
             from_walk = walk * np.minimum(times[:, None], times) + _WALK_START * seen.reach**2
             C = C + from_walk.reshape(C.shape)
         return _Joint(np.ascontiguousarray(C), weights, usable, noise * self.mean_noise)
+
+
+def _taken(values: FloatArray, where: Sequence[tuple[int, slice]]) -> FloatArray:
+    """Stretches of equal lengths, each of an output, (stretches, ...)."""
+    return np.array([values[at] for at in where])
 
 
 def _stationary(model: ProcessSum, apart: FloatArray, at: FloatArray) -> FloatArray:
@@ -319,7 +326,9 @@ class _Joint:
         return out
 
 
-def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _shifted_gamma(
+    e: FloatArray, variance: FloatArray, third: FloatArray, read: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Log-density of a gamma variable, shifted to mean zero, with Gaussian noise; and the normal quantile of its value.
 
     Parameters

@@ -1,8 +1,10 @@
 """Models of a disturbance of the slopes: all-pole processes driven by white noise, and sums of them.
 
-All are linear and Gaussian in continuous time: a(d/dt) theta = e, with e white and a(s) = prod_i (s - lambda_i). A random
-walk has the pole zero, an Ornstein-Uhlenbeck process one real pole, a resonance one pair of complex ones, a process of
-second order two real ones. Sampled at the fast rate, they are autoregressive with as many terms as poles.
+All are linear and Gaussian in continuous time: a(d/dt) theta = e, with e white and a(s) = prod_i (s - lambda_i). A
+random walk has the pole zero, an Ornstein-Uhlenbeck process one real pole, a resonance one pair of complex ones, a
+process of second order two real ones. "ar3" and "ar4" have a pair and a real pole, and two pairs. (Autoregressive
+processes of the orders one and two are the Ornstein-Uhlenbeck process, the process of second order and the resonance.)
+They are sampled at the fast rate exactly.
 """
 
 from __future__ import annotations
@@ -34,9 +36,11 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
 standard deviation, slope units; ``correlation_s`` minus the inverse of a real pole, s; ``frequency_hz`` and ``damping``
 the modulus of a pair of poles over 2 pi, Hz, and their damping ratio.
 """
-UNITS: Mapping[str, str] = {"intensity": "slope^2/s", "sd": "slope", "damping": "", "second_damping": ""} | dict.fromkeys(
-    ("frequency_hz", "second_frequency_hz"), "Hz"
-) | dict.fromkeys(("correlation_s", "second_correlation_s"), "s")
+UNITS: Mapping[str, str] = (
+    {"intensity": "slope^2/s", "sd": "slope", "damping": "", "second_damping": ""}
+    | dict.fromkeys(("frequency_hz", "second_frequency_hz"), "Hz")
+    | dict.fromkeys(("correlation_s", "second_correlation_s"), "s")
+)
 _FASTEST = 300.0
 _APART = 1e-4
 """Least distance of two poles, as a share of their modulus: a double pole has no partial fractions."""
@@ -129,8 +133,9 @@ class Process:
         return np.asarray((np.exp(np.outer(apart_s, poles)) @ (self.shares * means[0] * means[1])).real)
 
     def _tamed(self, at_s: FloatArray) -> ComplexArray:
-        """The poles, none of which decays so fast within ``at`` that its inverse is no number: nothing is left of it."""
-        return np.asarray(np.maximum(self.poles.real, -_FASTEST / float(np.ptp(at_s))) + 1j * self.poles.imag)
+        """The poles, none of which decays so fast within ``at`` that its inverse is no number."""
+        fastest = _FASTEST / max(float(np.ptp(at_s)), 1e-12)
+        return np.asarray(np.maximum(self.poles.real, -fastest) + 1j * self.poles.imag)
 
 
 def _pair(omega: float, damping: float) -> list[complex]:
@@ -258,5 +263,7 @@ def kinds_of(name: str) -> tuple[str, ...]:
     """The kinds of a sum such as ``random-walk+resonance``. Raises IdentificationError."""
     kinds = tuple(part.strip() for part in name.split("+"))
     if wrong := [kind for kind in kinds if kind not in PARAMETERS]:
-        raise IdentificationError(f"{wrong[0]!r} is no kind of process: use one of {', '.join(PARAMETERS)}, or sums of them")
+        raise IdentificationError(
+            f"{wrong[0]!r} is no kind of process: use one of {', '.join(PARAMETERS)}, or sums of them"
+        )
     return kinds

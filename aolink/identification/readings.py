@@ -1,9 +1,9 @@
 """What identification takes of each exposure: two weighted sums of the pixels of each slope.
 
-A spot at theta gives a weighted sum g(theta) = sum_i W_i (kernel integrated over pixel i). The weights are those of least
-noise for which g is theta - c, and (theta - c)^2, wherever the spot moves; c is where the spot is expected. So the sums
-are the mean of the path in the exposure and its mean square about c, kernel and pixels taken off, with the noise of the
-pixels that are needed and of no others. They are linear in the pixels: the noise is Gaussian and the means are exact.
+A spot at theta gives a weighted sum g(theta) = sum_i W_i (kernel integrated over pixel i). The weights are those of
+least noise for which g is theta - c, and (theta - c)^2, wherever the spot moves; c is where the spot is expected. So
+the sums are the mean of the path in the exposure and its mean square about c, kernel and pixels taken off, with the
+noise of the pixels that are needed and of no others. They are linear in the pixels, so that their noise is Gaussian.
 """
 
 from __future__ import annotations
@@ -115,7 +115,8 @@ def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = Tru
     """
     if len(exposures) < FEWEST:
         raise IdentificationError(
-            f"{len(exposures)} exposures are too short a recording to identify a model from: {FEWEST} or more are needed"
+            f"{len(exposures)} exposures are too short a recording to identify a model from: {FEWEST} or more are"
+            " needed"
         )
     if any(each.slopes is not None for each in exposures):
         raise IdentificationError("the recording holds slopes and no pixels: identification needs the blur")
@@ -139,14 +140,16 @@ def readings(rig: Rig, exposures: Sequence[Exposure], *, plant_known: bool = Tru
             if found.usable is not None:
                 mask[~np.repeat(found.usable, rig.plant.n_outputs), k] = False
     if mask.any(axis=(0, 2)).sum() < FEWEST:
-        raise IdentificationError(f"{int(mask.any(axis=(0, 2)).sum())} exposures show a spot, {FEWEST} or more are needed")
+        raise IdentificationError(
+            f"{int(mask.any(axis=(0, 2)).sum())} exposures show a spot, {FEWEST} or more are needed"
+        )
     response = np.zeros((rig.n_outputs, slots, n_steps + 1))
     if plant_known:
         response = _response(rig, inputs, slots, n_steps, period, exposures[0].start_offset)
     empty = np.zeros(density.shape[:2])
     blank = Readings(
         step_s=rig.timing.fast_step_s, n_steps=n_steps, period_steps=period, mean=empty, square=empty,
-        mean_noise=empty, square_noise=empty, centre=empty, usable=mask.any(axis=2), response=response,
+        mean_noise=empty, square_noise=empty, centre=empty, usable=np.asarray(mask.any(axis=2)), response=response,
         inputs=np.repeat(inputs, rig.plant.n_outputs, axis=0), offset=exposures[0].start_offset,
         motion=0.0, follows=False,
         reach=(rig.sensor.field[1] - rig.sensor.field[0]) / 2,
@@ -159,7 +162,10 @@ def _inputs(rig: Rig, exposures: Sequence[Exposure], steps: int) -> FloatArray:
     first = exposures[0].first_step
     u = np.full((steps, rig.n_inputs), np.nan)
     for each in exposures:
-        for start, values in ((each.first_step - len(each.lead_inputs), each.lead_inputs), (each.first_step, each.inputs)):
+        for start, values in (
+            (each.first_step - len(each.lead_inputs), each.lead_inputs),
+            (each.first_step, each.inputs),
+        ):
             begin = max(start - first, 0)
             end = min(start - first + len(values), steps)
             if end > begin:

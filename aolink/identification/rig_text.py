@@ -1,4 +1,4 @@
-"""What was identified, written into the text of a rig file: ``[[disturbance.model]]``, and the plant where it is new."""
+"""What was identified, in the text of a rig file: ``[[disturbance.model]]``, and the plant where it is new."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def identified_text(
     text: str, rig: Rig, models: Sequence[ProcessSum], *, plant: IdentifiedPlant | None = None, noise: float = 1.0,
     wider: float = 0.0,
 ) -> str:  # fmt: skip
-    """The text of a rig file with what was identified, which says all that disturbs: the plant's own noise becomes zero.
+    """The text of a rig file with what was identified, all that disturbs: the plant's own noise is zero then.
 
     Parameters
     ----------
@@ -81,7 +81,8 @@ def _as_table(process: Process, step_s: float) -> dict[str, Any]:
     kept = values > values.max() * 1e-12
     return {
         "kind": "matrices",
-        "A": _rows(space.A), "B_w": _rows(vectors[:, kept]), "C": _rows(space.C), "process_noise": values[kept].tolist(),
+        "A": _rows(space.A), "B_w": _rows(vectors[:, kept]), "C": _rows(space.C),
+        "process_noise": values[kept].tolist(),
     }  # fmt: skip
 
 
@@ -94,7 +95,9 @@ def for_outputs(tables: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, An
         own = [[1.0] if k == o else [0.0] for k in range(len(tables))]
         for part in parts:
             if part["kind"] == "matrices":
-                out.append(part | {"C": [row if k == o else [0.0] * len(row) for k in range(len(tables)) for row in part["C"]]})
+                out.append(
+                    part | {"C": [row if k == o else [0.0] * len(row) for k in range(len(tables)) for row in part["C"]]}
+                )
             else:
                 size = {name: [part[name]] for name in ("sd", "step_sd") if name in part}
                 out.append(part | size | {"modes": own})

@@ -21,7 +21,7 @@ BLOCK = 8
 CYCLES = 4.0
 """Highest frequency that is searched, in cycles per exposure."""
 _SPACING = 0.06
-"""Of the grid of frequencies, in cycles per frame period: below the width of what the grid's damping makes a maximum."""
+"""Of the grid of frequencies, in cycles per frame period: below the width of a maximum with the grid's damping."""
 _DECAY = 0.4
 """By how much a resonance of the grid decays in a frame period, in nats."""
 _STARTS = 8
@@ -58,7 +58,9 @@ class Space:
         """Names of the parameters, with the kind before them where there are several processes."""
         several = len(self.kinds) > 1
         names = [
-            f"{kind}{'' if self.kinds.count(kind) == 1 else self.kinds[: k + 1].count(kind)}.{name}" if several else name
+            f"{kind}{'' if self.kinds.count(kind) == 1 else self.kinds[: k + 1].count(kind)}.{name}"
+            if several
+            else name
             for k, kind in enumerate(self.kinds)
             for name in PARAMETERS[kind]
         ]
@@ -152,10 +154,13 @@ def space_of(
         )
     if plant is not None and any(each.inputs.shape[1] != 1 for each in seen):
         raise IdentificationError(
-            f"a plant is identified where one input moves one output, here {one.inputs.shape[1]} inputs move a copy of it"
+            f"a plant is identified where one input moves one output, here {one.inputs.shape[1]} move a copy of it"
         )
-    of_plant = [] if plant is None else [limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span),
-                                                   "damping": (1e-4, 30.0)}]
+    of_plant = (
+        []
+        if plant is None
+        else [limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span), "damping": (1e-4, 30.0)}]
+    )
     bounds = [each[name] for each in of_plant for name in PLANTS[plant or ""]]
     bounds += [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
     bounds += [(0.1, 10.0)] * with_noise + [(0.25, 4.0)] * with_kernel
@@ -200,7 +205,11 @@ def maxima(space: Space, seen: Sequence[Readings], tell: Told | None = None) -> 
     order = np.argsort(values)[::-1]
     chosen: list[FloatArray] = []
     for k in order:
-        if len(chosen) < _STARTS and math.isfinite(values[k]) and not any(_near(space, points[k], o, 0.04) for o in chosen):
+        if (
+            len(chosen) < _STARTS
+            and math.isfinite(values[k])
+            and not any(_near(space, points[k], o, 0.04) for o in chosen)
+        ):
             chosen.append(points[k])
     found: list[Maximum] = []
     for start in chosen:
@@ -260,9 +269,7 @@ def _add(space: Space, found: list[Maximum], new: Maximum) -> None:
     found.append(new)
 
 
-def climb(
-    space: Space, start: FloatArray, of: Sequence[Likelihood], enough: float = 1e-3
-) -> Maximum:
+def climb(space: Space, start: FloatArray, of: Sequence[Likelihood], enough: float = 1e-3) -> Maximum:
     """The local maximum that a start leads to, to ``enough`` nats."""
     nodes = max(each.nodes(space.model(start)) for each in of)
     nodes += 4 if nodes < of[0].seen.n_steps - 4 else 0
@@ -277,8 +284,12 @@ def climb(
     here, scale = cost(at), np.empty(len(at))
     for k, step in enumerate(_STEP * np.eye(len(at))):
         scale[k] = min(1 / math.sqrt(max(cost(at + step) + cost(at - step) - 2 * here, 0.0) / _STEP**2 + 1), 1.0)
+
+    def whitened(u: FloatArray) -> float:
+        return cost(at + u * scale)
+
     done = optimize.minimize(
-        lambda u: cost(at + u * scale), np.zeros(len(at)), method="L-BFGS-B",
+        whitened, np.zeros(len(at)), method="L-BFGS-B",
         bounds=list(zip((low - at) / scale, (high - at) / scale, strict=True)),
         options={"maxiter": 60, "eps": 1e-3, "ftol": enough / max(abs(here), 1.0)},
     )  # fmt: skip

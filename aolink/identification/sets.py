@@ -1,4 +1,4 @@
-"""What is identified: for each parameter a set that has the truth with a probability of 95 %, perhaps in several pieces.
+"""What is identified: for each parameter a set that holds the truth with a probability of 95 %, in one or more pieces.
 
 The set is that of the values whose profile log-likelihood, the highest with that value, is below the highest of all by
 less than 1.92 a. With the true likelihood a = 1 (Wilks). `likelihood` takes exposures that depend on each other for
@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from aolink.identification.likelihood import Likelihood
-from aolink.identification.models import ProcessSum
 from aolink.identification.readings import Readings
 from aolink.identification.search import BLOCK, Maximum, Space
 from aolink.identification.simulate import simulated
@@ -95,7 +94,7 @@ def identified(
 
 
 def _allowed(space: Space, top: Maximum, other: Maximum, seen: Sequence[Readings]) -> float:
-    """By how much ``other`` may be below the highest maximum if it is the truth, nats: one time in twenty it is more."""
+    """By how much ``other`` may be below the highest maximum if it is the truth, nats; rarely (1 in 20) it is more."""
     below = np.zeros(_DRAWS)
     for number, each in enumerate(seen):
         noise, _ = space.others(other.x)
@@ -166,7 +165,10 @@ def _factors(space: Space, top: Maximum, seen: Sequence[Readings], H: FloatArray
             h = 0.1 / math.sqrt(H[k, k])
             ends = [np.clip(top.x + sign * h * np.eye(n)[k], low, high) for sign in (1, -1)]
             two = [
-                space.driven(x, likelihood, _DRAWS).of_outputs(space.model(x), *space.others(x), top.nodes).reshape(_DRAWS, -1).sum(axis=1)
+                space.driven(x, likelihood, _DRAWS)
+                .of_outputs(space.model(x), *space.others(x), top.nodes)
+                .reshape(_DRAWS, -1)
+                .sum(axis=1)
                 for x in ends
             ]
             scores[k] = (two[0] - two[1]) / (ends[0][k] - ends[1][k])
@@ -176,9 +178,7 @@ def _factors(space: Space, top: Maximum, seen: Sequence[Readings], H: FloatArray
     return np.maximum(ratio, 1.0)
 
 
-def _piece(
-    space: Space, at: Maximum, k: int, least: float, of: Sequence[Likelihood], H: FloatArray
-) -> Piece:
+def _piece(space: Space, at: Maximum, k: int, least: float, of: Sequence[Likelihood], H: FloatArray) -> Piece:
     """The interval of parameter ``k`` about a local maximum in which the profile is above ``least``."""
     others = [j for j in range(len(at.x)) if j != k]
     follow = -np.linalg.solve(H[np.ix_(others, others)], H[others, k]) if others else np.zeros(0)
@@ -195,9 +195,7 @@ def _piece(
             moved = min(inside + step, abs(bound - at.x[k]))
             start = x.copy()
             start[k] = at.x[k] + sign * moved
-            start[others] = np.clip(
-                x[others] + follow * (start[k] - x[k]), *np.array(space.bounds)[others].T
-            )
+            start[others] = np.clip(x[others] + follow * (start[k] - x[k]), *np.array(space.bounds)[others].T)
             there, value = _highest(space, at, start, others, H, of)
             loss = at.log_likelihood - value
             if abs(loss - depth) < _CLOSE:
@@ -215,7 +213,13 @@ def _piece(
             else:
                 outside = moved
                 slope = (math.sqrt(loss) - math.sqrt(loss_inside)) / (outside - inside)
-                step = float(np.clip((math.sqrt(depth) - math.sqrt(loss_inside)) / slope, 0.1 * (outside - inside), 0.9 * (outside - inside)))
+                step = float(
+                    np.clip(
+                        (math.sqrt(depth) - math.sqrt(loss_inside)) / slope,
+                        0.1 * (outside - inside),
+                        0.9 * (outside - inside),
+                    )
+                )
         ends.append(math.exp(at.x[k] + sign * moved))
         opens.append(opened)
     return Piece(ends[0], ends[1], math.exp(at.x[k]), *opens)
@@ -224,7 +228,7 @@ def _piece(
 def _highest(
     space: Space, at: Maximum, start: FloatArray, others: list[int], H: FloatArray, of: Sequence[Likelihood]
 ) -> tuple[FloatArray, float]:
-    """Where the likelihood is highest in the other parameters, and how high, by Newton's method with the curvature H."""
+    """Where the likelihood is highest in the other parameters, and how high, by Newton's method with curvature H."""
     x, value = start, _value(space, at, start, of)
     if not others:
         return x, value

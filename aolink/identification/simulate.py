@@ -30,9 +30,8 @@ def simulated(seen: Readings, model: ProcessSum, count: int, seed: int, noise: f
     stride = seen.n_steps // points
     response = seen.response[:, :, :-1].reshape(outputs, seen.slots, points, stride).mean(axis=3)
     paths = _paths(seen, model, count * outputs, points, random) + np.tile(response, (count, 1, 1))
-    mean_noise, square_noise, usable = (
-        np.tile(each, (count, 1)) for each in (noise * seen.mean_noise, noise * seen.square_noise, seen.usable)
-    )
+    mean_noise, square_noise = (noise * np.tile(each, (count, 1)) for each in (seen.mean_noise, seen.square_noise))
+    usable = np.tile(seen.usable, (count, 1))
     mean = paths.mean(axis=2) + np.sqrt(mean_noise) * random.standard_normal(mean_noise.shape)
     expected = np.tile(response.mean(axis=2), (count, 1))
     if seen.follows:
@@ -54,9 +53,7 @@ def _points(seen: Readings, model: ProcessSum) -> int:
     return next(n for n in range(1, seen.n_steps + 1) if seen.n_steps % n == 0 and (n >= wanted or n == seen.n_steps))
 
 
-def _paths(
-    seen: Readings, model: ProcessSum, count: int, points: int, random: np.random.Generator
-) -> FloatArray:
+def _paths(seen: Readings, model: ProcessSum, count: int, points: int, random: np.random.Generator) -> FloatArray:
     """Disturbances at the middles of equal parts of the exposures, (count, slots, points)."""
     stride = seen.n_steps // points
     space = model.state_space(stride * seen.step_s)

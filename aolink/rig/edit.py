@@ -63,7 +63,7 @@ def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) ->
 
 
 def with_tables(text: str, name: str, tables: Sequence[Mapping[str, Any]], comment: str) -> str:
-    """The text with these as the list of tables of a key such as ``disturbance.model``, in the place of any before."""
+    """The text with these as the list of tables of a key such as ``disturbance.model``, in the place of any before; at least one."""
     top, key = name.split(".")
 
     def edit(document: tomlkit.TOMLDocument) -> None:
@@ -73,14 +73,14 @@ def with_tables(text: str, name: str, tables: Sequence[Mapping[str, Any]], comme
             for each, value in values.items():
                 table[each] = value
             made.append(table)
-        if tables:
-            made[0].comment(comment)
+        made[0].comment(comment)
         if top not in document:
             document[top] = tomlkit.table(is_super_table=True)
         document[top].pop(key, None)
         document[top][key] = made
 
-    return _edited(text, edit)
+    new = _edited(text, edit)
+    return new if new.endswith("\n") else f"{new}\r\n" if "\r\n" in new else f"{new}\n"
 
 
 def _edited(text: str, edit: Callable[[tomlkit.TOMLDocument], None]) -> str:
