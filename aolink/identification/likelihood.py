@@ -5,12 +5,12 @@ disturbance d, a Gaussian process. With y the means of the path over the exposur
 measured, p(y, s) = p(y) p(s | y).
 
 p(y) is Gaussian, exactly, and taken over long runs of exposures. Given y of a block of consecutive exposures the path
-is Gaussian, with mean m and covariance S, and s is a quadratic form of it: E s_j = mean of ((m - c)^2 + diag S), and
-Cov(s_j, s_k) = 2 mean of S^2 + 4 mean of (m - c) S (m - c), over both exposures' steps; the third cumulant is as exact.
-p(s | y) is taken as gamma distributions of these cumulants, with the pixels' noise, joined by the Gaussian copula of
-their covariance: where a spot swings several times in an exposure, its mean square is an exponential variable. That,
-and that s of a block depends on y of that block alone, is all that is not exact. What it costs is found by simulation
-(`sets`), and the sets allow for it.
+is Gaussian, with mean m and covariance S, and each s_j is a quadratic form of it: its mean is that of (m - c)^2 + diag
+S over the exposure's steps, its variance that of 2 S^2 + 4 (m - c) S (m - c) over pairs of them, and its third cumulant
+is as exact. p(s | y) is taken as the product of gamma distributions of these cumulants, with the pixels' noise: where a
+spot swings several times in an exposure, its mean square is an exponential variable. So it is a composite likelihood:
+each factor is right or nearly so, and that given y the mean squares still depend on each other is left out. What that
+costs is found by simulation (`sets`), and the sets allow for it.
 
 Sums over the steps of an exposure are Gauss's quadrature.
 """
@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from scipy import linalg, special
@@ -112,8 +111,8 @@ class Likelihood:
         try:
             constants = self._of_means(model, nodes, noise, out)
             for each in self._groups(nodes):
-                joint = self._joint(model, nodes, each.usable, noise)
-                np.add.at(out, each.output, joint.log_densities(each, constants[each.output], noise, wider))
+                given = self._given_means(model, nodes, each.usable, noise)
+                np.add.at(out, each.output, given.log_densities(each, constants[each.output], noise, wider))
         except linalg.LinAlgError:
             return np.full(len(out), -math.inf)
         return out if np.isfinite(out).all() else np.full(len(out), -math.inf)
@@ -211,22 +210,23 @@ class Likelihood:
             ]  # fmt: skip
         return self._means[nodes]
 
-    def _joint(self, model: ProcessSum, nodes: int, usable: BoolArray, noise: float) -> _Joint:
+    def _given_means(self, model: ProcessSum, nodes: int, usable: BoolArray, noise: float) -> _GivenMeans:
         rows, weights = self._rule(nodes)
         seen = self.seen
         at = np.asarray(rows @ np.arange(float(seen.n_steps))) * seen.step_s
-        slots = np.arange(float(len(usable)))
-        period = seen.period_steps * seen.step_s
-        # Of equal lags only one each, then spread over all pairs of exposures.
-        table = _stationary(model, slots * period, at)
-        apart = (slots[:, None] - slots).astype(np.intp)
-        C = table[np.abs(apart)]
-        C = np.where((apart >= 0)[:, :, None, None], C, C.swapaxes(2, 3)).swapaxes(1, 2)
+        begin = np.arange(float(len(usable))) * (seen.period_steps * seen.step_s)
+        table = _stationary(model, begin, at)
+        # Cov(y_i, path_j) depends on i - j alone, and on which of them is later.
+        apart = np.arange(len(usable))[:, None] - np.arange(len(usable))
+        earlier, later = (np.tensordot(weights, table, axes=(0, axis)) for axis in (2, 1))
+        with_means = np.where((apart > 0)[:, :, None], later[np.abs(apart)], earlier[np.abs(apart)])
+        own = np.broadcast_to(table[0], (len(usable), *table.shape[1:]))
         if walk := _walk(model):
-            times = (slots[:, None] * period + at).ravel()
-            from_walk = walk * np.minimum(times[:, None], times) + _WALK_START * seen.reach**2
-            C = C + from_walk.reshape(C.shape)
-        return _Joint(np.ascontiguousarray(C), weights, usable, noise * self.mean_noise)
+            times = begin[:, None] + at
+            shared = np.minimum(times[:, :, None, None], times) + _WALK_START * seen.reach**2 / walk
+            with_means = with_means + walk * np.tensordot(weights, shared, axes=(0, 1))
+            own = own + walk * np.einsum("jajb->jab", shared)
+        return _GivenMeans(with_means, own, weights, usable, noise * self.mean_noise)
 
 
 def _taken(values: FloatArray, where: Sequence[tuple[int, slice]]) -> FloatArray:
@@ -252,84 +252,54 @@ def _walk(model: ProcessSum) -> float:
     return sum(process["intensity"] for process in model.processes if not process.is_stationary)
 
 
-class _Joint:
-    """A block's path and readings as the model has them.
+class _GivenMeans:
+    """The path in a block of exposures, given its means over them.
 
     Parameters
     ----------
-    C:
-        Covariance of the path at the nodes, (L, nodes, L, nodes).
+    with_means:
+        Cov(y_i, path in exposure j), (L, L, nodes).
+    own:
+        Covariance of the path in each exposure, (L, nodes, nodes).
     """
 
-    def __init__(self, C: FloatArray, weights: FloatArray, usable: BoolArray, mean_noise: float) -> None:
-        L, K = C.shape[:2]
+    def __init__(
+        self, with_means: FloatArray, own: FloatArray, weights: FloatArray, usable: BoolArray, mean_noise: float
+    ) -> None:  # fmt: skip
         self.weights, self.good = weights, np.flatnonzero(usable)
-        over = np.tensordot(weights, C, axes=(0, 1))[self.good]  # Cov(y_j, path), (good, L, K)
-        sigma = (over @ weights)[:, self.good]
+        over = with_means[np.ix_(self.good, self.good)]
+        sigma = over @ weights
         sigma[np.diag_indices(len(sigma))] += mean_noise
         self.root = linalg.cholesky(sigma, lower=True, check_finite=False)
-        flat = over.reshape(len(self.good), L * K)
-        self.gain = linalg.solve_triangular(self.root, flat, lower=True, check_finite=False)
-        self.S = C.reshape(L * K, L * K) - self.gain.T @ self.gain
-        self.shape = (L, K)
-
-    @cached_property
-    def _from_variance(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """What S alone adds to the mean squares' mean (good,), covariance (good, good) and third cumulant (good,).
-
-        Before the last: S of each exposure with itself, weighted, (good, nodes, nodes).
-        """
-        w, (L, K) = self.weights, self.shape
-        diagonal = np.einsum("ii->i", self.S).reshape(L, K)[self.good] @ w
-        squares = (self.S * self.S).reshape(L, K, L, K)
-        spread = np.tensordot(np.tensordot(squares, w, axes=(3, 0)), w, axes=(1, 0))
-        root_w = np.sqrt(w)
-        own = self.S.reshape(L, K, L, K)[self.good, :, self.good] * root_w[:, None] * root_w
-        cubes = 8 * np.einsum("jab,jba->j", own @ own, own)
-        return diagonal, 2 * spread[np.ix_(self.good, self.good)], own, cubes
+        flat = over.reshape(len(self.good), -1)
+        gain = linalg.solve_triangular(self.root, flat, lower=True, check_finite=False)
+        self.gain = gain.reshape(over.shape)
+        S = own[self.good] - np.einsum("ija,ijb->jab", self.gain, self.gain, optimize=True)
+        root_w = np.sqrt(weights)
+        self.S = S * root_w[:, None] * root_w
+        """S of each exposure with the roots of the nodes' weights on both sides, (good, nodes, nodes)."""
 
     def log_densities(self, data: Blocks, constants: FloatArray, noise: float, wider: float) -> FloatArray:
-        """Log-density of each block's mean squares, given its means, (blocks,); ``constants`` b of each block."""
-        good, w = self.good, self.weights
+        """Log-density of each block's mean squares, (blocks,); ``constants`` b of each block."""
+        good, w, S = self.good, self.weights, self.S
         y = data.mean - data.response @ w + data.centre - constants[:, None]
         white = linalg.solve_triangular(self.root, y[:, good].T, lower=True, check_finite=False)
-        return self._squares(data, white, constants, noise, wider)
-
-    def _squares(self, data: Blocks, white: FloatArray, b: FloatArray, noise: float, wider: float) -> FloatArray:
-        L, K = self.shape
-        good, w = self.good, self.weights
-        m = (white.T @ self.gain).reshape(-1, L, K) + data.response + b[:, None, None] - data.centre[:, :, None]
-        diagonal, spread, own, cubes = self._from_variance
-        expected = (m[:, good] ** 2) @ w + diagonal + wider
-        measured, read = data.square[:, good], noise * data.square_noise[:, good]
-        out = np.empty(len(expected))
-        S = self.S.reshape(L, K, L * K)[good]
-        wm = (m * w)[:, good]
-        root_w = np.sqrt(w)
-        for first in range(0, len(out), _AT_ONCE):
-            some = slice(first, first + _AT_ONCE)
-            rows = np.matmul(wm[some].swapaxes(0, 1), S).reshape(len(good), -1, L, K)[:, :, good]
-            cross = np.einsum("jbkn,bkn->bjk", rows, wm[some], optimize=False)
-            V = spread + 4 * cross
-            variance = np.einsum("bjj->bj", V)
-            pushed = np.matmul(own, (m[some][:, good] * root_w)[..., None])[..., 0]
-            third = cubes + 24 * (pushed**2).sum(axis=2)
-            density, z = _shifted_gamma(measured[some] - expected[some], variance, third, read[some])
-            # Gaussian copula: the correlation of what is measured, noise and all.
-            sd = np.sqrt(variance + read[some])
-            C = V / (sd[:, :, None] * sd[:, None, :])
-            C[:, np.arange(len(good)), np.arange(len(good))] = 1.0
-            root = np.linalg.cholesky(C)
-            left = np.linalg.solve(root, z[:, :, None])[..., 0]
-            joint = -0.5 * (left**2).sum(axis=1) - np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-            out[some] = density.sum(axis=1) + joint + 0.5 * (z**2).sum(axis=1)
+        m = np.tensordot(white.T, self.gain, axes=1) + data.response[:, good]
+        m = (m + (constants[:, None] - data.centre[:, good])[:, :, None]) * np.sqrt(w)
+        pushed = np.matmul(S, m[..., None])[..., 0]
+        first = (m * m).sum(axis=2) + np.einsum("jaa->j", S) + wider
+        second = 4 * (m * pushed).sum(axis=2) + 2 * (S * S).sum(axis=(1, 2))
+        third = 24 * (pushed**2).sum(axis=2) + 8 * ((S @ S) * S).sum(axis=(1, 2))
+        out = np.empty(len(first))
+        for begin in range(0, len(out), _AT_ONCE):
+            some = slice(begin, begin + _AT_ONCE)
+            e, read = data.square[some][:, good] - first[some], noise * data.square_noise[some][:, good]
+            out[some] = _shifted_gamma(e, second[some], third[some], read).sum(axis=1)
         return out
 
 
-def _shifted_gamma(
-    e: FloatArray, variance: FloatArray, third: FloatArray, read: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Log-density of a gamma variable, shifted to mean zero, with Gaussian noise; and the normal quantile of its value.
+def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read: FloatArray) -> FloatArray:
+    """Log-density of a gamma variable, shifted to mean zero, with Gaussian noise.
 
     Parameters
     ----------
@@ -355,9 +325,7 @@ def _shifted_gamma(
     u = (e / sd)[..., None] - places
     bell = np.exp(-0.5 * (u / width) ** 2)
     density = (mass * bell / width).sum(axis=-1) / math.sqrt(2 * math.pi)
-    share = (mass * special.ndtr(u / width)).sum(axis=-1) / mass.sum(axis=-1)
     # Far outside it falls off as a Gaussian of the whole variance does, not to nothing.
     whole = 1 + read / variance
     rare = _RARE * np.exp(-0.5 * (e / sd) ** 2 / (_WIDE**2 * whole)) / np.sqrt(2 * math.pi * _WIDE**2 * whole)
-    z = special.ndtri(np.clip(share, 1e-6, 1 - 1e-6))
-    return np.log((1 - _RARE) * density + rare) - np.log(sd), z
+    return np.asarray(np.log((1 - _RARE) * density + rare) - np.log(sd))

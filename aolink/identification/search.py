@@ -16,8 +16,8 @@ from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Pr
 from aolink.identification.readings import Readings, by_slot
 from aolink.numerics.arrays import FloatArray
 
-BLOCK = 8
-"""Exposures in a block: more of them tell little more, and take longer by the square."""
+BLOCK = 16
+"""Exposures in a block: more of them tell little more, and take longer."""
 CYCLES = 4.0
 """Highest frequency that is searched, in cycles per exposure."""
 _SPACING = 0.06

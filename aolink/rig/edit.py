@@ -63,7 +63,7 @@ def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) ->
 
 
 def with_tables(text: str, name: str, tables: Sequence[Mapping[str, Any]], comment: str) -> str:
-    """The text with these as the list of tables of a key such as ``disturbance.model``, in the place of any before; at least one."""
+    """The text with these tables, at least one, as those of a key such as ``disturbance.model``; old ones go."""
     top, key = name.split(".")
 
     def edit(document: tomlkit.TOMLDocument) -> None:
