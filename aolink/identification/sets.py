@@ -77,7 +77,11 @@ def identified(
     factors = _factors(space, top, seen, curvature)
     found = found[:_MOST]
     allowed = [0.0, *(_allowed(space, top, each, seen) for each in found[1:])]
-    curvatures = [curvature] + [np.zeros(0)] * (len(found) - 1)
+    curvatures, own = [curvature], [factors]
+    for number, each in enumerate(found[1:], 1):
+        near = top.log_likelihood - each.log_likelihood < max(QUANTILE / 2 * factors.max(), allowed[number])
+        curvatures.append(_curvature(space, each, of) if near else curvature)
+        own.append(_factors(space, each, seen, curvatures[-1]) if near else factors)
     out = []
     for k, name in enumerate(space.names):
         if tell:
@@ -86,8 +90,8 @@ def identified(
         for number, each in enumerate(found):
             least = top.log_likelihood - max(QUANTILE / 2 * factors[k], allowed[number])
             if each.log_likelihood > least:
-                if not curvatures[number].size:
-                    curvatures[number] = _curvature(space, each, of)
+                # An alias that may be the truth is as uncertain as its own curvature and factor make it.
+                least = min(least, each.log_likelihood - QUANTILE / 2 * own[number][k])
                 pieces.append(_piece(space, each, k, least, of, curvatures[number]))
         out.append(Identified(name, math.exp(top.x[k]), _joined(pieces), float(factors[k])))
     return tuple(out)
