@@ -163,7 +163,7 @@ def space_of(
     )
     bounds = [each[name] for each in of_plant for name in PLANTS[plant or ""]]
     bounds += [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
-    bounds += [(0.1, 10.0)] * with_noise + [(0.25, 4.0)] * with_kernel
+    bounds += [(0.01, 100.0)] * with_noise + [(0.25, 4.0)] * with_kernel
     return Space(
         tuple(kinds), with_noise, with_kernel, kernel_variance,
         tuple((math.log(low), math.log(high)) for low, high in bounds), plant, _sign(seen) if plant else 1.0,

@@ -7,7 +7,9 @@ import pytest
 
 from aolink.jobs.demo import simulated_rig
 from aolink.rig import load_rig
+from aolink.rig.disturbance import Disturbance, DisturbanceModel
 from aolink.session import record
+from tests.kinds import must_be
 
 REFERENCE = Path(__file__).parents[2] / "recordings"
 
@@ -26,7 +28,7 @@ def test_a_model_goes_into_a_rig_file(aolink, shaken, tmp_path):
     told = json.loads(done.stdout)["outputs"][0]
     assert told["exposures"] == 24
     assert set(told["parameters"]) == {"correlation_s", "intensity"}
-    model = load_rig(out).disturbance.model
+    model = must_be(DisturbanceModel, must_be(Disturbance, load_rig(out).disturbance).model)
     assert model.A.shape == (1, 1)
     variance = told["parameters"]["intensity"]["value"] * told["parameters"]["correlation_s"]["value"] / 2
     assert model.initial_covariance[0, 0] == pytest.approx(variance, rel=1e-3)

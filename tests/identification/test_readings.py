@@ -8,13 +8,14 @@ import pytest
 import aolink
 from aolink.errors import IdentificationError
 from aolink.identification import readings
+from tests.kinds import truth_of
 
 
 @pytest.mark.parametrize("name", ["jitter", "section-vi-lively", "tip-tilt"])
 def test_readings_are_right_to_their_noise(name):
     exposures = aolink.simulate(name, 60, seed=3)
     seen = readings(exposures.rig, list(exposures))
-    path = np.array([each.truth.path for each in exposures]).swapaxes(0, 1) - seen.centre[:, :, None]
+    path = np.array([truth_of(each).path for each in exposures]).swapaxes(0, 1) - seen.centre[:, :, None]
     for value, true, noise in (
         (seen.mean, path.mean(axis=2), seen.mean_noise),
         (seen.square, (path**2).mean(axis=2), seen.square_noise),
@@ -29,7 +30,7 @@ def test_the_response_is_that_of_the_plant_over_all_exposures():
     quiet = aolink.rig.parse_rig(exposures.rig.toml.replace("process_noise = 10 ", "process_noise = 1e-12 "))
     still = aolink.simulate(quiet, 30, seed=3)
     seen = readings(exposures.rig, list(exposures))
-    expected = np.array([each.truth.path for each in still]).swapaxes(0, 1)
+    expected = np.array([truth_of(each).path for each in still]).swapaxes(0, 1)
     np.testing.assert_allclose(seen.response[:, :, :-1], expected, atol=1e-4)
 
 

@@ -5,6 +5,8 @@ import pytest
 
 from aolink.identification import IdentifiedPlant, Process, ProcessSum, identified_text
 from aolink.rig import load_rig, parse_rig
+from aolink.rig.disturbance import Disturbance, DisturbanceModel
+from tests.kinds import must_be
 
 PROCESSES = [
     Process("random-walk", (0.3,)),
@@ -15,9 +17,14 @@ PROCESSES = [
 ]
 
 
+def model_of(rig):
+    """What a rig file says of its disturbance."""
+    return must_be(DisturbanceModel, must_be(Disturbance, rig.disturbance).model)
+
+
 def lagged(rig, output, lags):
     """Covariances of the disturbance that a rig file has in its model, or of its steps for a walk."""
-    model = rig.disturbance.model
+    model = model_of(rig)
     Q = model.B_w @ model.process_noise @ model.B_w.T
     C = model.C[output]
     if np.abs(np.linalg.eigvals(model.A)).max() > 1 - 1e-9:
@@ -47,7 +54,7 @@ def test_each_output_has_its_own():
         ProcessSum((Process("ar3", (3.0, 0.1, 0.02, 0.1)), Process("random-walk", (0.1,)))),
     ]
     made = parse_rig(identified_text(rig.toml, rig, models))
-    C = made.disturbance.model.C
+    C = model_of(made).C
     assert C.shape == (2, 6)
     assert (C != 0).sum(axis=0).max() == 1
     assert lagged(parse_rig(identified_text(rig.toml, rig, [models[0], models[0]])), 1, [0]) == pytest.approx([4e-4])
