@@ -14,7 +14,7 @@ from scipy import stats
 import aolink
 from aolink.identification import Process, ProcessSum, identified, maxima, readings, space_of
 from aolink.rig import Rig, parse_rig
-from bench_rows.row import Effort, Row
+from bench_rows.row import FULL, Effort, Row
 
 _KINDS = (
     "resonance", "ornstein-uhlenbeck", "random-walk", "ornstein-uhlenbeck+resonance", "resonance", "second-order",
@@ -108,7 +108,7 @@ def held(seed: int) -> dict[str, bool]:
 
 def coverage(effort: Effort) -> list[Row]:
     """The share of the 95 % sets that hold the truth, against the least share that chance explains (1 in 40)."""
-    count = effort.of(200, least=1)
+    count = 200 if effort == FULL else 1
     with ProcessPoolExecutor() as pool:
         logs = list(pool.map(held, range(_FIRST_SEED, _FIRST_SEED + count)))
     return list(_rows(logs))
