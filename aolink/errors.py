@@ -85,3 +85,9 @@ class ControlError(AolinkError):
     """A controller that does not exist, cannot work on this rig, or whose loop would be unstable."""
 
     exit_code = 13
+
+
+class IdentificationError(AolinkError):
+    """A model that cannot be identified: not from this recording, or not of this kind."""
+
+    exit_code = 14

@@ -135,6 +135,8 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with simulated_rig(folder / "my.toml") as ports:
         record(rig, *ports, folder / "session.mcap", estimators=["o3"], exposures=12)
         shutil.copy(folder / "session.mcap", folder / "again.mcap")
+    with simulated_rig("jitter") as ports:
+        record(load_rig("jitter"), *ports, folder / "shaken.mcap", exposures=32)
     for part in ("001", "002"):
         with simulated_rig(folder / "my.toml") as ports:
             record(rig, *ports, folder / f"session-{part}.mcap", exposures=4)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli import calibration, exchange, films, look, recordings, restore, rigs  # noqa: F401  their commands
+from aolink.cli import calibration, exchange, films, identify, look, recordings, restore, rigs  # noqa: F401  their commands
 from aolink.cli.common import app, stderr
 from aolink.errors import AolinkError
 from aolink.signals import ending_the_command
