@@ -79,3 +79,15 @@ class ExportError(AolinkError):
     """Exposures that cannot be given to another program in the form asked for."""
 
     exit_code = 12
+
+
+class ControlError(AolinkError):
+    """A controller that does not exist, cannot work on this rig, or whose loop would be unstable."""
+
+    exit_code = 13
+
+
+class IdentificationError(AolinkError):
+    """A model that cannot be identified: not from this recording, or not of this kind."""
+
+    exit_code = 14

@@ -7,7 +7,7 @@ tell which.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import overload
 
@@ -141,3 +141,9 @@ def step_shares(n_steps: int, offset: float) -> NDArray[np.float64]:
         return shares
     shares[0] *= 1 - offset
     return np.append(shares, offset / n_steps)
+
+
+def residual_rms(series: Iterable[Exposure]) -> float:
+    """Root mean square of the true slopes at each fast step, slope units; NaN without truth."""
+    squares = [float(np.mean(each.truth.path**2)) for each in series if each.truth is not None]
+    return float(np.sqrt(np.mean(squares))) if squares else float("nan")

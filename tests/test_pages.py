@@ -99,7 +99,7 @@ def code_blocks(page: Path) -> Iterator[CodeBlock]:
 BLOCKS = [block for page in PAGES for block in code_blocks(page)]
 NO_CODE = {
     "estimator   RMSE start": "test_demo_figures.py runs the demo and compares",
-    "errors, files, signals": "test_the_architecture_names_what_there_is",
+    "errors, files, limits, signals": "test_the_architecture_names_what_there_is",
     "Copyright (c)": "a licence",
 }
 """How indented blocks begin that are no commands, and what holds them."""
@@ -128,13 +128,15 @@ def commands(block: CodeBlock) -> Iterator[str]:
 def laboratory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all the files that the pages' commands speak of."""
     folder = tmp_path_factory.mktemp("laboratory")
-    rigs = Path(load_rig("section-vi").folder)
+    rigs = load_rig("section-vi").path_of("", "")
     shutil.copytree(rigs, folder / "aolink" / "rigs")
     shutil.copy(rigs / "section-vi.toml", folder / "my.toml")  # as README begins with
     rig = load_rig(folder / "my.toml")
     with simulated_rig(folder / "my.toml") as ports:
         record(rig, *ports, folder / "session.mcap", estimators=["o3"], exposures=12)
         shutil.copy(folder / "session.mcap", folder / "again.mcap")
+    with simulated_rig("jitter") as ports:
+        record(load_rig("jitter"), *ports, folder / "shaken.mcap", exposures=32)
     for part in ("001", "002"):
         with simulated_rig(folder / "my.toml") as ports:
             record(rig, *ports, folder / f"session-{part}.mcap", exposures=4)
@@ -242,7 +244,7 @@ def test_every_block_is_of_a_kind_that_is_tried() -> None:
 
 def test_the_architecture_names_what_there_is() -> None:
     """The list of subpackages: each of its names is a module or a folder, and every one of them is in it."""
-    (block,) = [block for block in BLOCKS if block.text.startswith("errors, files, signals")]
+    (block,) = [block for block in BLOCKS if block.text.startswith("errors, files, limits, signals")]
     named = {name for line in block.text.splitlines() for name in re.split(r", ", re.split(r" {2,}", line)[0])}
     there = {path.stem for path in (ROOT / "aolink").iterdir() if path.suffix == ".py" or path.is_dir()}
     assert named == there - {"__init__", "__main__", "__pycache__"}

@@ -9,7 +9,17 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli import calibration, exchange, figures, films, look, recordings, restore, rigs  # noqa: F401  their commands
+from aolink.cli import (  # noqa: F401  their commands
+    calibration,
+    exchange,
+    figures,
+    films,
+    identify,
+    look,
+    recordings,
+    restore,
+    rigs,
+)
 from aolink.cli.common import app, stderr
 from aolink.errors import AolinkError
 from aolink.signals import ending_the_command
@@ -37,6 +47,9 @@ def main() -> None:
     except AolinkError as error:
         stderr.print(f"aolink: {escape(str(error))}")
         sys.exit(error.exit_code)
+    except MemoryError:
+        stderr.print("aolink: this needs more memory than there is: take a part of the recording, or fewer axes")
+        sys.exit(AolinkError.exit_code)
     except OSError as error:  # a file or a folder that no message of ours thought of, as the one for temporary files
         what = f"{error.filename}: " if error.filename else ""
         stderr.print(f"aolink: {what}{(error.strerror or str(error)).lower()}", markup=False)

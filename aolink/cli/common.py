@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
-from aolink.cli.terminal import progress_bar
+from aolink.cli.terminal import PlainConsole, progress_bar
 from aolink.errors import EstimatorError, RigError
 
 if TYPE_CHECKING:
@@ -30,8 +29,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     help="A logged hardware-in-the-loop pipeline for adaptive optics and any loop closed through a slow camera.",
 )
-stdout = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
-stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+stdout = PlainConsole(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 120)
+stderr = PlainConsole(stderr=True, highlight=False, soft_wrap=True)
 
 RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a rig that comes with aolink.")]
 FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]

@@ -263,6 +263,16 @@ def record(
         Light | None,
         typer.Option(help="Record frames of this light for `aolink calibrate`; the mirror stays parked."),
     ] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Close the loop with this controller, integrator, lqg or another package's; the first -e serves it.",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --control: also a loop that is unstable by the model.")
+    ] = False,
     view: Annotated[
         bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
     ] = False,
@@ -281,7 +291,7 @@ def record(
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Record a session: play the rig's drive, record everything, estimate online.
+    """Record a session: play the rig's drive, or close the loop; record everything, estimate online.
 
     In real time an estimator that is slower than the camera skips exposures; the recording has them all.
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
@@ -294,6 +304,8 @@ def record(
         split_bytes=round(split_mib * 2**20), split_s=split_s,
     )  # fmt: skip
     loaded = load_checked(rig)
+    if force and not control:
+        raise typer.BadParameter("--force is for --control")
     if exposures is not None and duration is not None:
         raise typer.BadParameter("give --exposures or --duration, not both")
     if duration is not None:
@@ -306,13 +318,15 @@ def record(
 
     def told(done: int) -> None:
         skipped = report.exposures_skipped.items()
-        tell(done, "skipped: " + ", ".join(f"{name} {n}" for name, n in skipped) if skipped else "")
+        notes = ["skipped: " + ", ".join(f"{name} {n}" for name, n in skipped)] if skipped else []
+        tell(done, "; ".join([*notes, *([report.control.note] if report.control else [])]))
 
     with _live_view(loaded, estimator or [], shown=view) as live:
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
-                calibration=calibration or "", watch=live.show if live else None, overwrite=overwrite,
+                calibration=calibration or "", control=control or "", force=force,
+                watch=live.show if live else None, overwrite=overwrite,
                 options=options, stop=stop, progress=told, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
@@ -359,6 +373,14 @@ def replay(
     ] = 0.0,
     start: Annotated[float, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")] = 0.0,
     end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Say what this controller would have commanded, served by the first -e; and on a simulated rig what"
+            " would have come of it.",
+        ),
+    ] = None,
     view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun.")] = False,
     to_rig: Annotated[
         bool, typer.Option("--to-rig", help="Send its commands to a rig, and record a new session.")
@@ -381,6 +403,8 @@ def replay(
     names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
     get_ready(recording.rig, names)
     if to_rig:
+        if control:
+            raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
         if not (output and _are_driven(recording.rig, camera, mirror)):
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
@@ -389,6 +413,11 @@ def replay(
         return
     if camera or mirror or output:
         raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
+    if control:
+        if view or rate or start or end is not None:
+            raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
+        _replay_control(recording, control, names[0], as_json=as_json)
+        return
     from aolink.cli.tables import scores as tables
     from aolink.estimation import Scorer
     from aolink.session.replay import replay as replay_recording
@@ -414,6 +443,19 @@ def replay(
             stdout.print(tables.scores(scores))
     stop.raise_if_asked()
     check_measured(file, scores)
+
+
+def _replay_control(recording: Recording, controller: str, estimator: str, *, as_json: bool) -> None:
+    from aolink.cli.tables import control as tables
+    from aolink.jobs.closed_loop import replayed
+
+    with StopRequest().installed() as stop, progress("replay", None) as tell:
+        result = replayed(recording, controller, estimator, stop, tell)
+    stop.raise_if_asked()
+    if as_json:
+        print(json.dumps(tables.replayed_as_json(result), allow_nan=False))
+    else:
+        stdout.print(tables.replayed(result))
 
 
 def _are_driven(rig: Rig, camera: str | None, mirror: str | None) -> bool:
@@ -466,6 +508,10 @@ def demo(
     exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
     real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
+    control: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Close the loop, and compare with the open one and the integrator."),
+    ] = None,
 ) -> None:
     """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
     from aolink.cli.tables import scores, sessions
@@ -480,8 +526,8 @@ def demo(
     try:
         with progress_bar(stderr, exposures) as tell:
             result = run_demo(
-                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time, stoppable=stop.installed,
-                progress=tell,
+                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time,
+                control=control or "", stoppable=stop.installed, progress=tell,
             )  # fmt: skip
     except Interrupted as interrupted:
         raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None

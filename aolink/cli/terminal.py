@@ -8,10 +8,25 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.segment import Segment
 
 from aolink.signals import Interrupted
+
+_SHOWN = {ord("\n"), ord("\t")}
+
+
+class PlainConsole(Console):
+    """A console that shows control characters of a text as "?": texts of files and devices cannot steer a terminal."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        for segment in super().render(renderable, options):
+            text = segment.text
+            if segment.control is None and not text.isprintable():
+                text = "".join(each if each.isprintable() or ord(each) in _SHOWN else "?" for each in text)
+                segment = Segment(text, segment.style)
+            yield segment
 
 
 @contextmanager

@@ -129,6 +129,9 @@ class AdaptedMirror(Adapted):
         self._events.append(CommandAnswered(ack, block))
         return block
 
+    def withdraw(self, step: int) -> int:
+        return step  # each block is taken or refused when it is sent
+
     def poll(self) -> list[Event]:
         """What has happened since the last call."""
         events = self._take_events()

@@ -158,6 +158,13 @@ class Mirror(Device, Protocol):
         Raises DeviceError for an input beyond the limits: it is refused, never clamped.
         """
 
+    def withdraw(self, step: int) -> int:
+        """Send no block again that has steps from ``step`` on: they are about to be replaced.
+
+        Gives the first step from which inputs must be sent anew, because a block that begins there may not have come;
+        ``step`` where all have.
+        """
+
     def next_due_ns(self) -> int | None:
         """Host time at which it is to be served next; None while nothing is waited for."""
 

@@ -36,6 +36,7 @@ _START_ANSWER_S = 0.05
 """Wait for the answer to a camera's start, which is at a near step: the next try must not be late."""
 _START_TRIES = 60
 _MAX_QUERIES = 32
+_MOST_WITHDRAWN = 64
 
 
 class _NativeDevice:
@@ -196,6 +197,8 @@ class NativeMirror(_NativeDevice):
         self._watchdog_s = identity.mirror.watchdog_s
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
+        self._withdrawn: dict[int, _Flight] = {}
+        """Blocks that are not sent again, but may be answered yet."""
         self._answered_ns: int | None = None
         """When the newest of the blocks that the mirror has taken was sent."""
         self._reports = AppliedReports(identity.fast_step_ns, round(self._watchdog_s * 1e9))
@@ -246,6 +249,16 @@ class NativeMirror(_NativeDevice):
         self._reports.begin(first_step)
         self._send(flight, now_ns)
         return block
+
+    def withdraw(self, step: int) -> int:
+        replaced = [
+            flight for flight in self._flights.values() if flight.block.first_step + flight.block.n_steps > step
+        ]
+        for flight in replaced:
+            self._withdrawn[flight.block.block_id] = self._flights.pop(flight.block.block_id)
+        while len(self._withdrawn) > _MOST_WITHDRAWN:  # their answers were lost
+            del self._withdrawn[next(iter(self._withdrawn))]
+        return min([step, *(flight.block.first_step for flight in replaced)])
 
     def _begins_ns(self, step: int) -> float:
         """Host time at which a fast step begins; infinite on virtual time, where the rig waits for its commands."""
@@ -319,7 +332,7 @@ class NativeMirror(_NativeDevice):
         return self._say(message) if isinstance(message, pb.Event) else []
 
     def _take_ack(self, ack: pb.CommandAck, receive_ns: int) -> list[Event]:
-        flight = self._flights.get(ack.block_id)
+        flight = self._flights.get(ack.block_id) or self._withdrawn.get(ack.block_id)
         if flight is None:
             return []
         sent_ns = flight.tries.get(ack.sequence)
@@ -328,7 +341,8 @@ class NativeMirror(_NativeDevice):
         if ack.code == pb.QUEUE_FULL:  # not an answer to keep: it is sent again when its time-out comes
             flight.heard_ns = receive_ns
             return []
-        del self._flights[ack.block_id]
+        for flights in (self._flights, self._withdrawn):
+            flights.pop(ack.block_id, None)
         self.queue_end_step = ack.queue_end_step
         if ack.code == pb.LATCHED:
             self.latched = True

@@ -72,6 +72,9 @@ class NoMirror:
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         raise DeviceError("there is no mirror to send commands to: give --mirror PORT, or [devices.mirror]")
 
+    def withdraw(self, step: int) -> int:
+        return step
+
     def next_due_ns(self) -> int | None:
         return None
 

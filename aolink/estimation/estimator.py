@@ -214,4 +214,6 @@ def _status_reasons(posterior: Posterior) -> list[str]:
     if posterior.several is not None and posterior.several.any():
         of = "" if axes == 1 else f"{int(posterior.several.sum())} of {axes} axes: "
         reasons.append(f"{of}the blur has more than one reading")
+    if posterior.remark:
+        reasons.append(posterior.remark)
     return reasons

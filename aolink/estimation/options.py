@@ -13,6 +13,8 @@ from aolink.estimation.moments.windowed import Basis
 Engine = Literal["aolink", "filterpy"]
 
 _HIGHEST_ORDER = 8
+# Fewer particles than this do not describe a posterior of a dozen coefficients and more.
+_FEWEST_TEMPERED = 100
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,10 @@ class Options:
     """Orders of the moments that `moments` takes, in its basis; 0 is the light in the window."""
     basis: Basis = "monomial"
     """Basis of `moments`: "monomial", "legendre" or "fourier"."""
-    particles: int = 3000
+    tempered: int | None = None
+    """Points that `profile` and `mixture` temper for an axis and exposure where importance sampling is not enough: the
+    budget of work. None: 600 and 1200. 0: none; such estimates are as wide as their few effective points make them."""
+    particles: int = 2000
     """Number of particles of `sampled`."""
     seed: int = 0
     """Seed of `sampled`: the same one gives the same estimates, bit for bit."""
@@ -56,6 +61,10 @@ def checked_options(**options: Any) -> Options:
     for key, values in choices.items():
         if getattr(chosen, key) not in values:
             raise EstimatorError(f"{key} = {getattr(chosen, key)!r} is not known: use one of {', '.join(values)}")
+    if chosen.tempered is not None and chosen.tempered != 0 and chosen.tempered < _FEWEST_TEMPERED:
+        raise EstimatorError(
+            f"tempered = {chosen.tempered}: use at least {_FEWEST_TEMPERED} points, or 0 for no tempering"
+        )
     orders = tuple(chosen.orders)
     if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")

@@ -214,7 +214,7 @@ def _profile(rig: Rig, options: Options) -> Filter:
     if alike_systems(rig.plant) is None:
         from aolink.estimation.pixels.updates import PROFILE
 
-        return _of_pixels(rig, options, PROFILE)
+        return _of_pixels(rig, options, PROFILE.within(options.tempered))
     assert isinstance(rig.sensor, SpotSensor)
     _warm_up(rig)
     return _blur_filter(rig, options, JointProfile(rig.sensor, rig.plant.n_outputs))
@@ -223,7 +223,7 @@ def _profile(rig: Rig, options: Options) -> Filter:
 def _mixture(rig: Rig, options: Options) -> Filter:
     from aolink.estimation.pixels.updates import MIXTURE
 
-    return _of_pixels(rig, options, MIXTURE)
+    return _of_pixels(rig, options, MIXTURE.within(options.tempered))
 
 
 def _sampled(rig: Rig, options: Options) -> Filter:

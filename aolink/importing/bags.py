@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
 from aolink.importing.film import Film, Frame, grey
-from aolink.optics.pictures import image_pixels
+from aolink.optics.pictures import image_pixels, opened_image
 
 _ENCODINGS = {
     "mono8": "u1", "8uc1": "u1", "mono16": "<u2", "16uc1": "<u2", "32fc1": "<f4", "64fc1": "<f8",
@@ -147,9 +147,7 @@ def raw_picture(data: bytes, encoding: str, height: int, width: int, step: int, 
 
 def compressed_picture(data: bytes) -> tuple[Frame, bool]:
     """Pixels of a JPEG or PNG, (rows, columns) or (rows, columns, 3 or 4), and whether it is lossy."""
-    from PIL import Image
-
-    with Image.open(io.BytesIO(data)) as image:
+    with opened_image(io.BytesIO(data), ImportingError) as image:
         return image_pixels(image), image.format != "PNG"
 
 

@@ -6,7 +6,6 @@ start is taken from it; nothing is guessed.
 
 from __future__ import annotations
 
-import gzip
 import logging
 import math
 import mmap
@@ -24,8 +23,9 @@ from numpy.typing import NDArray
 from aolink.errors import AolinkError, FrameError, ImportingError
 from aolink.extensions import needs_extra
 from aolink.importing.film import Film, Frame, grey
-from aolink.optics.frame_file import parse_fits_array
-from aolink.optics.pictures import image_pixels, read_picture
+from aolink.limits import load_archive, unpacked
+from aolink.optics.frame_file import parse_fits_array, read_fits
+from aolink.optics.pictures import image_pixels, opened_image, read_picture
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".npy", ".fits", ".fit", ".pgm")
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".gif", ".wmv")
@@ -136,8 +136,7 @@ def _npy(path: Path) -> Film:
 
 
 def _npz(path: Path) -> Film:
-    with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as archive:
-        arrays = {name: np.asarray(archive[name]) for name in archive}
+    arrays = load_archive(path, ImportingError)
     stacks = [name for name in arrays if name == "frames"] or [n for n in arrays if arrays[n].ndim in (3, 4)]
     if len(stacks) != 1:
         have = ", ".join(f"{name} {arrays[name].shape}" for name in arrays) or "nothing"
@@ -180,9 +179,9 @@ def _tiff(path: Path) -> Film:
 
     def pictures() -> Iterator[Frame]:
         if compression in _PILLOW_TIFF:
-            from PIL import Image, ImageSequence
+            from PIL import ImageSequence
 
-            with Image.open(path) as image:
+            with opened_image(path, ImportingError) as image:
                 yield from map(image_pixels, ImageSequence.Iterator(image))
             return
         with tifffile.TiffFile(path) as file:
@@ -257,7 +256,7 @@ def _picture(path: Path) -> Frame:
     if path.suffix.lower() not in (".fits", ".fit"):
         return read_picture(path)
     try:
-        _, stored, scale, zero = parse_fits_array(path.read_bytes())
+        _, stored, scale, zero = parse_fits_array(read_fits(path, ImportingError))
     except FrameError as error:
         raise ImportingError(f"{path}: {error}") from None
     return _values(stored, scale, zero)
@@ -280,7 +279,7 @@ def _fits(path: Path) -> Film:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
         # Mapped, not read: a cube may be larger than the memory.
-        data = gzip.decompress(file.read()) if packed else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        data = unpacked(file, ImportingError) if packed else mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     try:
         header, stored, scale, zero = parse_fits_array(data)  # type: ignore[arg-type] # a map is read as bytes are
     except FrameError as error:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from aolink.devices.drivers import KINDS, NATIVE, check_driver
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
+from aolink.estimation.assumptions import broken_assumptions, peak_snr
 from aolink.estimation.frames.moments import least_significance, spot_significance
-from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import SpotSensor
 from aolink.plant.check import nominal_path
@@ -78,6 +78,7 @@ def check_rig(rig: Rig) -> list[Finding]:
             findings = [
                 *_check_timing(rig), *_check_sensor(rig), *_check_signal(rig, path), *_check_motion(rig, path),
                 *_check_field(rig, path, sd), *_check_mirror(rig), *_check_simulation(rig), *_check_observability(rig),
+                *(_warning(key, message) for key, message in broken_assumptions(rig)),
             ]  # fmt: skip
     except (ArithmeticError, ValueError) as error:  # a LinAlgError is a ValueError
         return [_error("rig", f"it has numbers that are too large or too small to compute with ({error})")]
@@ -171,12 +172,6 @@ def _check_sensor(rig: Rig) -> Iterator[Finding]:
             f"two sd of the kernel to either side, {4 * wide:.3g}, are more than the field, {width:g}: every frame"
             " cuts the spot off",
         )
-    if narrow < pixel / 3:
-        yield _warning(
-            "sensor.kernel.sigma",
-            f"the kernel's sd, {narrow:.3g}, is under a third of a pixel ({pixel:.3g}):"
-            " moments depend on where in a pixel the spot rests",
-        )
     noise = 5 * math.sqrt(sensor.noise_density / sensor.pixel_size) * sensor.counts_per_density
     if sensor.black_level < noise:
         yield _warning(
@@ -204,7 +199,7 @@ def _check_signal(rig: Rig, path: FloatArray) -> Iterator[Finding]:
     """How the spot stands out of the noise: resting, and blurred as the drive moves it."""
     sensor, line = rig.sensor, rig.sensor.profile
     peak = sensor.peak_density
-    noise = math.sqrt(effective_noise_density(sensor) / sensor.pixel_size + shot_gain(sensor) * peak)
+    snr = peak_snr(rig)
     middle = (sensor.field[0] + sensor.field[1]) / 2
     resting = exposure_density(line.kernel, line.edges, np.array([[middle]]))
     whole = float(spot_significance(line, resting)[0])
@@ -216,8 +211,8 @@ def _check_signal(rig: Rig, path: FloatArray) -> Iterator[Finding]:
     counts = sensor.counts_per_density
     yield _info(
         "sensor.noise_density",
-        f"signal to noise {peak / noise:.3g} in the brightest pixel of a resting spot ({peak * counts:.5g} counts over"
-        f" {noise * counts:.4g}); the whole spot stands out by {whole:.3g} sd of noise, blurred by the drive by at"
+        f"signal to noise {snr:.3g} in the brightest pixel of a resting spot ({peak * counts:.5g} counts over"
+        f" {peak * counts / snr:.4g}); the whole spot stands out by {whole:.3g} sd of noise, blurred by the drive by at"
         f" least {least:.3g}, and estimators ask for {needed:.3g}",
     )
     if peak * counts < 1:

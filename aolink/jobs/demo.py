@@ -16,6 +16,7 @@ from pathlib import Path
 
 from aolink.errors import AolinkError, DeviceError, ExportError, ViewerError
 from aolink.estimation import estimator_rows
+from aolink.exposure import residual_rms
 from aolink.files import writing
 from aolink.recording.deblur import Summary, write_deblurred
 from aolink.recording.reader import Recording
@@ -25,6 +26,8 @@ from aolink.session import Report, record
 
 _RIG_START_S = 60.0
 _RIG_END_S = 5.0
+_SERVING = ("moments", "o1", "open-loop")
+"""Which estimator serves the demo's controller: the first that can work on the rig."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +41,9 @@ class DemoResult:
     not_of_viewer: str = ""
     """Why the picture is not one of the viewer, but of matplotlib or None; empty where it is the viewer's."""
     report: Report
+    residuals: Mapping[str, float] = field(default_factory=dict)
+    """Where the loop was closed: true slopes at the fast rate, root mean square, slope units, by the controller's name;
+    "open" for none. Each has a recording of its name beside the session's."""
     deblurred: Summary | None = None
     """Summary of the restored pictures; None where the rig has no picture sensor."""
     deblurred_by: str = ""
@@ -111,13 +117,16 @@ def run_demo(
     exposures: int,
     seed: int | None,
     real_time: bool,
+    control: str = "",
     stoppable: Callable[[], AbstractContextManager[Callable[[], bool]]],
     progress: Callable[[str, int], None],
 ) -> DemoResult:
     """Do the main job into ``folder``. Raises AolinkError; what was recorded until then stays.
 
     The rig runs from its ``source``, file or name: what that names is relative to it. ``stoppable`` is entered for
-    the session alone, which ends in good order when what it gives says so; nothing else is made then.
+    the session alone, which ends in good order when what it gives says so; nothing else is made then. With ``control``
+    the session's loop is closed by that controller, and two others are recorded before, from the same seed: with
+    the loop open, and closed by the integrator.
     """
     from aolink import plotting, viewing
 
@@ -136,13 +145,25 @@ def run_demo(
 
     options = ["--real-time"] if real_time else []
     options += ["--seed", str(seed)] if seed is not None else []
-    with part("record") as tell, stoppable() as stop, simulated_rig(source, *options) as (camera, mirror):
-        report = record(
-            rig, camera, mirror, path, estimators=estimators, exposures=exposures, note="aolink demo", stop=stop,
-            progress=tell,
-        )  # fmt: skip
-    if stop():
-        return DemoResult(recording=path, report=report, seconds=seconds)
+    if control:  # the first one serves the controller
+        serving = next(name for name in _SERVING if name in estimators)
+        estimators = (serving, *(name for name in estimators if name != serving))
+    sessions = [("", path, estimators)]
+    if control:
+        beside = [("open", "", ()), *([("integrator", "integrator", ())] if control != "integrator" else [])]
+        sessions = [(of, folder / f"{name}.mcap", none) for name, of, none in beside] + [(control, path, estimators)]
+    residuals: dict[str, float] = {}
+    for of, where, names in sessions:
+        what = f"record {of or 'open'}" if control else "record"
+        with part(what) as tell, stoppable() as stop, simulated_rig(source, *options) as (camera, mirror):
+            report = record(
+                rig, camera, mirror, where, estimators=names, exposures=exposures, note="aolink demo", control=of,
+                stop=stop, progress=tell,
+            )  # fmt: skip
+        if stop():
+            return DemoResult(recording=where, report=report, seconds=seconds)
+        if control:
+            residuals[of or "open"] = residual_rms(Recording(where).exposures())
     with part("estimate again") as tell:
         recording = Recording(path)
         offline = reestimate(recording, estimators, tell, as_recorded=True)
@@ -173,6 +194,7 @@ def run_demo(
             except ExportError as also:
                 not_of_viewer += f"; {also}"
     return DemoResult(
-        recording=path, rrd=rrd, picture=drawn, not_of_viewer=not_of_viewer, report=report, deblurred=deblurred,
-        deblurred_by=estimators[-1], deblurred_recording=sharp, differences=differences, seconds=seconds,
+        recording=path, rrd=rrd, picture=drawn, residuals=residuals, not_of_viewer=not_of_viewer, report=report,
+        deblurred=deblurred, deblurred_by=estimators[-1], deblurred_recording=sharp, differences=differences,
+        seconds=seconds,
     )  # fmt: skip

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import gzip
 import math
+import os
+import stat
 import zlib
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.errors import FrameError
+from aolink.errors import AolinkError, FrameError
+from aolink.limits import load_array, unpacked
 from aolink.numerics.arrays import FloatArray
 
 _BLOCK, _CARD = 2880, 80
@@ -29,10 +31,9 @@ def read_frame(path: str | Path) -> FloatArray:
     path = Path(path)
     try:
         if path.suffix == ".npy":
-            picture = np.load(path)
+            picture = load_array(path)
         else:
-            data = path.read_bytes()
-            picture = parse_fits(gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data)
+            picture = parse_fits(read_fits(path, FrameError))
     except OSError as error:
         raise FrameError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
     except (EOFError, ValueError, zlib.error) as error:
@@ -42,6 +43,16 @@ def read_frame(path: str | Path) -> FloatArray:
     if picture.ndim != 2 or picture.dtype.kind not in "biuf":
         raise FrameError(f"{path} holds {picture.dtype} of shape {picture.shape}, expected numbers in rows and columns")
     return np.asarray(picture, dtype=np.float64)
+
+
+def read_fits(path: Path, error: type[AolinkError]) -> bytes:
+    """The bytes of a FITS file without its compression; raises ``error`` for a file that is no file or very large."""
+    with path.open("rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise error(f"{path} is a pipe or a device: copy what it gives into a file")
+        packed = file.read(2) == b"\x1f\x8b"
+        file.seek(0)
+        return unpacked(file, error) if packed else file.read()
 
 
 def parse_fits(data: bytes) -> FloatArray:

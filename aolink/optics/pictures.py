@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.errors import RestorationError
+from aolink.errors import AolinkError, RestorationError
 from aolink.files import writing
+from aolink.limits import check_picture, load_array
 from aolink.numerics.arrays import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -30,15 +33,31 @@ def read_picture(path: Path) -> NDArray[Any]:
     """
     if path.suffix == ".npy":
         return _load(path, "picture")
-    from PIL import Image
-
     try:
-        with Image.open(path) as image:
+        with opened_image(path, RestorationError) as image:
             return image_pixels(image)
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
+    except RestorationError as error:
+        raise RestorationError(f"{path}: {error}") from None
+    except (OSError, ValueError) as error:
         raise RestorationError(
             f"{path} cannot be read as a picture ({error}): give a .png, .tif, .jpg or .npy"
         ) from error
+
+
+@contextmanager
+def opened_image(source: Path | IO[bytes], error: type[AolinkError]) -> Iterator[Image.Image]:
+    """An image of Pillow's, whose pixels are not read yet; raises ``error`` for one with more than the limit's."""
+    from PIL import Image
+
+    with warnings.catch_warnings():  # Pillow's own limits are others
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        try:
+            image = Image.open(source)
+        except Image.DecompressionBombError as problem:
+            raise error(str(problem).partition(",")[0].lower()) from None
+    with image:
+        check_picture(image.width, image.height, error)
+        yield image
 
 
 def image_pixels(image: Image.Image) -> NDArray[Any]:
@@ -117,7 +136,7 @@ def read_psf(path: Path) -> FloatArray:
 
 def _load(path: Path, what: str) -> NDArray[Any]:
     try:
-        values = np.asarray(np.load(path, allow_pickle=False))
+        values = load_array(path)
     except (OSError, ValueError, EOFError) as error:
         raise RestorationError(f"{path} cannot be read as a {what} ({error})") from error
     if not values.size:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,7 @@ from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
 
 if TYPE_CHECKING:
+    from aolink.control import Act
     from aolink.restoration import RestoredPictures
 
 _COUNTS = np.dtype("<u2")
@@ -30,6 +32,9 @@ _OF_FRAME = (
     "frame_id", "first_step", "last_step", "device_start_ns", "device_end_ns", "host_start_ns", "clock_sigma_ns",
     "alignment_sigma_ns", "host_first_byte_ns", "host_receive_ns", "chunks_lost", "frames_lost_before",
     "exposure_offset_ns",
+)  # fmt: skip
+_OF_ACT = (
+    "frame_id", "first_step", "delay_steps", "late", "reason", "slope_rms", "path_rms", "clipped_steps",
 )  # fmt: skip
 _OF_RESTORATION = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
 _OF_ESTIMATE = ("estimator", "frame_id", "first_step", "n_steps", "reason")
@@ -46,6 +51,20 @@ def frame_messages(frame: Frame) -> tuple[pb.ExposureInfo, RawImage]:
     image.timestamp.FromNanoseconds(frame.host_start_ns or frame.host_receive_ns)
     image.data = frame.pixels.astype("<u2").tobytes()
     return info, image
+
+
+def control_message(act: Act, controller: str, estimator: str) -> pb.Control:
+    """What a controller made of an exposure, as it is recorded."""
+    fit = act.fit
+    return pb.Control(
+        controller=controller,
+        estimator=estimator,
+        state=pb.Control.State.Name(act.state),
+        nis_ratio=math.nan if fit is None else fit.nis_ratio,
+        whiteness=math.nan if fit is None else fit.whiteness,
+        model_fits=fit is None or fit.fits,
+        **{name: getattr(act, name) for name in _OF_ACT},
+    )
 
 
 def restoration_message(done: RestoredPictures) -> pb.Restoration:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from google.protobuf.message import Message
-from mcap.records import Schema
+from mcap.records import Metadata, Schema
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -18,6 +21,10 @@ from aolink.errors import RecordingError
 from aolink.recording import topics
 
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
+
+
+_SEAL = "crc32"
+"""Key of the checksum in metadata."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +113,7 @@ class McapFile:
             self._file,  # type: ignore[arg-type]
             chunk_size=options.chunk_bytes,
             compression=COMPRESSIONS[options.compression],
+            enable_data_crcs=True,
         )
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -134,7 +142,7 @@ class McapFile:
 
     def add_metadata(self, name: str, values: dict[str, str]) -> None:
         self.flush()
-        self._writer.add_metadata(name, values)
+        self._writer.add_metadata(name, sealed(name, values))
         self._whole = self.size
 
     def add(
@@ -157,7 +165,8 @@ class McapFile:
             self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
         channel = self._writer.register_channel(topic, encoding, self._schemas[schema.name])
         # The channel itself is in the chunk. Were that chunk damaged, later ones could not be read: say it twice.
-        self._writer.add_metadata(topics.CHANNEL_METADATA, {"id": str(channel), "topic": topic, "schema": schema.name})
+        known = {"id": str(channel), "topic": topic, "schema": schema.name}
+        self._writer.add_metadata(topics.CHANNEL_METADATA, sealed(topics.CHANNEL_METADATA, known))
         return channel
 
     def flush(self) -> None:
@@ -188,6 +197,29 @@ class McapFile:
             os.ftruncate(self._file.descriptor, self._whole)
         with contextlib.suppress(OSError):
             self._file.close()
+
+
+def sealed(name: str, values: Mapping[str, str]) -> dict[str, str]:
+    """Metadata with a checksum, which MCAP gives to chunks and attachments but not to metadata."""
+    return {**values, _SEAL: _checksum(name, values)}
+
+
+def unsealed(records: Sequence[Metadata]) -> Iterator[tuple[str, dict[str, str] | None]]:
+    """The name and the facts of each metadata without their checksum, or None where that is wrong.
+
+    Where one record of a file has a checksum, all of ours have: damage to a length may hide the key. Metadata of older
+    files and of other writers have none, and are believed.
+    """
+    is_sealed = any(_SEAL in each.metadata for each in records)
+    for each in records:
+        facts = {key: value for key, value in each.metadata.items() if key != _SEAL}
+        expected = is_sealed and each.name.startswith(topics.SESSION_METADATA)
+        found = each.metadata.get(_SEAL, None if expected else _checksum(each.name, facts))
+        yield each.name, facts if found == _checksum(each.name, facts) else None
+
+
+def _checksum(name: str, values: Mapping[str, str]) -> str:
+    return f"{zlib.crc32(json.dumps([name, sorted(values.items())]).encode()):08x}"
 
 
 def schema_of(message_class: type[Message]) -> Schema:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import heapq
-import io
 import json
 from collections import deque
 from collections.abc import Collection, Container, Iterator, Sequence
@@ -25,12 +24,15 @@ from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel, exposure_model
 from aolink.exporting.series import Series
 from aolink.exposure import Exposure
+from aolink.limits import Budget, exceeded, limits, load_array
 from aolink.recording import convert, schemas_pb2, topics
 from aolink.recording.exposures import Companions, ExposureAssembly
 from aolink.recording.frame_index import FrameIndex, StepRun
+from aolink.recording.mcap_file import unsealed
 from aolink.recording.remote import Url, location, only_paths
 from aolink.recording.scan import Loss, Summary, chunk_at, open_recording, read_summary, record_at, scan
 from aolink.recording.slices import RecordingSlice
+from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
 from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
@@ -121,8 +123,8 @@ class Recording(Series):
         self.start_ns = self.end_ns = 0
         """Log times of the first and of the last message."""
         self._losses: dict[int, Loss] = {}
-        self._undecoded: dict[str, dict[tuple[int, int], int]] = {}
-        """Messages that are not of their kind, by topic: sequence, log time and length."""
+        self._unusable: dict[tuple[str, str], dict[tuple[int, int], int]] = {}
+        """Messages that are not of their kind, by topic and what is wrong with them: sequence, log time and length."""
         self._channels: dict[int, tuple[str, str]] = {}
         """Topic and name of the schema, by the channel's id."""
         self.schemas: dict[str, Schema] = {}
@@ -155,9 +157,9 @@ class Recording(Series):
     def losses(self) -> list[Loss]:
         """The parts that could not be read, so far as the file has been read, in the order of the file."""
         found = [self._losses[offset] for offset in sorted(self._losses)]
-        for topic, messages in self._undecoded.items():
+        for (topic, wrong), messages in self._unusable.items():
             times = [time_ns for _, time_ns in messages]
-            what = f"{len(messages)} message(s) on {topic} cannot be decoded"
+            what = f"{len(messages)} message(s) on {topic} {wrong}"
             found.append(Loss(0, sum(messages.values()), what, min(times), max(times)))
         return found + [loss for each in self._side for loss in each.losses]
 
@@ -244,11 +246,10 @@ class Recording(Series):
             message = kind.FromString(raw.data)
         except DecodeError:
             message = None
-        # A report that has not the inputs of its steps would stand for all of these steps.
-        if isinstance(message, Applied) and message.source not in (Applied.AWAITED, Applied.NOT_REPORTED):
-            message = message if len(message.u) == message.n_steps * self.rig.n_inputs else None
-        if message is None:
-            self._undecoded.setdefault(raw.topic, {})[raw.sequence, raw.log_time_ns] = len(raw.data)
+        if message is None or (wrong := what_is_wrong(message, self.rig)):
+            what = "cannot be decoded" if message is None else f"cannot be used: {wrong}"
+            self._unusable.setdefault((raw.topic, what), {})[raw.sequence, raw.log_time_ns] = len(raw.data)
+            return None
         return message
 
     def decoded_run(self, raw: RawMessage) -> Run | None:
@@ -260,7 +261,7 @@ class Recording(Series):
         except DecodeError:
             return None
         # A writer may have split the row, or put each number by itself: that is for the message's own class.
-        return run if len(run.u) == 8 * run.n_steps * self.rig.n_inputs else None
+        return None if what_is_wrong(run, self.rig) else run
 
     def raw_messages(
         self, *wanted: str, start_ns: int = 0, end_ns: int = _END_OF_TIME, first_chunk: int = 0
@@ -396,7 +397,7 @@ class Recording(Series):
         if data is None or self.rig.scene is None:
             return None
         try:
-            counts = np.load(io.BytesIO(data), allow_pickle=False)
+            counts = load_array(data)
         except (ValueError, EOFError, OSError):
             counts = np.zeros(0)
         if counts.shape != self.rig.scene.shape or counts.dtype != np.uint16:
@@ -505,6 +506,7 @@ class Recording(Series):
         else:
             records = self._scanned()
         ids: dict[int, str] = {}
+        noted: list[Metadata] = []
         for record, sure in records:
             if isinstance(record, McapMessage):
                 self.start_ns = min(self.start_ns, record.log_time) if held else record.log_time
@@ -520,8 +522,11 @@ class Recording(Series):
                     kind = ids.get(record.schema_id, before[1] if before else "")
                     self._channels[record.id] = (record.topic, kind)
                     self.encodings[record.topic] = record.message_encoding
-            else:
-                self._note(record)
+            elif isinstance(record, Attachment):
+                self._attach(record)
+            elif isinstance(record, Metadata):
+                noted.append(record)
+        self._note(noted)
         for channel_id, number in held.items():
             if channel_id in self._channels:
                 self.counts[self._channels[channel_id][0]] = number
@@ -535,23 +540,30 @@ class Recording(Series):
         others = sorted(summary.others, key=lambda each: each.offset)
         with open_recording(self.path, [(each.offset, each.length) for each in others]) as file:
             for each in others:
-                if (found := record_at(file, each.offset)) is not None:
+                if (found := record_at(file, each, self._lose)) is not None:
                     yield found, True
 
-    def _note(self, record: McapRecord) -> None:
-        """Keep what an attachment or metadata says."""
-        if isinstance(record, Attachment):
-            self.attachments[record.name] = record.data
-        elif isinstance(record, Metadata):
-            values = record.metadata
-            if record.name in (topics.SESSION_METADATA, topics.END_METADATA):
+    def _attach(self, record: Attachment) -> None:
+        self.attachments[record.name] = record.data
+        if (held := sum(map(len, self.attachments.values()))) > limits().attachment_bytes:
+            raise exceeded(f"{self.path} holds attachments of {held} bytes", "attachment_bytes")
+
+    def _note(self, records: Sequence[Metadata]) -> None:
+        """Keep what the metadata of the file say."""
+        for name, values in unsealed(records):
+            if values is None:
+                self._losses[-1 - len(self._losses)] = Loss(0, 0, f"the metadata {name!r} is damaged")
+            elif name in (topics.SESSION_METADATA, topics.END_METADATA):
                 self.metadata.update(values)
-                if record.name == topics.END_METADATA:
+                if name == topics.END_METADATA:
                     self.end_metadata.update(values)
-            elif record.name == topics.RIG_METADATA:
+            elif name == topics.RIG_METADATA:
                 self._second_rig_text = values.get("toml", self._second_rig_text)
-            elif record.name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
-                self._channels.setdefault(int(values["id"]), (values.get("topic", ""), values.get("schema", "")))
+            elif name == topics.CHANNEL_METADATA and values.get("id", "").isdigit():
+                number = int(values["id"])
+                # The chunk that names the channel, or the one that holds its schema, may be lost.
+                if not self._channels.get(number, ("", ""))[1]:
+                    self._channels[number] = (values.get("topic", ""), values.get("schema", ""))
 
     def _records(self, channels: Container[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""
@@ -565,9 +577,10 @@ class Recording(Series):
             if not (index.message_end_time < low or index.message_start_time >= high)
             and (not (held := index.message_index_offsets) or any(channel in channels for channel in held))
         ]
+        budget = Budget(str(self.path), self.size)
         with open_recording(self.path, [(each.chunk_start_offset, each.chunk_length) for each in wanted]) as file:
             for index in wanted:
-                yield from chunk_at(file, index, self._lose)
+                yield from chunk_at(file, index, self._lose, budget)
 
     def _scanned(self) -> Iterator[tuple[McapRecord, bool]]:
         with open_recording(self.path) as file:

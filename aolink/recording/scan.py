@@ -41,13 +41,13 @@ from mcap.records import (
 from mcap.records import Message as McapMessage
 
 from aolink.errors import RecordingError
+from aolink.limits import Budget, exceeded, limits
 from aolink.recording.remote import Url
-from aolink.recording.search import HEAD, MAX_RECORD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
+from aolink.recording.search import HEAD, MESSAGE_HEAD, Search, begins_a_record, is_plausible
 
-MAX_CHUNK = 128 << 20
-"""Bytes without compression: the largest that is written, 64 MiB, and the message that it ends with."""
 _MOST_READINGS = 4
 """How many times the file's size is read, at most, of records that turn out to be none."""
+_READ_BYTES = 1 << 20
 _MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_BYTES = HEAD.size + 20 + len(_MAGIC)
 
@@ -168,7 +168,7 @@ def read_summary(file: IO[bytes]) -> Summary | None:
     if not tail.endswith(_MAGIC) or (opcode, length) != (Opcode.FOOTER, 20) or start > end:
         return None
     start = start or end
-    if end - start > MAX_RECORD:
+    if end - start > limits().record_bytes:
         return None
     file.seek(start)
     data = file.read(end - start)
@@ -210,14 +210,21 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
 
     With each record, whether a checksum says that it is what was written.
     """
+    whole = True
+
+    def lose(loss: Loss) -> None:
+        nonlocal whole
+        whole = False
+        on_loss(loss)
+
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
     if file.read(len(_MAGIC)) != _MAGIC:
-        on_loss(Loss(0, len(_MAGIC), "the first bytes are damaged"))
+        lose(Loss(0, len(_MAGIC), "the first bytes are damaged"))
     position = len(_MAGIC)
     search, before = Search(file, size), 0
     whole_end: bool | None = None
-    readings = _MOST_READINGS * size
+    readings, budget = _MOST_READINGS * size, Budget(str(getattr(file, "name", "the file")), size)
     while position < size:
         file.seek(position)
         head = file.read(HEAD.size)
@@ -227,9 +234,9 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
             found = end if begins_a_record(file, end, size) else search.next(position + 1)
             if found is None:
                 what = f"it was cut off: it ends at byte {size}, in the middle of a record"
-                on_loss(Loss(position, size - position, what))
+                lose(Loss(position, size - position, what))
                 return
-            on_loss(Loss(position, found - position, f"{found - position} bytes make no sense"))
+            lose(Loss(position, found - position, f"{found - position} bytes make no sense"))
             position, before = found, 0
             continue
         lost: list[Loss] = []
@@ -239,73 +246,98 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
             # reading: a file that was made to waste time gets a few.
             readings -= length
             end = (search.next(position + 1, before=end) if readings > 0 else None) or end
-            on_loss(replace(lost[0], length=end - position))
+            lose(replace(lost[0], length=end - position))
         elif isinstance(record, Chunk):
-            yield from ((each, True) for each in broken_up(record, position, on_loss))
+            yield from ((each, True) for each in broken_up(record, position, lose, budget))
         elif record is not None:
+            budget.take_records(1)
             yield record, False
         if head[0] == Opcode.DATA_END:
             whole_end = read_summary(file) is not None if whole_end is None else whole_end
             if whole_end:
+                if whole:
+                    _check_data(file, position, on_loss)
                 return
             found = search.next(end)  # it may have been no end
-            on_loss(Loss(end, (found or size) - end, "its index is damaged or was cut off"))
+            lose(Loss(end, (found or size) - end, "its index is damaged or was cut off"))
             if found is None:
                 return
             end = found
         position, before = end, head[0]
-    on_loss(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
+    lose(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
 
 
-def chunk_at(file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None]) -> Iterator[McapRecord]:
+def _check_data(file: IO[bytes], end: int, on_loss: Callable[[Loss], None]) -> None:
+    """Compare all bytes before the end of the data with the checksum that stands there, if there is one."""
+    file.seek(end)
+    (expected,) = struct.unpack("<I", file.read(HEAD.size + 4)[HEAD.size :])
+    file.seek(0)
+    found, left = 0, end if expected else 0
+    while left and (data := file.read(min(left, _READ_BYTES))):
+        found, left = zlib.crc32(data, found), left - len(data)
+    if found != expected:
+        on_loss(Loss(0, end, "its bytes are not those that were written: their checksum is another"))
+
+
+def chunk_at(
+    file: IO[bytes], index: ChunkIndex, on_loss: Callable[[Loss], None], budget: Budget
+) -> Iterator[McapRecord]:
     """What is in a chunk that the summary names; nothing if it is damaged."""
     file.seek(index.chunk_start_offset)
     head = file.read(HEAD.size)
-    if len(head) < HEAD.size or head[0] != Opcode.CHUNK or HEAD.unpack(head)[1] > MAX_RECORD:
+    if len(head) < HEAD.size or head[0] != Opcode.CHUNK or HEAD.unpack(head)[1] > limits().record_bytes:
         on_loss(_chunk_loss(index.chunk_start_offset, index.chunk_length, index))
         return
     record = _record_at(file, index.chunk_start_offset, on_loss)
     if isinstance(record, Chunk):
-        yield from broken_up(record, index.chunk_start_offset, on_loss)
+        yield from broken_up(record, index.chunk_start_offset, on_loss, budget)
 
 
-def record_at(file: IO[bytes], offset: int) -> McapRecord | None:
-    """A record that the summary names; None if it is damaged."""
-    file.seek(offset)
+def record_at(
+    file: IO[bytes], index: AttachmentIndex | MetadataIndex, on_loss: Callable[[Loss], None]
+) -> McapRecord | None:
+    """An attachment or metadata that the summary names; None, and a loss, if it is damaged."""
+    kind = Opcode.ATTACHMENT if isinstance(index, AttachmentIndex) else Opcode.METADATA
+    file.seek(index.offset)
     head = file.read(HEAD.size)
-    if len(head) < HEAD.size or HEAD.unpack(head)[1] > MAX_RECORD:
-        return None
-    return _record_at(file, offset, lambda loss: None)
+    if len(head) == HEAD.size and head[0] == kind and HEAD.unpack(head)[1] <= limits().record_bytes:
+        return _record_at(file, index.offset, on_loss)
+    on_loss(Loss(index.offset, index.length, f"the {kind.name.lower()} {index.name!r} is damaged"))
+    return None
 
 
-def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None]) -> Iterator[McapRecord]:
+def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None], budget: Budget) -> Iterator[McapRecord]:
     """The records in a chunk, one by one; nothing if it is damaged."""
     try:
-        data = _decompressed(chunk)
+        budget.take_bytes(chunk.uncompressed_size)
+        data, count = _decompressed(chunk), 0
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError("checksum")
-        for opcode, at, length in _heads(data):
-            if opcode != Opcode.MESSAGE:
+        for count, (opcode, at, length) in enumerate(_heads(data), 1):
+            if count > budget.records:
+                break
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 _parsed(opcode, data[at : at + length])
-            elif length < MESSAGE_HEAD.size:
+            elif opcode == Opcode.MESSAGE and length < MESSAGE_HEAD.size:
                 raise ValueError("a message without its times")
     except _DAMAGE:
         on_loss(_chunk_loss(offset, HEAD.size + len(chunk.data), chunk))
         return
+    budget.take_records(count)
     for opcode, at, length in _heads(data):
-        yield _parsed(opcode, data[at : at + length])
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield _parsed(opcode, data[at : at + length])
 
 
 def _heads(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode, first byte and length of the content of each record of a chunk that is looked into."""
+    """Opcode, first byte and length of the content of each record of a chunk."""
     position = 0
     while position < len(data):
         opcode, length = HEAD.unpack_from(data, position)
         position += HEAD.size
         if length > len(data) - position:
             raise ValueError("a record that goes beyond its chunk")
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            yield opcode, position, length
+        yield opcode, position, length
         position += length
 
 
@@ -333,6 +365,8 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
     opcode, length = HEAD.unpack(file.read(HEAD.size))
     if opcode not in _PARSERS and opcode != Opcode.MESSAGE:
         return None
+    if opcode == Opcode.ATTACHMENT and length > limits().attachment_bytes:
+        raise exceeded(f"it holds an attachment of {length} bytes", "attachment_bytes")
     content = file.read(length)
     try:
         record = _parsed(opcode, content)
@@ -347,7 +381,7 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
 
 def _decompressed(chunk: Chunk) -> bytes:
     """What a chunk holds. It may say one size and hold another: neither may fill the memory."""
-    if chunk.uncompressed_size > MAX_CHUNK:
+    if chunk.uncompressed_size > limits().chunk_bytes:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
     data = chunk.data
     if chunk.compression == "lz4":

@@ -210,3 +210,43 @@ class Restoration(_message.Message):
     path_noise_sd: float
     reason: str
     def __init__(self, frame_id: _Optional[int] = ..., estimator: _Optional[str] = ..., method: _Optional[str] = ..., scene_noise_sd: _Optional[float] = ..., path_noise_sd: _Optional[float] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class Control(_message.Message):
+    __slots__ = ("controller", "estimator", "frame_id", "first_step", "delay_steps", "late", "state", "reason", "slope_rms", "path_rms", "clipped_steps", "nis_ratio", "whiteness", "model_fits")
+    class State(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        CLOSED: _ClassVar[Control.State]
+        HELD: _ClassVar[Control.State]
+        PARKED: _ClassVar[Control.State]
+    CLOSED: Control.State
+    HELD: Control.State
+    PARKED: Control.State
+    CONTROLLER_FIELD_NUMBER: _ClassVar[int]
+    ESTIMATOR_FIELD_NUMBER: _ClassVar[int]
+    FRAME_ID_FIELD_NUMBER: _ClassVar[int]
+    FIRST_STEP_FIELD_NUMBER: _ClassVar[int]
+    DELAY_STEPS_FIELD_NUMBER: _ClassVar[int]
+    LATE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    SLOPE_RMS_FIELD_NUMBER: _ClassVar[int]
+    PATH_RMS_FIELD_NUMBER: _ClassVar[int]
+    CLIPPED_STEPS_FIELD_NUMBER: _ClassVar[int]
+    NIS_RATIO_FIELD_NUMBER: _ClassVar[int]
+    WHITENESS_FIELD_NUMBER: _ClassVar[int]
+    MODEL_FITS_FIELD_NUMBER: _ClassVar[int]
+    controller: str
+    estimator: str
+    frame_id: int
+    first_step: int
+    delay_steps: int
+    late: bool
+    state: Control.State
+    reason: str
+    slope_rms: float
+    path_rms: float
+    clipped_steps: int
+    nis_ratio: float
+    whiteness: float
+    model_fits: bool
+    def __init__(self, controller: _Optional[str] = ..., estimator: _Optional[str] = ..., frame_id: _Optional[int] = ..., first_step: _Optional[int] = ..., delay_steps: _Optional[int] = ..., late: _Optional[bool] = ..., state: _Optional[_Union[Control.State, str]] = ..., reason: _Optional[str] = ..., slope_rms: _Optional[float] = ..., path_rms: _Optional[float] = ..., clipped_steps: _Optional[int] = ..., nis_ratio: _Optional[float] = ..., whiteness: _Optional[float] = ..., model_fits: _Optional[bool] = ...) -> None: ...

@@ -2,12 +2,13 @@
 
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig
-from aolink.rig.parts import Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing
+from aolink.rig.parts import Control, Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing
 from aolink.rig.sensor_tables import CalibrationTable
 from aolink.rig.tables import parse_light
 
 __all__ = [
     "CalibrationTable",
+    "Control",
     "Drive",
     "Faults",
     "Kernel",

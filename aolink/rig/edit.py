@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import tomlkit
@@ -60,6 +60,27 @@ def with_table(text: str, name: str, values: Mapping[str, Any], comment: str) ->
             document[name][key] = value
 
     return _edited(text, edit)
+
+
+def with_tables(text: str, name: str, tables: Sequence[Mapping[str, Any]], comment: str) -> str:
+    """The text with these tables, at least one, as those of a key such as ``disturbance.model``; old ones go."""
+    top, key = name.split(".")
+
+    def edit(document: tomlkit.TOMLDocument) -> None:
+        made = tomlkit.aot()
+        for values in tables:
+            table = tomlkit.table()
+            for each, value in values.items():
+                table[each] = value
+            made.append(table)
+        made[0].comment(comment)
+        if top not in document:
+            document[top] = tomlkit.table(is_super_table=True)
+        document[top].pop(key, None)
+        document[top][key] = made
+
+    new = _edited(text, edit)
+    return new if new.endswith("\n") else f"{new}\r\n" if "\r\n" in new else f"{new}\n"
 
 
 def _edited(text: str, edit: Callable[[tomlkit.TOMLDocument], None]) -> str:

@@ -8,6 +8,7 @@ the unit of ``sensor.field``, of the plant's output and of the kernel's width.
 from __future__ import annotations
 
 import hashlib
+import re
 import tomllib
 from dataclasses import dataclass
 from importlib import resources
@@ -19,17 +20,28 @@ from aolink.optics.sensor import BaseSensor
 from aolink.rig.device_tables import DeviceTable, read_devices
 from aolink.rig.disturbance import Disturbance, read_disturbance
 from aolink.rig.optical_plant import Optics, read_optics
-from aolink.rig.parts import Drive, MirrorDriver, Plant, Simulation, Timing
+from aolink.rig.parts import Control, Drive, MirrorDriver, Plant, Simulation, Timing
 from aolink.rig.scene_table import read_scene
 from aolink.rig.sensor_tables import CalibrationTable, read_calibration, read_grid, read_sensor
-from aolink.rig.tables import read_drive, read_mirror, read_plant, read_simulation, read_timing
-from aolink.rig.toml_table import Table
+from aolink.rig.tables import (
+    read_control,
+    read_drive,
+    read_mirror,
+    read_plant,
+    read_simulation,
+    read_timing,
+    with_disturbance,
+)
+from aolink.rig.toml_table import Table, named_file
 
 _TABLES = (
     "name", "summary", "plant", "timing", "sensor", "mirror", "drive", "simulation",
-    "lenslets", "disturbance", "scene", "calibration", "devices",
+    "lenslets", "disturbance", "scene", "calibration", "devices", "control",
 )  # fmt: skip
 """The top-level keys of a rig file."""
+_LONGEST = 16 << 20
+_DEEPEST = 200
+"""Characters of a rig file, and parts of a key: what a key takes of the memory grows with the square of its parts."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,6 +55,7 @@ class Rig:
     sensor: BaseSensor
     mirror: MirrorDriver
     drive: Drive
+    control: Control
     simulation: Simulation
     calibration: CalibrationTable | None
     """None where the sensor's values were not measured."""
@@ -53,8 +66,9 @@ class Rig:
     """The picture sensor that shares the exposure, where the rig has one."""
     devices: dict[str, DeviceTable]
     """Drivers of the devices, by the names ``camera`` and ``mirror``, where the file names them."""
-    folder: Path
-    """Folder of the rig file, which paths in the file are relative to."""
+    folder: Path | None
+    """Folder of the rig file, which paths in the file are relative to. None where the file came out of a recording:
+    such a one names no file, since nobody on this machine has chosen it."""
     toml: str
     """The file's text, as read."""
 
@@ -62,6 +76,16 @@ class Rig:
     def digest(self) -> str:
         """SHA-256 of the file's text: the rig's identity in a recording."""
         return hashlib.sha256(self.toml.encode()).hexdigest()
+
+    def path_of(self, name: str | Path, key: str) -> Path:
+        """The path of a file that the rig file names under ``key``.
+
+        Raises
+        ------
+        RigError
+            The rig file comes out of a recording.
+        """
+        return named_file(self.folder, name, key)
 
     @property
     def n_inputs(self) -> int:
@@ -93,7 +117,8 @@ def load_rig(path_or_name: str | Path) -> Rig:
         text = path.read_text()
     else:
         try:
-            text = path.read_text()
+            with path.open() as file:
+                text = file.read(_LONGEST + 1)
         except OSError as error:
             if path.name.removesuffix(".toml") in builtin_rigs() and path.parent == Path():
                 return load_rig(path.name.removesuffix(".toml"))
@@ -116,7 +141,15 @@ def builtin_rigs() -> list[str]:
 
 
 def parse_rig(text: str, folder: Path | None = None) -> Rig:
-    """Validate the text of a rig file. Raises `RigError`, naming the key."""
+    """Validate the text of a rig file. Raises `RigError`, naming the key.
+
+    Parameters
+    ----------
+    folder:
+        The folder of the file; None for a text that comes out of a recording.
+    """
+    if len(text) > _LONGEST or _deepest_key(text) > _DEEPEST:
+        raise RigError(f"it is longer than {_LONGEST >> 20} MiB, or has a key of more than {_DEEPEST} parts")
     try:
         root = Table(tomllib.loads(text), "")
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number or nesting beyond what Python reads
@@ -131,15 +164,23 @@ def parse_rig(text: str, folder: Path | None = None) -> Rig:
     n_inputs = plant.axes * plant.n_inputs
     mirror = root.read("mirror", read_mirror, n_inputs, timing)
     drive = root.read("drive", read_drive, n_inputs, mirror, optional=True)
-    disturbance = root.read_any("disturbance", read_disturbance)
+    control = root.read("control", read_control, timing, optional=True)
+    disturbance = root.read_any("disturbance", read_disturbance, plant.n_outputs, timing.fast_step_s)
     if disturbance and optics is None and (disturbance.layers or len(disturbance.zernike_m)):
         raise RigError("disturbance: turbulence and aberrations need [lenslets], to know the slopes that they make")
+    if disturbance and disturbance.model:
+        plant = with_disturbance(plant, disturbance.model)
     scene = root.read_any("scene", read_scene)
     simulation = root.read("simulation", read_simulation, optional=True)
     calibration = root.read_any("calibration", read_calibration)
     devices = root.read("devices", read_devices, optional=True)
     return Rig(
         name=name, summary=summary, plant=plant, timing=timing, sensor=sensor,
-        mirror=mirror, drive=drive, simulation=simulation, calibration=calibration,
-        optics=optics, disturbance=disturbance, scene=scene, devices=devices, folder=folder or Path(), toml=text,
+        mirror=mirror, drive=drive, control=control, simulation=simulation, calibration=calibration,
+        optics=optics, disturbance=disturbance, scene=scene, devices=devices, folder=folder, toml=text,
     )  # fmt: skip
+
+
+def _deepest_key(text: str) -> int:
+    """More than the parts of any key in a text, as far as one can tell without parsing it."""
+    return max(part.count(".") for part in re.split(r"[,=\[\]\n]", text.replace(" ", "").replace("\t", "")))

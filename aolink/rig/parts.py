@@ -66,6 +66,8 @@ class Plant:
     """Number of independent copies."""
     unmodelled: UnmodelledSlopes | None = None
     """What estimators expect of the outputs beside C x(k); None for nothing."""
+    disturbance_states: int = 0
+    """How many states, the last ones, are those of the disturbance's model, which no input reaches."""
 
     @property
     def n_states(self) -> int:
@@ -156,6 +158,26 @@ class Drive:
             t = np.arange(first_step, first_step + n_steps) * fast_step_s
             u += np.sin(2 * np.pi * t / self.period_s)[:, None] * self.amplitude
         return u
+
+
+@dataclass(frozen=True, kw_only=True)
+class Control:
+    """How the loop is closed, where a session closes it."""
+
+    delay_s: float = 0.01
+    """From the end of an exposure to the beginning of the first fast step that its estimate can change, at least, s:
+    read-out, link and estimator. On virtual time it is exactly this, rounded up to whole fast steps."""
+    when_lost: Literal["hold", "park"] = "hold"
+    """What the mirror does while nothing reliable is known of the spot: it holds its input, or goes to the safe one."""
+    gain: float = 0.5
+    """Of the integrator."""
+    leak: float = 0.01
+    """Share of itself that the integrator loses with each exposure."""
+    least_singular_value: float = 0.03
+    """Modes of the mirror that move the slopes less than this share of the strongest one are left alone by the
+    integrator."""
+    effort: float = 1e-3
+    """Weight of the inputs in the cost of ``lqg``, relative to the slopes that they make at rest."""
 
 
 @dataclass(frozen=True, kw_only=True)

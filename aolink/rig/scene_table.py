@@ -11,7 +11,7 @@ from aolink.errors import RestorationError, RigError
 from aolink.optics.pictures import read_picture
 from aolink.optics.scene import SceneSensor
 from aolink.rig.sensor_tables import read_kernel
-from aolink.rig.toml_table import Table
+from aolink.rig.toml_table import Table, named_file
 
 FloatArray = NDArray[np.float64]
 
@@ -41,13 +41,14 @@ def read_scene(table: Table) -> SceneSensor:
     return sensor
 
 
-def read_scene_picture(sensor: SceneSensor, folder: Path) -> FloatArray:
+def read_scene_picture(sensor: SceneSensor, folder: Path | None) -> FloatArray:
     """The picture that a simulated rig shows, in its own, finer pixels, (rows, columns); grey, integers scaled to 0..1.
 
     Parameters
     ----------
     folder:
-        Folder of the rig file; a picture that is not there may be one that comes with aolink.
+        Folder of the rig file; a picture that is not there may be one that comes with aolink. None, for a rig file
+        that comes out of a recording, allows for nothing else.
 
     Raises
     ------
@@ -56,9 +57,11 @@ def read_scene_picture(sensor: SceneSensor, folder: Path) -> FloatArray:
     """
     if not sensor.picture:
         raise RigError("scene.picture is missing: a simulated rig needs a picture to show")
-    beside, shipped = folder / sensor.picture, _SHIPPED / sensor.picture
+    shipped = _SHIPPED / sensor.picture
+    comes_along = shipped.parent == _SHIPPED and shipped.is_file()
+    beside = shipped if comes_along and folder is None else named_file(folder, sensor.picture, "scene.picture")
     try:
-        found = read_picture(shipped if shipped.is_file() and not beside.is_file() else beside)
+        found = read_picture(shipped if comes_along and not beside.is_file() else beside)
     except RestorationError as error:
         raise RigError(f"scene.picture: {error}") from None
     if found.ndim == 3 and found.shape[2] in (3, 4):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from aolink.errors import RigError
 from aolink.numerics.block_diagonal import stationary_covariance
+from aolink.rig.disturbance import DisturbanceModel
 from aolink.rig.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
-from aolink.rig.parts import Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, UnmodelledSlopes
+from aolink.rig.parts import Control, Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, UnmodelledSlopes
 from aolink.rig.sensor_tables import read_grid
 from aolink.rig.toml_table import Table, shape_text
 
@@ -95,6 +98,26 @@ def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
         A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes,
         unmodelled=unmodelled,
     )  # fmt: skip
+
+
+def with_disturbance(plant: Plant, model: DisturbanceModel) -> Plant:
+    """A plant with the states of a disturbance's model behind its own, and the sum of both as its outputs."""
+    n = len(model.A)
+    return replace(
+        plant,
+        A=_beside(plant.A, model.A),
+        B=np.vstack([plant.B, np.zeros((n, plant.n_inputs))]),
+        B_w=_beside(plant.B_w, model.B_w),
+        C=np.hstack([plant.C, model.C]),
+        process_noise=_beside(plant.process_noise, model.process_noise),
+        initial_mean=np.append(plant.initial_mean, np.zeros(n)),
+        initial_covariance=_beside(plant.initial_covariance, model.initial_covariance),
+        disturbance_states=n,
+    )
+
+
+def _beside(first: FloatArray, second: FloatArray) -> FloatArray:
+    return np.asarray(linalg.block_diag(first, second))
 
 
 def _covariance(table: Table, name: str, size: int, why: str) -> FloatArray:
@@ -182,6 +205,25 @@ def read_drive(table: Table, n_inputs: int, mirror: MirrorDriver) -> Drive:
             f" {mirror.slew_max_per_s:g}: the mirror would refuse it"
         )
     return Drive(kind=kind, amplitude=amplitude, period_s=period, offset=offset)
+
+
+def read_control(table: Table, timing: Timing) -> Control:
+    """The table ``[control]``. Raises `RigError`."""
+    default, frame_s = Control(), timing.frame_period_steps * timing.fast_step_s
+    control = Control(
+        delay_s=table.number("delay_s", min(default.delay_s, frame_s / 4), low=0.0),
+        when_lost=table.choice("when_lost", ("hold", "park"), default.when_lost),
+        gain=table.number("gain", default.gain, above=0.0),
+        leak=table.rate("leak", default.leak),
+        least_singular_value=table.rate("least_singular_value", default.least_singular_value),
+        effort=table.number("effort", default.effort, above=0.0),
+    )
+    if control.delay_s >= frame_s:
+        raise RigError(
+            f"{table.key('delay_s')} = {control.delay_s:g} is not below the {frame_s:g} s from one exposure to the"
+            " next: a loop whose commands come a whole frame too late is not supported"
+        )
+    return control
 
 
 def read_simulation(table: Table) -> Simulation:

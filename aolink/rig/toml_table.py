@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Callable, Iterable
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -18,16 +19,16 @@ _Read = TypeVar("_Read")
 
 _KEYS = """
 A actuators amplitude axes B B_w bias_v bit_depth bit_error_rate bit_flip_rate black_level black_level_sd block_steps
-C calibration camera clock_drift_ppm clock_offset_s command_loss_rate correlation_s counts_per_density
-counts_per_density_sd counts_per_intensity coupling dac_bits damping dark_frames delay_s delay_sd_s devices
-disturbance drift_s drive driver duplicate_rate exposure_offset exposure_steps fast_step_s faults field flat_frames
-focal_length_m footprint_m frame_period_steps frequency_hz gain gamma grid initial_covariance initial_mean input_max
-input_min kernel kernel_sigma_sd kind latency_s layers least_light lenslets light max_v mirror name noise_density
-noise_density_sd noise_sd obstruction offset outer_scale_m packet_loss_rate pad_radius_m park period_s photoelectrons
-photoelectrons_sd picture picture_pixels pitch_m pixel_scale pixels plant plant_noise process_noise pupil_m
-queue_steps r0_m radius_m recorded resonance_hz scene sd seed sensor shape sigma simulation slew_max_per_s
-slope_unit_rad sources still_frames summary tension_n_per_m timing turbulence unmodelled vibration voltage watchdog_s
-wavelength_m wind_m_s window zernike_m
+C calibration camera clock_drift_ppm clock_offset_s coefficients command_loss_rate control correlation_s
+counts_per_density counts_per_density_sd counts_per_intensity coupling dac_bits damping dark_frames delay_s delay_sd_s
+devices disturbance drift_s drive driver duplicate_rate effort exposure_offset exposure_steps fast_step_s faults field
+flat_frames focal_length_m footprint_m frame_period_steps frequency_hz gain gamma grid initial_covariance initial_mean
+input_max input_min kernel kernel_sigma_sd kind latency_s layers leak least_light least_singular_value lenslets light
+max_v mirror model modes name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m
+packet_loss_rate pad_radius_m park period_s photoelectrons photoelectrons_sd picture picture_pixels pitch_m
+pixel_scale pixels plant plant_noise process_noise pupil_m queue_steps r0_m radius_m recorded resonance_hz scene sd
+seed sensor shape sigma simulation slew_max_per_s slope_unit_rad sources step_sd still_frames summary tension_n_per_m
+timing turbulence unmodelled vibration voltage watchdog_s wavelength_m when_lost wind_m_s window zernike_m
 """
 KEYS = frozenset(_KEYS.split())
 """Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.
@@ -35,6 +36,22 @@ KEYS = frozenset(_KEYS.split())
 Where a key is missing, a key of the file that is not among these is taken for a misspelling of it if the two look
 alike. What the readers have asked for cannot tell: they have not asked yet for the keys after the missing one.
 """
+
+
+def named_file(folder: Path | None, name: str | Path, key: str) -> Path:
+    """The path of a file that a rig file in ``folder`` names under ``key``.
+
+    Raises
+    ------
+    RigError
+        There is no folder: the rig file comes out of a recording.
+    """
+    if folder is None:
+        raise RigError(
+            f"{key}: the rig file comes out of a recording, and such a one may not name files ({name}): save it as a"
+            " file of your own, look at it, and give that"
+        )
+    return folder / name
 
 
 def did_you_mean(written: Iterable[str], known: Iterable[str]) -> str:
@@ -138,10 +155,10 @@ class Table:
         self._expect(name, values, are_texts, "a list of texts")
         return tuple(values)
 
-    def rate(self, name: str) -> float:
-        value = self.number(name, 0.0, low=0.0)
+    def rate(self, name: str, default: float = 0.0) -> float:
+        value = self.number(name, default, low=0.0)
         if value > 1:
-            raise RigError(f"{self.key(name)} = {value:g} is a probability: it must be at most 1")
+            raise RigError(f"{self.key(name)} = {value:g} is a share or a probability: it must be at most 1")
         return value
 
     def integer(self, name: str, default: int | None = None, *, low: int, high: int = 2**31) -> int:
@@ -178,6 +195,13 @@ class Table:
             return np.full(size, float(array))
         if array.shape != (size,):
             raise RigError(f"{self.key(name)} has shape {shape_text(array)}, expected {size} ({why})")
+        return array
+
+    def numbers(self, name: str, why: str, *, most: int) -> FloatArray:
+        """A vector of one to ``most`` numbers; a number is one of them."""
+        array = np.atleast_1d(self._array(name, self.get(name)))
+        if array.ndim != 1 or not 0 < len(array) <= most:
+            raise RigError(f"{self.key(name)} has shape {shape_text(array)}, expected 1 to {most} numbers ({why})")
         return array
 
     def _array(self, name: str, value: Any) -> FloatArray:

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from aolink.control import check_stable, stability
 from aolink.devices.interfaces import Camera
 from aolink.devices.opening import open_devices
-from aolink.errors import AolinkError, DeviceError, PortError
+from aolink.errors import AolinkError, ControlError, DeviceError, PortError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
 from aolink.optics.scene import framed
@@ -23,6 +24,7 @@ from aolink.recording.mcap_file import WriteOptions
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Drive, Rig
 from aolink.rig.scene_table import read_scene_picture
+from aolink.session.controlling import Controlling, facts
 from aolink.session.estimating import BesideTheLoop, Outcome
 from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
 from aolink.session.report import EstimatorReport, Report
@@ -68,6 +70,8 @@ def record(
     note: str = "",
     calibration: str = "",
     inputs: Inputs | None = None,
+    control: str = "",
+    force: bool = False,
     watch: Watch | None = None,
     overwrite: bool = False,
     options: WriteOptions | None = None,
@@ -101,6 +105,12 @@ def record(
     inputs:
         Function that gives the inputs to command, instead of the rig's drive. The loop calls it, and sends the next
         commands when it returns.
+    control:
+        Name of the controller that closes the loop, one of `aolink.control.controller_names`: it gives the inputs,
+        instead of the rig's drive. The first of the estimators serves it. On virtual time an exposure changes the
+        inputs ``control.delay_s`` after its end; in real time as soon after that as it can.
+    force:
+        Close a loop that is unstable by the model all the same.
     watch:
         Called with each exposure and its estimates. An estimate that is not there when the next exposure comes is given
         with that one or a later one. In real time it is called on a thread of its own and may take its time:
@@ -121,6 +131,13 @@ def record(
     """
     estimators = list(dict.fromkeys(estimators))
     driver = Driver(rig, estimators)
+    controlling, of_control = None, {}
+    if control:
+        if calibration or inputs is not None:
+            raise ControlError("a controller gives the inputs itself: leave out the calibration, or the inputs")
+        controlling = Controlling(rig, control, estimators)
+        found = stability(rig, control) if force else check_stable(rig, control)
+        of_control = facts(rig, controlling, found.text())
     if calibration:
         rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
         rig = replace(rig, drive=rest)
@@ -129,8 +146,10 @@ def record(
         open_devices(rig, camera_port, mirror_port, stop) as (clock, camera, mirror, warnings),
         contextlib.ExitStack() as aside,
     ):
+        if control and not mirror.commanded:
+            raise ControlError("there is no mirror to close the loop with: give --mirror PORT, or [devices.mirror]")
         start_ns = clock.now_ns()
-        facts = {
+        session_facts = {
             "session": f"{start_ns:x}",
             "aolink_version": version("aolink"),
             "rig": rig.name,
@@ -142,22 +161,22 @@ def record(
             "virtual_time": str(clock.virtual),
             "estimators": " ".join(estimators),
             "note": note,
-        }
+        } | of_control
         if calibration:
-            facts[topics.CALIBRATION] = calibration
+            session_facts[topics.CALIBRATION] = calibration
         attachments = _true_scene(rig, camera)
         writer = RecordingWriter(
-            path, rig, facts, start_ns, overwrite=overwrite, deterministic=clock.virtual, attachments=attachments,
-            options=options,
+            path, rig, session_facts, start_ns, overwrite=overwrite, deterministic=clock.virtual,
+            attachments=attachments, options=options,
         )  # fmt: skip
         report.warnings += warnings
         show, beside = _shown(rig, watch), None
         if not clock.virtual:
             progress = aside.enter_context(_progress_aside(progress, report))
             show = aside.enter_context(_shown_aside(show, rig, report)) if show else None
-            beside = aside.enter_context(BesideTheLoop(rig, estimators))
+            beside = aside.enter_context(BesideTheLoop(rig, estimators, controlling.estimator if controlling else ""))
             clock.beside = beside.processes
-        loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, show, beside, report)
+        loop = SessionLoop(rig, clock, camera, mirror, writer, driver, inputs, show, beside, report, controlling)
         try:
             loop.run(exposures, stop, progress)
         except BaseException as error:

@@ -29,7 +29,7 @@ from aolink.numerics.workers import THREAD_VARIABLES
 from aolink.recording import convert
 from aolink.recording import schemas_pb2 as pb
 from aolink.rig import Rig
-from aolink.session.estimator_process import LENGTH, READY, packed
+from aolink.session.estimator_process import LENGTH, NICENESS, READY, packed
 from aolink.session.waiting import Waiting, most_waiting
 
 _SLICE_S = 0.1
@@ -125,14 +125,17 @@ class InTheLoop:
 
 
 class BesideTheLoop:
-    """One process for each estimator. Processes start and get ready while the session is prepared."""
+    """One process for each estimator. Processes start and get ready while the session is prepared.
 
-    def __init__(self, rig: Rig, names: Sequence[str]) -> None:
+    The one that ``controls`` has the priority of the loop, which waits for its estimates.
+    """
+
+    def __init__(self, rig: Rig, names: Sequence[str], controls: str = "") -> None:
         self.names = names
         self.processes: list[EstimatorProcess] = []
         try:
             for name in names:
-                self.processes.append(EstimatorProcess(rig, name))
+                self.processes.append(EstimatorProcess(rig, name, 0 if name == controls else NICENESS))
         except BaseException:
             self.close()
             raise
@@ -187,7 +190,7 @@ class BesideTheLoop:
 class EstimatorProcess:
     """The process of one estimator, seen from the loop: nothing here waits for it."""
 
-    def __init__(self, rig: Rig, name: str) -> None:
+    def __init__(self, rig: Rig, name: str, niceness: int) -> None:
         self.name = name
         self.ready = False
         """Whether it has computed and loaded what it needs."""
@@ -205,7 +208,7 @@ class EstimatorProcess:
         # in all processes of a pool: the cores are for the loop as well.
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         environment |= dict.fromkeys(THREAD_VARIABLES, "1")
-        main = f"from aolink.session.estimator_process import main; main({theirs.fileno()}, {os.getpid()})"
+        main = f"from aolink.session.estimator_process import main; main({theirs.fileno()}, {os.getpid()}, {niceness})"
         with theirs:
             # A group of its own: Ctrl-C is for the session, which waits for what is under way.
             self._process = subprocess.Popen(

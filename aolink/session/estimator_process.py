@@ -28,8 +28,9 @@ from aolink.rig import Rig
 
 LENGTH = struct.Struct("<Q")
 """Each message on the socket is a pickle behind its length."""
-_NICENESS = 5
-"""Where all cores are busy, the loop, the devices' drivers and the disk come first."""
+NICENESS = 5
+"""Of an estimator that nothing waits for: where all cores are busy, the loop, the devices' drivers, the disk and the
+estimator that closes the loop come first."""
 _PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux."""
 
@@ -45,12 +46,12 @@ def packed(message: object) -> bytes:
     return LENGTH.pack(len(data)) + data
 
 
-def main(fileno: int, parent: int) -> None:
+def main(fileno: int, parent: int, niceness: int) -> None:
     """Estimate the exposures that come over the socket until it is closed."""
     _end_with(parent)
     if sys.platform == "linux":  # a session that runs at real-time priority is one for its loop's sake
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    os.nice(_NICENESS)
+    os.nice(niceness)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with socket.socket(fileno=fileno) as connection, connection.makefile("rb") as stream:
         try:

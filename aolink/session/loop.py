@@ -20,13 +20,14 @@ from aolink.assembly import Assembler, Frame
 from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
 from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Event, Mirror, Time
 from aolink.errors import DeviceError
-from aolink.estimation import Driver
+from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure, Picture
 from aolink.recording import convert, topics
 from aolink.recording import schemas_pb2 as pb
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import MirrorDriver, Rig
 from aolink.session.account import REFUSALS, Account
+from aolink.session.controlling import MARGIN_S, Controlling
 from aolink.session.estimating import Estimating, InTheLoop, Outcome
 from aolink.session.report import EstimatorReport, LatencyBook, Report
 from aolink.wire import messages_pb2 as wire
@@ -82,6 +83,7 @@ class SessionLoop:
         show: Show | None = None,
         beside: Estimating | None = None,
         report: Report | None = None,
+        controlling: Controlling | None = None,
     ) -> None:
         self.report = report or Report()
         self.report.virtual_time = time.virtual
@@ -97,6 +99,9 @@ class SessionLoop:
         self._unseen_estimates: list[Outcome] = []
         """... and the estimates that have not."""
         self._inputs = inputs or partial(rig.drive.inputs, fast_step_s=rig.timing.fast_step_s)
+        self._controlling = controlling
+        if controlling is not None:
+            self.report.control = controlling.report
         self._assembler = Assembler(rig)
         self._step_ns = rig.timing.fast_step_ns
         self._first_step = _NOT_YET
@@ -126,6 +131,8 @@ class SessionLoop:
         if self._mirror.latched:
             self._rearm("in a session before")
         self._first_step = self._queued_until = self._start_camera(exposures)
+        if self._controlling is not None:
+            self._controlling.begin(self._first_step)
         if exposures:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
         self._send_commands(self._first_step)  # queued before the first step is due
@@ -271,13 +278,19 @@ class SessionLoop:
         if not self._mirror.commanded:
             return
         block_steps, end_step = self._rig.mirror.block_steps, self._end_step
-        horizon = device_step + lead_steps(self._rig.mirror)
+        lead, control, cause = lead_steps(self._rig.mirror), self._controlling, self._newest_frame
+        if control is not None:  # what is queued is sent anew after each exposure
+            lead, cause = LEAD_BLOCKS * block_steps, control.cause_frame
+        horizon = device_step + lead
+        if control is not None and self._time.virtual:
+            horizon = control.horizon(device_step)
+            end_step = horizon if end_step is None else min(end_step, horizon)
         while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
-            n_steps = block_steps if end_step is None else min(block_steps, end_step - self._queued_until)
-            since_start = self._queued_until - self._first_step
-            u = self._inputs(since_start, n_steps)
+            first = self._queued_until
+            n_steps = block_steps if end_step is None else min(block_steps, end_step - first)
+            u = control.loop.inputs(first, n_steps) if control else self._inputs(first - self._first_step, n_steps)
             now = self._time.now_ns()
-            block = self._mirror.send_block(self._queued_until, u, self._newest_frame, now)
+            block = self._mirror.send_block(first, u, cause, now)
             self._account.commanded(block)
             self._assembler.add_command(block)
             self._record(topics.COMMAND, block, now)
@@ -412,15 +425,32 @@ class SessionLoop:
             self._unseen = exposure
             self._unsettled[exposure.frame_id] = []
             outcomes = self._estimating.offer(exposure)
+            if self._controlling is not None and not self._controlling.estimator:
+                self._control(exposure, None, log_time_ns)
             if not self._estimating.names:
                 self._settle(exposure.frame_id)
             self._take_outcomes(outcomes, log_time_ns)
+
+    def _control(self, exposure: Exposure, estimate: Estimate | None, log_time_ns: int) -> None:
+        """Let the controller change the inputs that are not due yet: they are sent anew, and supersede the queued."""
+        if self._controlling is None or self._is_safe:
+            return
+        margin = 0 if self._time.virtual else round(MARGIN_S * 1e9) // self._step_ns + 1
+        change = self._controlling.see(exposure, estimate, self._device_step() + margin)
+        if change.first_step < self._queued_until:
+            self._queued_until = max(self._device_step() + 1, self._mirror.withdraw(change.first_step))
+        self._record(topics.CONTROL, change.message, log_time_ns)
+        if change.warning:
+            self.report.warnings.append(change.warning)
+            self._log(Log.WARNING, change.warning)
 
     def _take_outcomes(self, outcomes: Sequence[Outcome], log_time_ns: int) -> None:
         for outcome in outcomes:
             name, frame_id, message = outcome.estimator, outcome.exposure.frame_id, outcome.message
             if message is not None:
                 self._record(topics.estimate_topic(name), message, log_time_ns)
+                if self._controlling is not None and name == self._controlling.estimator:
+                    self._control(outcome.exposure, outcome.estimate(self._rig), log_time_ns)
                 if self._show is not None:
                     self._unseen_estimates.append(outcome)
             if name in self.report.estimation:
@@ -459,6 +489,8 @@ class SessionLoop:
         self._record(topics.APPLIED, applied, receive_ns)
         if applied.source != wire.Applied.AWAITED:
             self._account.reported(applied)
+        if self._controlling is not None:
+            self._controlling.applied(applied)
         is_report = applied.source not in (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
         if is_report and applied.first_step >= self._first_step:  # not before the clock is known
             since_zero_ns = (applied.first_step + applied.n_steps) * self._step_ns

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.control import Act, ControlLoop
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure
@@ -71,6 +74,54 @@ def replay(
         yield exposure, driver.step(exposure)
     if began is None and not stop():
         raise RecordingError(f"{recording.path} has no exposure {between(start_s, end_s)}")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WouldCommand:
+    """What a controller would have commanded after an exposure, and what was held."""
+
+    act: Act
+    inputs: NDArray[np.float64]
+    """From ``act.first_step`` on, as the mirror's converter puts them out, to the same step after the next exposure,
+    (k, n_inputs)."""
+    recorded: NDArray[np.float64]
+    """What the mirror held in those of these steps that the recording knows, (at most k, n_inputs)."""
+
+
+def would_command(
+    recording: Recording, controller: str, estimator: str, *, stop: Callable[[], bool] = lambda: False
+) -> Iterator[WouldCommand]:
+    """What a controller would have commanded, exposure by exposure, had it been asked in the session.
+
+    Each exposure, and the inputs that were pending at its end, are those of the recording: the answer is to what
+    happened, not to what would have come of it.
+
+    Raises
+    ------
+    ControlError, EstimatorError
+        There is no such controller or estimator, or it cannot work on this rig.
+    """
+    rig = recording.rig
+    loop = ControlLoop(rig, controller)
+    driver = Driver(rig, [estimator] if loop.needs_state else [])
+    before: Exposure | None = None
+    for exposure in chain(recording.exposures(), [None]):
+        if stop():
+            return
+        held = np.empty((0, rig.n_inputs))
+        if exposure is not None:
+            held = np.concatenate([exposure.lead_inputs, exposure.inputs])
+        if before is None:
+            loop.begin(0 if exposure is None else exposure.first_step)
+        else:
+            end = before.first_step + before.n_steps
+            loop.inputs(end, loop.delay_steps)
+            loop.applied(end, held)
+            estimate = next(iter(driver.step(before)), None)
+            act = loop.see(before, estimate, end)
+            wanted = rig.mirror.quantise(loop.inputs(act.first_step, rig.timing.frame_period_steps))
+            yield WouldCommand(act=act, inputs=wanted, recorded=held[act.first_step - end :][: len(wanted)])
+        before = exposure
 
 
 class RecordedCommands:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
+from aolink.control import Act, State
 from aolink.recording import schemas_pb2 as pb
 from aolink.session.estimating import Outcome
 from aolink.wire import messages_pb2 as wire
@@ -33,6 +36,57 @@ class EstimatorReport:
         self.estimated += 1
         self.took_ms.append(outcome.took_ns / 1e6)
         del self.took_ms[:-_KEPT_LATENCIES]
+
+
+@dataclass(kw_only=True)
+class ControlReport:
+    """Counts of the closed loop of a session."""
+
+    controller: str
+    estimator: str
+    """That serves it; empty for none."""
+    exposures: int = 0
+    """Exposures that it has taken."""
+    open_exposures: int = 0
+    """Of them, those with which the loop was open: the mirror held its input, or went to the safe one."""
+    late_exposures: int = 0
+    """Of them, those that changed the inputs later than the rig file's ``control.delay_s``."""
+    misfit_exposures: int = 0
+    """Of them, those at which the model no longer fitted."""
+    clipped_steps: int = 0
+    """Fast steps whose wanted input the limits have changed."""
+    slope_rms: float = float("nan")
+    """Root mean square of the centroids over all exposures, slope units."""
+    delay_ms: list[float] = field(default_factory=list)
+    """From the end of each exposure to the first step that it changed; the newest ones, `_KEPT_LATENCIES` at most."""
+    note: str = ""
+    """What the newest exposure says, in a few words, for a screen."""
+    _squares: tuple[float, int] = (0.0, 0)
+
+    def add(self, act: Act, fast_step_s: float) -> None:
+        """Count an exposure."""
+        self.exposures += 1
+        self.open_exposures += act.state is not State.CLOSED
+        self.late_exposures += act.late
+        self.misfit_exposures += act.fit is not None and not act.fit.fits
+        self.clipped_steps += act.clipped_steps
+        if not math.isnan(act.slope_rms):
+            total, count = self._squares
+            self._squares = total + act.slope_rms**2, count + 1
+            self.slope_rms = math.sqrt(self._squares[0] / self._squares[1])
+        self.delay_ms.append(1e3 * act.delay_steps * fast_step_s)
+        del self.delay_ms[:-_KEPT_LATENCIES]
+        state = "" if act.state is State.CLOSED else f", loop {act.state.name.lower()}"
+        self.note = f"slopes {act.slope_rms:.3g} rms, delay {self.delay_ms[-1]:.3g} ms{state}"
+        if act.fit is not None and not act.fit.fits:
+            self.note += ", the model does not fit"
+
+    def counts(self) -> dict[str, Any]:
+        """Everything but the single delays, of which it gives the median and the longest."""
+        names = ("exposures", "open_exposures", "late_exposures", "misfit_exposures", "clipped_steps", "slope_rms")
+        delays = sorted(self.delay_ms)
+        delay = {"delay_ms": delays[len(delays) // 2], "longest_delay_ms": delays[-1]} if delays else {}
+        return {name: getattr(self, name) for name in names} | delay
 
 
 @dataclass(kw_only=True)
@@ -84,6 +138,8 @@ class Report:
     clock_sigma_ns: float = float("nan")
     estimation: dict[str, EstimatorReport] = field(default_factory=dict)
     """By the estimator's name. Empty on virtual time, which waits for every estimate."""
+    control: ControlReport | None = None
+    """Of the closed loop; None where the session played its inputs."""
     unwatched: int = 0
     """Exposures for which the watcher had no time."""
     warnings: list[str] = field(default_factory=list)
@@ -99,12 +155,15 @@ class Report:
 
     def counts(self) -> dict[str, str]:
         """Everything but the latencies, as text, for the recording's metadata."""
-        facts = asdict(self)
-        del facts["latencies"], facts["warnings"], facts["files"], facts["estimation"], facts["unwatched"]
+        facts = asdict(replace(self, control=None))
+        for name in ("latencies", "warnings", "files", "estimation", "unwatched", "control"):
+            del facts[name]
         for name, each in self.estimation.items():
             facts[f"skipped_{name}"] = each.skipped
             if each.took_ms:
                 facts[f"estimate_ms_{name}"] = round(statistics.median(each.took_ms), 3)
+        if self.control is not None:
+            facts |= {f"control_{name}": value for name, value in self.control.counts().items()}
         return {name: str(value) for name, value in facts.items()} | {"warnings": "; ".join(self.warnings)}
 
 

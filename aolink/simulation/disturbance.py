@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RigError
+from aolink.limits import load_archive, load_array
 from aolink.optics.turbulence import FrozenFlow
 from aolink.optics.wavefront import zernike_modes
 from aolink.rig import Rig
@@ -74,16 +75,17 @@ class DisturbancePlayer:
 
 def _recorded(rig: Rig, name: str) -> FloatArray:
     """Slopes from a .npy, .npz (its only array) or .csv file, beside the rig file where its path is relative."""
-    path = rig.folder / name
+    path = rig.path_of(name, "disturbance.recorded")
     try:
         if path.suffix == ".csv":
             found = np.loadtxt(path, delimiter=",", ndmin=2)
+        elif path.suffix == ".npz":
+            arrays = load_archive(path, RigError)
+            if len(arrays) != 1:
+                raise ValueError(f"it holds {len(arrays)} arrays, expected one")
+            (found,) = arrays.values()
         else:
-            found = np.load(path)
-            if isinstance(found, np.lib.npyio.NpzFile):
-                if len(found.files) != 1:
-                    raise ValueError(f"it holds {len(found.files)} arrays, expected one")
-                found = found[found.files[0]]
+            found = load_array(path)
         slopes = np.asarray(found, dtype=np.float64)
     except OSError as error:
         raise RigError(f"disturbance.recorded: cannot read {path}: {(error.strerror or str(error)).lower()}") from None

@@ -201,11 +201,14 @@ def simulate(
         model.start_camera(0, n_exposures)
     frames = model.advance(inputs[:n_steps])
     ends = [0] + [frame.first_step + frame.n_steps for frame in frames]
-    return [_exposure(rig, frame, inputs, after) for frame, after in zip(frames, ends[:-1], strict=True)]
+    return [
+        exposure_of(rig, frame, inputs[frame.first_step : end].copy(), inputs[after : frame.first_step].copy())
+        for frame, after, end in zip(frames, ends[:-1], ends[1:], strict=True)
+    ]
 
 
-def _exposure(rig: Rig, frame: CameraFrame, inputs: FloatArray, after: int) -> Exposure:
-    """The exposure of a frame; ``after`` is the end of the one before it."""
+def exposure_of(rig: Rig, frame: CameraFrame, inputs: FloatArray, lead_inputs: FloatArray) -> Exposure:
+    """The exposure of a frame, with the inputs in it and those since the exposure before, (k, n_inputs)."""
     start, end = frame.first_step, frame.first_step + frame.n_steps
     step_ns, late_ns = rig.timing.fast_step_ns, rig.timing.exposure_offset_ns
     return Exposure(
@@ -214,8 +217,8 @@ def _exposure(rig: Rig, frame: CameraFrame, inputs: FloatArray, after: int) -> E
         n_steps=frame.n_steps,
         pixels=frame.pixels,
         mask=np.ones(frame.pixels.shape, dtype=np.bool_),
-        inputs=inputs[start:end].copy(),
-        lead_inputs=inputs[after:start].copy(),
+        inputs=inputs,
+        lead_inputs=lead_inputs,
         start_offset=late_ns / step_ns,
         device_start_ns=start * step_ns + late_ns,
         device_end_ns=end * step_ns + late_ns,

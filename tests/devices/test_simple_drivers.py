@@ -402,6 +402,10 @@ def test_a_command_that_changes_too_fast_is_refused() -> None:
     with pytest.raises(DeviceError, match=r"input 0 changes by 0.0015 to fast step 3, more than mirror.slew_max_per_s"):
         mirror.send_block(2, np.array([[0.003], [0.0045]]), 0, 0)
     mirror.send_block(2, np.array([[0.003], [0.004]]), 0, 0)
+    # One that replaces queued steps goes on from the step before them, not from the last that was sent.
+    mirror.send_block(1, np.array([[0.0005], [0.0]]), 0, 0)
+    with pytest.raises(DeviceError, match=r"input 0 changes by 0\.004 to fast step 4"):
+        mirror.send_block(4, np.array([[0.0]]), 0, 0)
 
 
 @pytest.mark.parametrize(("lacks", "expected"), [((), 3e6), ((Lacks.QUEUE,), 0.0)])

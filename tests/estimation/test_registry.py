@@ -47,7 +47,7 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     assert scored["threshold"]["path_rmse"] < 0.8 * scored["open-loop"]["path_rmse"]
     asked = (
         "from aolink.estimation import ESTIMATOR_NAMES;"
-        "from aolink.colours import estimator_colour; from aolink.colours import by_rank;"
+        "from aolink.colours import by_rank, estimator_colour;"
         "print(ESTIMATOR_NAMES[:3], estimator_colour('threshold'), by_rank(['o3', 'threshold', 'o1']))"
     )
     told = subprocess.run([sys.executable, "-c", asked], env=with_example, capture_output=True, text=True, check=True)

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import re
 
+import numpy as np
 import pytest
 
 from aolink.jobs.check_rig import check_rig
 from aolink.rig import builtin_rigs, load_rig, parse_rig
 
 SECTION_VI = load_rig("section-vi").toml
+
+
+def swinging(turn: float) -> str:
+    """A of a damped oscillation that turns by so much in a fast step, rad."""
+    return str([[0.99 * math.cos(turn), 0.99 * math.sin(turn)], [-0.99 * math.sin(turn), 0.99 * math.cos(turn)]])
 
 
 def found(severity: str, **values: str) -> dict[str, str]:
@@ -50,7 +57,21 @@ def test_what_cannot_work_is_an_error(values: dict[str, str], key: str, message:
         ({"frame_period_steps": "100000"}, "timing.frame_period_steps", "looks for 0.002 of the time"),
         ({"fast_step_s": "1e-6"}, "timing.frame_period_steps", "5 kHz are more than a host takes"),
         ({"sigma": "0.8"}, "sensor.kernel.sigma", "every frame cuts the spot off"),
-        ({"sigma": "0.02"}, "sensor.kernel.sigma", "under a third of a pixel"),
+        ({"sigma": "0.02"}, "sensor.kernel.sigma", r"sigma is 0\.4 pixels, .* from 0\.8 on"),
+        ({"noise_density": "7"}, "sensor.noise_density", r"is 0\.88 in the brightest pixel .* from 1 on"),
+        ({"process_noise": "100"}, "plant.process_noise", "by 13.1 sds of the kernel .* up to 8"),
+        ({"A": swinging(0.4)}, "timing.exposure_steps", r"swings 12\.7 times in an exposure, .* up to 8"),
+        ({"A": swinging(1.2), "exposure_steps": "20"}, "timing.fast_step_s", r"5\.2 fast steps in one swing"),
+        (
+            {
+                "A": str(np.diag([0.99, 0.98, 0.97, 0.96]).tolist()),
+                "B": "[[0.0], [0.0], [0.0], [0.1]]",
+                "B_w": "[[0.05], [0.05], [0.05], [0.05]]",
+                "C": "[[1.0, 1.0, 1.0, 1.0]]",
+            },
+            "plant.A",
+            "4 modes of the plant move the spot",
+        ),
         ({"black_level": "100"}, "sensor.black_level", "clipped at zero"),
         ({"photoelectrons": "1"}, "sensor.photoelectrons", "4e.04 counts for each photo-electron"),
         ({"process_noise": "100"}, "sensor.field", "beyond the field"),

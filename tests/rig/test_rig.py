@@ -345,6 +345,81 @@ def test_the_list_of_keys_is_that_of_the_keys_that_the_readers_ask_for() -> None
 
 def test_the_rooms_page_names_every_key() -> None:
     page = (Path(tables.__file__).parent / "README.md").read_text()
-    top = {"drive", "lenslets", "mirror", "plant", "scene", "sensor", "simulation", "timing"}
+    top = {"control", "drive", "lenslets", "mirror", "plant", "scene", "sensor", "simulation", "timing"}
     named = set(re.findall(r"\b[A-Za-z_0-9]+\b", "".join(re.findall(r"`[^`]+`", page))))
     assert named | top >= KEYS
+
+
+MODELS = {
+    "resonance": 'kind = "resonance"\nfrequency_hz = 12.0\ndamping = 0.05\nsd = 0.2',
+    "ornstein-uhlenbeck": 'kind = "ornstein-uhlenbeck"\ncorrelation_s = 0.1\nsd = 0.2',
+    "ar": 'kind = "ar"\ncoefficients = [1.2, -0.5, 0.1]\nsd = 0.2',
+    "matrices": 'kind = "matrices"\nA = [[0.6]]\nB_w = [[1.0]]\nC = [[2.0]]\nprocess_noise = 0.0064',
+}
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_a_disturbance_model_adds_states_whose_outputs_have_the_sd_that_it_says(kind: str) -> None:
+    rig = parse_rig(f"{TEXT}\n[[disturbance.model]]\n{MODELS[kind]}\n")
+    alone, plant = load_rig("section-vi").plant, rig.plant
+    n = plant.disturbance_states
+    assert plant.n_states == alone.n_states + n
+    assert not plant.B[-n:].any()
+    assert np.array_equal(plant.A[:-n, :-n], alone.A)
+    assert not plant.A[:-n, -n:].any()
+    # Through Lyapunov's equation: A P A' + Q = P.
+    A, C, P = plant.A[-n:, -n:], plant.C[:, -n:], plant.initial_covariance[-n:, -n:]
+    Q = (plant.B_w @ plant.process_noise @ plant.B_w.T)[-n:, -n:]
+    assert np.allclose(A @ P @ A.T + Q, P)
+    assert np.isclose(np.sqrt(C @ P @ C.T), 0.2)
+
+
+def test_parts_of_a_disturbance_model_add_up_and_modes_share_the_outputs_between_them() -> None:
+    """One resonance that shakes x and y together, and a wandering of each on its own."""
+    text = f"""{load_rig("tip-tilt").toml}
+[[disturbance.model]]
+kind = "resonance"
+frequency_hz = 43.0
+damping = 0.01
+modes = [[0.6], [0.8]]
+sd = 0.1
+[[disturbance.model]]
+kind = "random-walk"
+step_sd = [0.001, 0.002]
+"""
+    plant = parse_rig(text).plant
+    C, P = plant.C[:, -4:], plant.initial_covariance[-4:, -4:]
+    assert plant.disturbance_states == 4
+    assert np.allclose(C[:, :2] @ P[:2, :2] @ C[:, :2].T, 0.01 * np.outer([0.6, 0.8], [0.6, 0.8]))
+    assert np.allclose(np.diag(plant.process_noise)[-2:], [1e-6, 4e-6])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('kind = "pink"', r"disturbance.model\[0\].kind = 'pink' is not known: use one of resonance, ornstein"),
+        ('kind = "resonance"\nfrequency_hz = 600.0\ndamping = 0.1\nsd = 0.1', "frequency_hz = 600 is beyond"),
+        ('kind = "resonance"\nfrequency_hz = 6.0\nsd = 0.1', r"model\[0\].damping is missing"),
+        ('kind = "ar"\ncoefficients = [1.0]\nsd = 0.1', "does not die out .* modulus 1, .* use kind = 'random-walk'"),
+        ('kind = "ar"\ncoefficients = [1, 1, 1, 1, 1]\nsd = 0.1', r"has shape 5, expected 1 to 4 numbers"),
+        ('kind = "matrices"\nA = [[0.5]]\nB_w = [[1.0]]\nC = [[1.0], [1.0]]\nprocess_noise = 1.0', "shape 2 x 1"),
+        ('kind = "ornstein-uhlenbeck"\ncorrelation_s = 1.0\nsd = [0.1, 0.1]', "sd has shape 2, expected 1 "),
+    ],
+)
+def test_a_disturbance_model_that_cannot_work_is_refused(text: str, message: str) -> None:
+    with pytest.raises(RigError, match=message):
+        parse_rig(f"{TEXT}\n[[disturbance.model]]\n{text}\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("delay_s = 0.2", r"control.delay_s = 0.2 is not below the 0.2 s from one exposure to the next"),
+        ("gain = 0", "control.gain = 0 must be above 0"),
+        ('when_lost = "stop"', "control.when_lost = 'stop' is not known: use one of hold, park"),
+        ("leak = 2", "control.leak = 2 is a share or a probability: it must be at most 1"),
+    ],
+)
+def test_a_control_table_that_cannot_work_is_refused(text: str, message: str) -> None:
+    with pytest.raises(RigError, match=message):
+        parse_rig(f"{TEXT}\n[control]\n{text}\n")

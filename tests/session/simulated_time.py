@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.writer import RecordingWriter
 from aolink.rig import Rig
+from aolink.session.controlling import Controlling
 from aolink.session.loop import Inputs, SessionLoop
 from aolink.session.report import Report
 from aolink.simulation.devices import Line
@@ -197,6 +198,8 @@ def run_session(
     exposures: int,
     *,
     inputs: Inputs | None = None,
+    controller: str = "",
+    estimators: Sequence[str] = (),
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
 ) -> Run:
@@ -213,8 +216,10 @@ def run_session(
         link.reset_counts()
     with RecordingWriter(path, rig, {}, hub.now_ns(), deterministic=True) as writer:
         loop = SessionLoop(
-            rig, hub, camera, mirror, writer, Driver(rig, []), inputs, lambda exposure, _: live.append(exposure)
-        )
+            rig, hub, camera, mirror, writer, Driver(rig, estimators), inputs,
+            lambda exposure, _: live.append(exposure),
+            controlling=Controlling(rig, controller, estimators) if controller else None,
+        )  # fmt: skip
         run = Run(hub, loop, mirror, path, live)
         try:
             loop.run(exposures, stop, progress)

@@ -96,7 +96,7 @@ def test_the_wire_gives_what_the_model_gives_in_memory(session: Path) -> None:
 def test_the_true_scene_is_in_the_recording_of_a_simulated_rig(session: Path) -> None:
     true = Recording(session).true_scene
     assert true is not None
-    expected = SCENE.to_counts(framed(SCENE, read_scene_picture(SCENE, must_be(Path, RIG.folder))))
+    expected = SCENE.to_counts(framed(SCENE, read_scene_picture(SCENE, RIG.folder)))
     np.testing.assert_array_equal(true, expected)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import subprocess
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +26,8 @@ from aolink.recording.reestimate import (
     write_reestimated,
 )
 from aolink.rig import load_rig, parse_rig
-from aolink.session import Report, record
+from aolink.session import record
 from tests.conftest import ESTIMATORS, EXPOSURES, Session
-from tests.session.native import open_native
 
 
 def test_everything_is_received_and_recorded(recorded: Session) -> None:
@@ -217,71 +215,6 @@ def test_a_bad_link_loses_frames_and_nothing_else(tmp_path: Path) -> None:
     assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"])["o3"]) is None
     sd = np.concatenate([e.path_sd for e in recording.estimates("o3")])
     assert np.isfinite(sd).all()
-
-
-def test_real_time_has_latencies_and_accounts_for_every_step(tmp_path: Path) -> None:
-    """The clock runs here, so nothing is said about how fast; only that order and counts are right."""
-    path = tmp_path / "real.mcap"
-    with simulated_rig("section-vi-lively", "--real-time") as (camera, mirror):
-        report = record(load_rig("section-vi-lively"), camera, mirror, path, estimators=["o3"], exposures=4)
-    assert (report.ended, report.exposures, report.virtual_time) == ("complete", 4, False)
-    assert report.steps_commanded == report.steps_applied + report.steps_parked == 800
-    assert report.steps_late == report.steps_parked
-    assert len(report.latencies) == 4
-    for latency in report.latencies:
-        assert 0 < latency.first_byte_ns <= latency.complete_ns <= latency.estimated_ns
-    exposures = list(Recording(path).exposures())
-    assert [e.frame_id for e in exposures] == [1, 2, 3, 4]
-    for exposure in exposures:
-        assert exposure.host_receive_ns > exposure.host_start_ns
-        assert 0 < exposure.clock_sigma_ns < 10_000_000
-    recording = Recording(path)
-    assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"], as_recorded=True)["o3"]) is None
-
-
-def stopped_host(path: Path, seconds: float) -> Report:
-    """A session in real time whose host is held up in the middle of its second exposure."""
-    rig = load_rig("section-vi-lively")
-
-    def inputs(first_step: int, n_steps: int) -> np.ndarray:
-        if first_step == 300:
-            time.sleep(seconds)  # the fault itself, not a wait for something
-        return rig.drive.inputs(first_step, n_steps, rig.timing.fast_step_s)
-
-    with simulated_rig("section-vi-lively", "--real-time") as (camera, mirror):
-        return record(rig, camera, mirror, path, exposures=8, inputs=inputs)
-
-
-@pytest.mark.parametrize("seconds", [0.3, 1.0])
-def test_a_host_that_is_held_up_has_every_step_accounted_for(tmp_path: Path, seconds: float) -> None:
-    report = stopped_host(tmp_path / "a.mcap", seconds)
-    assert report.ended == "complete"
-    assert report.frames_received + report.frames_lost == 8
-    assert report.steps_applied + report.steps_parked == 1600
-    assert report.steps_parked > 0
-    assert report.steps_superseded == report.steps_not_reported == 0
-    assert report.steps_commanded == report.steps_applied + report.steps_late + report.steps_refused
-    if not report.rearmed:  # otherwise the watchdog had parked the mirror by then: it refused what came until told
-        assert report.steps_late == report.steps_parked
-
-
-def test_what_a_killed_host_left_behind_is_not_in_the_next_session(tmp_path: Path) -> None:
-    """The camera still runs and commands are queued, with a gap before them; the next session knows nothing of it."""
-    rig = load_rig("section-vi-lively")
-    for how in ([], ["--real-time"]):
-        path = tmp_path / f"{len(how)}.mcap"
-        with simulated_rig("section-vi-lively", *how) as ports:
-            with open_native(rig, *ports) as (hub, camera, mirror):
-                first = mirror.identity.next_step + 300
-                camera.start(first, 0)
-                mirror.send_block(first + 50, np.full((50, 1), 0.01), 0, hub.now_ns())
-                mirror.send_block(first + 100, np.full((50, 1), 0.01), 0, hub.now_ns())
-                hub.wait(0.1)
-            report = record(rig, *ports, path, estimators=["o3"], exposures=3)
-        assert (report.ended, report.exposures, report.frames_received) == ("complete", 3, 3)
-        exposures = list(Recording(path).exposures())
-        assert [e.first_step - exposures[0].first_step for e in exposures] == [0, 200, 400]
-        assert np.abs(exposures[0].inputs[0]).max() < 1e-5
 
 
 def test_a_rig_file_with_other_numbers_is_a_warning(tmp_path: Path) -> None:

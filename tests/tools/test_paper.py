@@ -20,7 +20,9 @@ from aolink.rig import Rig, load_rig
 pytest.importorskip("matplotlib", reason="tools/paper draws with it: install aolink[plot]")
 
 TOOLS = Path(__file__).parents[2] / "tools"
-FIGURES = ("figure-4.png", "figure-5.png", "figure-6.png", "figure-7.png", "remarks.png", "map.png", "limit.png")
+FIGURES = (
+    "figure-4.png", "figure-5.png", "figure-6.png", "figure-7.png", "remarks.png", "map.png", "limit.png", "family.png"
+)  # fmt: skip
 SECTIONS = (
     "Every printed number beside ours",
     "Figures 4 to 7",
@@ -32,6 +34,7 @@ SECTIONS = (
     "A shake faster than the frames",
     "How near to the limit",
     "Not worse than o1, anywhere",
+    "A family of plants that nobody tuned for",
     "Blur that nobody here made",
     "Films whose motion we know",
 )

@@ -24,9 +24,12 @@ from aolink.exposure import Exposure
 from aolink.optics.camera import to_density
 from aolink.rig import Rig
 from paper_report.ensemble import Cell, Measured, clean_exposures, errors, side_by_side, with_pixel_noise
+from paper_report.family import SWINGS, draw
+from paper_report.judge import LIMIT, Row
 from paper_report.limit import NAMES, Found
 from paper_report.limit import Scene as LimitScene
 from paper_report.numbers import Effort, Remark1, Remark2
+from paper_report.verdict import JUDGED, SCENE_INSIDE, by_estimator, ratios
 
 FloatArray = NDArray[np.float64]
 
@@ -324,3 +327,29 @@ def figure_limit(path: Path, table: Sequence[LimitScene], dpi: int) -> None:
         for ax in (left, right):
             ax.grid(axis="y", **_GRID)
         figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=len(NAMES))
+
+
+def figure_family(path: Path, given: Sequence[Row], dpi: int) -> None:
+    """Each scene a point: path RMSE over the sampler's, and coverage, against swings in an exposure."""
+    rows = by_estimator(given)
+    with _figure(path, dpi, (9.5, 4.2), 1, 2) as (figure, ((left, right),)):
+        for name in ("o1", *JUDGED):
+            style = {"marker": _MARKERS[name], "color": _colour(name), "linestyle": "none", "markersize": 4.5}
+            over = ratios(rows, name, LIMIT)
+            left.plot([_swings(seed) for seed in over], list(over.values()), label=name, **style)
+            found = rows[name]
+            right.plot([_swings(seed) for seed in found], [np.mean(row.inside) for row in found.values()], **style)
+        left.axhline(1, color=_colour(LIMIT), linewidth=1.2)
+        left.set(ylabel="path RMSE / sampled's", ylim=(0.5, 4))
+        for end in SCENE_INSIDE:
+            right.axhline(end, color="0.5", linewidth=0.9, linestyle=":")
+        right.set(ylim=(0, 1.02), ylabel="coverage of 95 % intervals")
+        for ax in (left, right):
+            ax.set(xscale="log", xlabel="swings of the fastest mode in an exposure")
+            ax.grid(**_GRID)
+        figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+
+
+def _swings(seed: int) -> float:
+    """Of a random walk, which has none, the least of the family."""
+    return max(draw(seed).swings, SWINGS[0] / 5)

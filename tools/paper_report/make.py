@@ -16,6 +16,7 @@ from paper_report import figures, shahin
 from paper_report import numbers as n
 from paper_report.blocks import as_html, as_markdown
 from paper_report.ensemble import Cell, map_cells
+from paper_report.judge import judge_plan
 from paper_report.limit import against_o1, limit_table
 from paper_report.made_films import made_films
 from paper_report.page import Results, build
@@ -35,7 +36,7 @@ def make(out: Path, effort: n.Effort) -> list[Path]:
     """Make everything in ``out``; the pages' paths."""
     mpl.use("Agg")
     out.mkdir(parents=True, exist_ok=True)
-    results = compute(effort)
+    results = compute(effort, out)
     with _timed("figures"):
         draw(out, results)
     write_map(out / "map.csv", results.cells)
@@ -48,8 +49,8 @@ def make(out: Path, effort: n.Effort) -> list[Path]:
     return [page, restored]
 
 
-def compute(effort: n.Effort) -> Results:
-    """All runs."""
+def compute(effort: n.Effort, out: Path) -> Results:
+    """All runs; the rows of the family of plants are kept in the folder, and are not made again."""
     printed, lively = load_rig("section-vi"), load_rig("section-vi-lively")
     with _timed("printed numbers"):
         rows = [*n.plant_rows(printed, effort), *n.noise_rows(printed, effort.noise_frames), *n.kernel_rows(printed)]
@@ -69,6 +70,8 @@ def compute(effort: n.Effort) -> Results:
         spheres = film(effort)
     with _timed("made films"):
         made = made_films(effort)
+    with _timed("family"):
+        family = judge_plan(out / "family.jsonl", effort.family)
     with _timed("map"):
         mechanism = n.mechanism(lively, effort)
         cells = map_cells(
@@ -78,7 +81,7 @@ def compute(effort: n.Effort) -> Results:
     return Results(
         printed=printed, lively=lively, effort=effort, rows=rows, norms=norms, errors=errors, forms=forms,
         remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, over_o1=over_o1, film=spheres,
-        made=made, cells=cells,
+        made=made, family=family, cells=cells,
     )  # fmt: skip
 
 
@@ -93,6 +96,7 @@ def draw(out: Path, results: Results) -> None:
     figures.figure_remarks(out / "remarks.png", results.remark_1, results.remark_2, dpi)
     figures.figure_map(out / "map.png", results.cells, dpi)
     figures.figure_limit(out / "limit.png", results.limit, dpi)
+    figures.figure_family(out / "family.png", results.family, dpi)
 
 
 def write_map(path: Path, cells: Sequence[Cell]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from aolink.plant.lifting import input_response, lift
 from aolink.plant.observability import observability
 from aolink.rig import Plant, Rig
 from paper_report.ensemble import Measured, ensemble, mean, measure_errors, ratio, rms, variant
+from paper_report.judge import Plan, Size
 from paper_report.printed import FORMS, output_errors
 
 FloatArray = NDArray[np.float64]
@@ -52,6 +53,7 @@ class Effort:
     """Which kinds of made films, from the first to before the second."""
     made_seeds: int = 5
     made_exposures: int = 14
+    family: Plan = field(default_factory=Plan)
     particles: int = 1500
     """Of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -66,6 +68,10 @@ QUICK = Effort(
     noise_frames=20_000, runs=16, exposures=14, cycle_exposures=20, skip=4, map_runs=16, shake_runs=6,
     limit_runs=2, limit_exposures=4, limit_skip=1, o1_runs=4, o1_exposures=4, particles=150, film_exposures=3,
     made_kinds=(3, 4), made_seeds=1, made_exposures=5,
+    family=Plan(
+        scenes=4, pixel_scenes=2, limit_scenes=1,
+        size=Size(runs=4, exposures=5, skip=2, pixel_runs=1, limit_runs=1, particles=150),
+    ),
     offsets=(0.0, 0.5), densities=(0.1, 0.01), process_noises=(0.1, 10.0), frequencies=100, dpi=70,
 )  # fmt: skip
 

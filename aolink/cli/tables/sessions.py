@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from aolink.jobs.demo import DemoResult
     from aolink.recording.deblur import Summary
     from aolink.session import EstimatorReport, Report
+    from aolink.session.report import ControlReport
 
 _LATENCY_STEPS = (
     ("exposure end to first byte", "exposure_end_ns", "first_byte_ns"),
@@ -30,8 +31,10 @@ _LATENCY_STEPS = (
 
 def session_as_json(report: Report) -> dict[str, Any]:
     """What `session` says, for scripts."""
-    facts = asdict(replace(report, latencies=[]))
+    facts = asdict(replace(report, latencies=[], control=None))
     del facts["latencies"]
+    if (control := report.control) is not None:
+        facts["control"] = {"controller": control.controller, "estimator": control.estimator, **control.counts()}
     for each in facts["estimation"].values():
         took_ms = each.pop("took_ms")
         each["ms"] = dict(zip(("p50", "p99"), np.percentile(took_ms, [50, 99]), strict=True)) if took_ms else {}
@@ -76,6 +79,8 @@ def session(report: Report) -> Table:
     )
     for name, each in report.estimation.items():
         table.add_row("estimates", f"{name}: {_estimation(each)}")
+    if report.control is not None:
+        table.add_row("control", _control(report.control))
     if report.unwatched:
         table.add_row("view", f"{report.unwatched} exposures not shown, for want of time")
     if report.virtual_time:
@@ -83,6 +88,18 @@ def session(report: Report) -> Table:
     for name, since, until in () if report.virtual_time else _LATENCY_STEPS:
         table.add_row("latency", f"{name}: {_percentiles(report.latencies, since, until)}")
     return table
+
+
+def _control(report: ControlReport) -> str:
+    served = f" with {report.estimator}" if report.estimator else ""
+    text = f"{report.controller}{served}: {report.exposures} exposures taken, slopes {report.slope_rms:.4g} rms"
+    if counts := report.counts().get("delay_ms"):
+        text += f"; delay p50 {counts:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
+    text += f", {report.late_exposures} later than control.delay_s"
+    return text + (
+        f"; loop open for {report.open_exposures} exposures, model off for {report.misfit_exposures}; limits changed"
+        f" {report.clipped_steps} steps"
+    )
 
 
 def _estimation(report: EstimatorReport) -> str:
@@ -148,6 +165,9 @@ def demo_summary(result: DemoResult, command: str) -> list[str]:
         lines = [f"online and offline differ: {name}, {what}" for name, what in result.differences.items()]
     else:
         lines = ["online and offline estimates agree bit for bit"]
+    if result.residuals:
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in result.residuals.items())
+        lines.append(f"residual slopes at the fast rate, rms: {shown}")
     if result.deblurred is not None:
         from aolink.restoration.registry import DEFAULT_METHOD
 

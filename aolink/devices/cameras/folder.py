@@ -41,7 +41,7 @@ class FolderCamera(ThreadCamera):
     def __init__(self, rig: Rig, *, path: str, repeat: bool = True, corner: Sequence[int] | None = None) -> None:
         self._rig, self._repeat, self._corner = rig, repeat, checked_corner(corner)
         try:
-            self._film = open_film(rig.folder / Path(path).expanduser())
+            self._film = open_film(rig.path_of(Path(path).expanduser(), "devices.camera.path"))
             self._counts(next(self._film.frames()))
         except ImportingError as error:
             raise DeviceError(str(error)) from error

@@ -55,7 +55,7 @@ class OpenCVCamera(ThreadCamera):
         with needs_extra("opencv", DeviceError):
             import cv2
         self._rig, self._corner, timing = rig, checked_corner(corner), rig.timing
-        beside = rig.folder / str(source)
+        beside = rig.path_of(str(source), "devices.camera.source")
         opened = int(source) if str(source).isdecimal() else str(beside) if beside.exists() else source
         self._name = f"camera {source}" if isinstance(opened, int) else str(source)
         said = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the error below says it better

@@ -211,6 +211,23 @@ def _log_densities(
 
 
 @compiled
+def log_densities(
+    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, points: FloatArray, out: FloatArray
+) -> None:
+    """Log-densities (axes, points) of mixtures with components (axes, components, ...) at points (axes, points, n)."""
+    axes, count, n = mean.shape
+    many = points.shape[1]
+    root, inverse, constant = np.empty((count, n, n)), np.empty((count, n, n)), np.empty(count)
+    t, white, logs = np.empty((n, many)), np.empty(many), np.empty((count, many))
+    for axis in range(axes):
+        for k in range(many):
+            for i in range(n):
+                t[i, k] = points[axis, k, i]
+        _roots(log_weight[axis], covariance[axis], root, inverse, constant)
+        _log_densities(log_weight[axis], mean[axis], inverse, constant, t, 0, many, white, logs, out[axis])
+
+
+@compiled
 def importance_corrected(
     line: Line, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray, log_weight: FloatArray,
     mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, enough: FloatArray,

@@ -48,6 +48,8 @@ class Posterior:
     several: BoolArray | None = None
     """Whether several modes of the posterior were found (the blur has more than one reading), (axes,); None where they
     are not searched."""
+    remark: str = ""
+    """What the filter had to do on some axes, for the estimate's reason; otherwise empty."""
 
     @property
     def start(self) -> Gaussian:

@@ -130,11 +130,6 @@ class Resolution:
         return level
 
 
-def all_steps(n_steps: int) -> Resolution:
-    """Every step is a node."""
-    return Resolution((blocks(n_steps, n_steps),), math.inf)
-
-
 def resolution(paths: FloatArray, variance: float, sensor: Sensor) -> Resolution:
     """The coarsest resolution whose error in a spot's light stays below a share of the pixels' noise.
 

@@ -61,10 +61,16 @@ class MixtureUpdate:
     innovation: Innovation
     several: BoolArray
     """Whether the posterior has several modes (the blur has more than one reading), (axes,)."""
+    poor: BoolArray
+    """Whether importance sampling was not enough for it, (axes,)."""
 
 
 class MixtureUpdater(Protocol):
     """A way to update a mixture with the pixels of an exposure."""
+
+    @property
+    def when_poor(self) -> str:
+        """What it does on axes of which an update says `MixtureUpdate.poor`, for the estimate's reason."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
@@ -103,7 +109,7 @@ class MixtureFilter(Filter):
         one = slice(0, 1)
         twice = joined(self.prior.part(one), self.prior.part(one))
         n = self.plant.n_states
-        twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1)
+        twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1).log_density(twice.mean)
         drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
         if self.plant.n_outputs > 1:
             return
@@ -140,7 +146,7 @@ class MixtureFilter(Filter):
         prior = _chosen(lost, single(self._unseen), self.prior)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
         new = _spread([], np.zeros(0, dtype=np.intp), axes)
-        several = np.zeros(axes, dtype=bool)
+        several, poor = np.zeros(axes, dtype=bool), np.zeros(axes, dtype=bool)
         done: list[MixtureUpdate] = []
         took = np.zeros(0, dtype=np.intp)
         if measured is not None:
@@ -175,7 +181,7 @@ class MixtureFilter(Filter):
             if len(took) < len(trusted):
                 after = [each[trusted] for each in after]
             kicked = GaussianMixture(after[0], after[1] + response.end[took][:, None], after[2])
-            several[took] = after[5]
+            several[took], poor[took] = after[5], after[6]
             if np.array_equal(took, np.arange(axes)):
                 coefficients, end = Gaussian(after[3], after[4]), kicked
             else:
@@ -186,13 +192,18 @@ class MixtureFilter(Filter):
         self._number += 1
         return Posterior(
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
-            innovation_covariance=new.covariance, nis=new.nis, several=several,
+            innovation_covariance=new.covariance, nis=new.nis, several=several, remark=self._remark(poor),
         )  # fmt: skip
+
+    def _remark(self, poor: BoolArray) -> str:
+        if not poor.any():
+            return ""
+        return ("" if len(poor) == 1 else f"{int(poor.sum())} of {len(poor)} axes: ") + self._updater.when_poor
 
 
 def _arrays(done: MixtureUpdate, components: int) -> tuple[NDArray[Any], ...]:
     e, c = done.end.with_components(components), done.coefficients
-    return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several)
+    return (e.log_weight, e.mean, e.covariance, c.mean, c.covariance, done.several, done.poor)
 
 
 def _spread(parts: Sequence[Innovation], seen: Indices, axes: int) -> Innovation:

@@ -55,7 +55,9 @@ class GaussianMixture:
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Log-density of the mixture, (axes, points, n) -> (axes, points)."""
-        return log_sum(self.component_log_densities(points), axis=1)
+        out = np.empty(points.shape[:2])
+        compiled_mixtures.log_densities(*self.contiguous, np.ascontiguousarray(points), out)
+        return out
 
     def component_log_densities(self, points: FloatArray) -> FloatArray:
         """The log-density of each component times its weight, (axes, components, points)."""

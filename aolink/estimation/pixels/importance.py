@@ -6,8 +6,10 @@ points of all rounds are weighted against all their densities together (Veach's 
 et al., Adaptive multiple importance sampling, Scand. J. Stat. 39 (2012)). The points are quasi-random (Sobol) and the
 same for every axis and frame.
 
-No such mixture comes near some posteriors: where a spot hardly moves and there is little noise, the blur fixes the sum
-of many squares, and the posterior is a shell. There tempered sequential Monte Carlo draws the points
+No such mixture comes near some posteriors. Where a spot hardly moves and there is little noise, the blur fixes the sum
+of many squares, and the posterior is a shell. Where several vibrations are free in phase, one search finds few of the
+modes, and the effective sample size of points about those says nothing of the others: what is left uncertain by the
+windowed moments decides (`scattered`). In both cases tempered sequential Monte Carlo draws the points
 (`aolink.estimation.pixels.tempering`).
 """
 
@@ -38,9 +40,11 @@ from aolink.numerics.arrays import BoolArray, FloatArray
 # Most rounds, and the effective sample size that is enough.
 _ROUNDS = 4
 _ENOUGH = 100.0
-# If it is not reached: number of tempered points, and of the components that are fitted to their end states.
-_TEMPERED = 600
+# If less than this share of it is reached, points are tempered: number of components fitted to their end states.
+_TOO_FEW = 0.5
 _COMPONENTS = 6
+# Modes are scattered if the windowed moments leave the path uncertain by a variance of so many variances of the kernel.
+_SCATTERED = 2.5
 # Least effective sample size when a mixture is fitted; weights are raised to a power below one to reach it, since a fit
 # to a handful of points is too sure. And steps of the search for that power.
 _LEAST_EFFECTIVE = 128.0
@@ -58,10 +62,13 @@ _INFLATION = 1.5
 _EVIDENCE = 0.5
 # In a fit, a component's old covariance counts as this many points for each coefficient. Between rounds few, so that a
 # component soon finds its place; in the last fit more, with old covariances that a fit has made widened by the third
-# number: a covariance of few points is too narrow, and all later estimates would be too sure.
+# number: a covariance of few points is too narrow. (Twice as wide is too much: with twenty coefficients, where the old
+# covariances count as sixty points, intervals of 95 % held 98 to 99 %.)
 _PRIOR_POINTS = 2.0
 _LAST_PRIOR_POINTS = 3.0
-_LOOSENED = 2.0
+_LOOSENED = 1.2
+# A component of the prior has to have this weight for its modes to count as scattered.
+_HEAVY = 0.05
 # A component of less than this weight is dropped.
 _NEGLIGIBLE = 1e-3
 
@@ -78,22 +85,35 @@ def proposed(modes_weight: FloatArray, modes: Gaussian, wide_weight: FloatArray,
 
 
 def posterior(
-    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, number: int, believed: BoolArray, share: float,
-    several: BoolArray,
-) -> GaussianMixture:  # fmt: skip
-    """A mixture that fits the posterior of t in the exposure of this number.
+    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float, several: BoolArray
+) -> tuple[GaussianMixture, BoolArray]:
+    """A mixture that fits the posterior of t by importance sampling, and where it can be relied on, (axes,).
 
     Each round has this ``share`` of the usual number of points. The effective sample size to reach is the same share of
-    the usual one, except on axes with ``several`` modes, which need all of it. Only ``believed`` axes are tempered.
+    the usual one, except on axes with ``several`` modes, which need all of it. A fit to less than half of that cannot
+    be relied on: its weights are flattened, so that it is wide.
     """
-    fit, effective = importance_corrected(view, prior, proposal, share, np.where(several, _ENOUGH, share * _ENOUGH))
-    few = np.flatnonzero(believed & ~(effective >= share * _ENOUGH))
-    if not len(few):
-        return fit
-    some = view.part(few)
-    points = tempered_points(some, prior.part(few), _TEMPERED, [(number, axis) for axis in some.axes.tolist()])
+    wanted = np.where(several, _ENOUGH, share * _ENOUGH)
+    fit, effective = importance_corrected(view, prior, proposal, share, wanted)
+    return fit, np.asarray(effective >= _TOO_FEW * wanted)
+
+
+def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -> tuple[GaussianMixture, FloatArray]:
+    """The same by so many tempered points, in the exposure of this number; and the most likely point, (axes, 1, n)."""
+    points = tempered_points(view, prior, count, [(number, axis) for axis in view.axes.tolist()])
+    best = np.argmax(with_noise(prior, points) + view.log_likelihoods(points), axis=1)
     rows = view.reduced.end_rows
-    return fit.replaced(few, stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points]))
+    fit = stacked_axes([fitted(each, rows, _COMPONENTS, 0) for each in points])
+    return fit, points[np.arange(len(points)), best][:, None]
+
+
+def scattered(view: PixelView, weight: FloatArray, wide: Gaussian) -> BoolArray:
+    """Where a search about the windowed moments' Gaussians (axes, components, ...) finds too few of the modes, (axes,).
+
+    ``weight`` are the logarithms of their weights; light ones do not count.
+    """
+    variance = np.einsum("ij,acij->ac", view.gram, wide.covariance) / view.outputs
+    return np.asarray(((weight > math.log(_HEAVY)) & (variance > _SCATTERED * view.kernel_variance)).any(axis=1))
 
 
 def importance_corrected(

@@ -80,17 +80,13 @@ class Reduction:
 
 
 @lru_cache(maxsize=16)
-def reduction(
-    model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LEFT_OUT, all_steps: bool = False
-) -> Reduction:
+def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LEFT_OUT) -> Reduction:
     """The reduction for a sensor, made once.
 
     Parameters
     ----------
     left_out:
         Rms of the path that may be left out, in standard deviations of the kernel.
-    all_steps:
-        Whether all fast steps are nodes.
     """
     n = model.plant.n_states
     variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
@@ -107,9 +103,7 @@ def reduction(
     hidden = np.zeros((n + size, n + size))
     hidden[n:, n:] = np.eye(size) - V @ V.T
     remainder = model.end_remainder + model.end_rows @ hidden @ model.end_rows.T
-    if all_steps:
-        seen = quadrature.all_steps(model.n_steps)
-    elif model.moved:  # it is the same whenever in a step an exposure starts
+    if model.moved:  # it is the same whenever in a step an exposure starts
         seen = reduction(exposure_model(model.plant, model.n_steps), sensor).resolution
     else:
         seen = quadrature.resolution(_paths(model, expand), variance, sensor.profile)

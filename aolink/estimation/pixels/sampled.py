@@ -1,11 +1,13 @@
 """The estimator `sampled`: tempered sequential Monte Carlo. Slow, for offline use; the limit of all other estimators.
 
-All fast steps are nodes, and less of the path is left out.
+Less of the path is left out than for the others; the nodes in time are those of `profile`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+import numpy as np
 
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
@@ -28,12 +30,14 @@ _COMPONENTS = 8
 class TemperedUpdater:
     """Particles of one axis after another; a mixture of Gaussians is fitted to their end states."""
 
-    particles: int = 3000
+    particles: int = 2000
     seed: int = 0
+
+    when_poor = ""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
-        return reduction(model, sensor, left_out=_LEFT_OUT, all_steps=True)
+        return reduction(model, sensor, left_out=_LEFT_OUT)
 
     def update(self, view: PixelView, prior: GaussianMixture, unseen: Gaussian, number: int) -> MixtureUpdate:
         """The posterior of axes with a prior of their start states."""
@@ -46,7 +50,8 @@ class TemperedUpdater:
         new = innovation(view, before, modes)
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         end = reduced.end(Gaussian(fit.mean, fit.covariance))
-        return MixtureUpdate(after, GaussianMixture(fit.log_weight, end.mean, end.covariance), new, has_several(modes))
+        carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)
+        return MixtureUpdate(after, carried, new, has_several(modes), np.zeros(len(mean), dtype=bool))
 
     def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> FloatArray:
         """Equally likely particles of the posterior, (axes, particles, n).

@@ -50,28 +50,30 @@ def _of_axis(view: PixelView, prior: GaussianMixture, count: int, key: tuple[int
     rng, n = np.random.default_rng(key), view.reduced.size
     t = _drawn(prior, rng, count, n)
     log_prior, log_likelihood = with_noise(prior, t[None])[0], view.log_likelihoods(t[None])[0]
-    power = 0.0
+    power, walk, difference = 0.0, 1.0, 1.0
     while power < 1.0:
         power, before = _next_power(log_likelihood, power), power
         chosen = _resampled(np.exp((power - before) * (log_likelihood - log_likelihood.max())), rng)
         t, log_prior, log_likelihood = t[chosen], log_prior[chosen], log_likelihood[chosen]
         root = cholesky(np.cov(t, rowvar=False).reshape(n, n))
-        size = 1.0
         for move in range(_MOVES):
             if move % 2:
-                step = 2.38 / math.sqrt(n) * size * rng.standard_normal((count, n)) @ root.T
+                step = 2.38 / math.sqrt(n) * walk * rng.standard_normal((count, n)) @ root.T
             else:
                 first, second = rng.integers(0, count, (2, count))
-                length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * size
-                step = length * (t[first] - t[second]) + 0.01 * rng.standard_normal((count, n)) @ root.T
+                length = 1.0 if move % _WHOLE == 0 else 2.38 / math.sqrt(2 * n) * difference
+                step = length * (t[first] - t[second]) + 0.01 * walk * rng.standard_normal((count, n)) @ root.T
             there = t + step
             its_prior, its_likelihood = with_noise(prior, there[None])[0], view.log_likelihoods(there[None])[0]
             gain = its_prior - log_prior + power * (its_likelihood - log_likelihood)
             taken = np.log(rng.random(count)) < gain
             t[taken], log_prior[taken], log_likelihood[taken] = there[taken], its_prior[taken], its_likelihood[taken]
-            if move % _WHOLE:
-                # Towards an acceptance rate of one quarter.
-                size *= math.exp(taken.mean() - 0.25)
+            # Towards an acceptance rate of one quarter. The sizes are kept: what the next power needs is hardly less.
+            change = math.exp(2 * (taken.mean() - 0.25))
+            if move % 2:
+                walk *= change
+            elif move % _WHOLE:
+                difference *= change
     return t
 
 

@@ -42,7 +42,7 @@ def rig_of(kind):
     return {"line": LINE, "round": tip_tilt(ROUND), "tilted": tip_tilt(TILTED)}[kind]
 
 
-def view_of(rig, *, photoelectrons=0.0, seed=1, **how):
+def view_of(rig, *, photoelectrons=0.0, seed=1, all_steps=False, **how):
     rig = dataclasses.replace(rig, sensor=dataclasses.replace(rig.sensor, photoelectrons=photoelectrons))
     (exposure,) = simulate(rig, 1, seed=seed)
     spots = rig.plant.n_outputs // 2
@@ -51,7 +51,9 @@ def view_of(rig, *, photoelectrons=0.0, seed=1, **how):
     model = exposure_model(rig.plant, exposure.n_steps)
     reduced = likelihood.reduction(model, rig.sensor, **how)
     assert isinstance(measured, SpotWindows if spots else Profile)
-    view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced)
+    level = len(reduced.resolution.levels) - 1 if all_steps else 0
+    view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced, level)
+    assert not all_steps or view.whole_nodes == exposure.n_steps
     return view if spots else PlainView.of(view), model
 
 

@@ -1,0 +1,27 @@
+"""Controllers: what the mirror is to do, from exposures and estimates. No time, no files, no ports."""
+
+from aolink.control.controller import Controller, ControllerRow, Seen
+from aolink.control.drift import Fit, FitMonitor
+from aolink.control.loop import Act, ControlLoop, State, delay_steps
+from aolink.control.modes import Modes, response_at_rest
+from aolink.control.registry import controller_names, find_controller
+from aolink.control.stability import Stability, check_stable, stability
+
+__all__ = [
+    "Act",
+    "ControlLoop",
+    "Controller",
+    "ControllerRow",
+    "Fit",
+    "FitMonitor",
+    "Modes",
+    "Seen",
+    "Stability",
+    "State",
+    "check_stable",
+    "controller_names",
+    "delay_steps",
+    "find_controller",
+    "response_at_rest",
+    "stability",
+]

@@ -1,0 +1,88 @@
+"""Whether the model still fits: the innovations of the estimator that closes the loop."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from aolink.estimation import Estimate
+from aolink.numerics.arrays import FloatArray
+
+WINDOW = 60
+"""Exposures that are judged together."""
+_TOLERATED_RATIO = 2.0
+"""No model is exact: a mean NIS within this factor of its expectation is no drift, however significant."""
+_TOLERATED_CORRELATION = 0.3
+_SIGMAS = 5.0
+"""How many standard deviations of chance a window must be off."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """How the innovations of the newest exposures look, those of `WINDOW`."""
+
+    nis_ratio: float
+    """Mean NIS over its expectation, the number of measurements: 1 where the model is right."""
+    whiteness: float
+    """Correlation of neighbouring innovations, in units of their own covariance: 0 where the model is right."""
+    fits: bool
+    """Whether both are within what chance and an inexact model explain."""
+
+    def text(self) -> str:
+        return (
+            f"NIS {self.nis_ratio:.2f} of what is expected, neighbouring innovations correlate by {self.whiteness:+.2f}"
+        )
+
+
+class _Sums(NamedTuple):
+    nis: float
+    numbers: int
+    product: float
+    square: float
+
+
+class FitMonitor:
+    """Follows the innovations of an estimator, exposure by exposure."""
+
+    def __init__(self) -> None:
+        self._window: deque[_Sums] = deque(maxlen=WINDOW)
+        self._before: FloatArray | None = None
+
+    def add(self, estimate: Estimate) -> Fit | None:
+        """Take the next estimate; None while fewer than `WINDOW` of them had a measurement."""
+        measured = estimate.nis > 0
+        if not measured.any():
+            self._before = None
+            return self.fit()
+        white = _whitened(estimate)
+        white[~measured] = 0.0
+        before = white if self._before is None or self._before.shape != white.shape else self._before
+        product = 0.0 if self._before is None else float((white * before).sum())
+        count = int(measured.sum()) * white.shape[1]
+        self._window.append(_Sums(float(estimate.nis.sum()), count, product, float((white**2).sum())))
+        self._before = white
+        return self.fit()
+
+    def fit(self) -> Fit | None:
+        """That of the newest exposures; None while they are too few."""
+        if len(self._window) < WINDOW:
+            return None
+        nis, count, product, square = (sum(each) for each in zip(*self._window, strict=True))
+        ratio, whiteness = nis / count, product / square
+        off = max(ratio, 1 / ratio) > max(_TOLERATED_RATIO, 1 + _SIGMAS * math.sqrt(2 / count))
+        coloured = abs(whiteness) > max(_TOLERATED_CORRELATION, _SIGMAS / math.sqrt(count))
+        return Fit(nis_ratio=ratio, whiteness=whiteness, fits=not (off or coloured))
+
+
+def _whitened(estimate: Estimate) -> FloatArray:
+    """Innovations in units of their covariance, (axes, n_measurements)."""
+    S = estimate.innovation_covariance
+    if S.ndim == 2:  # of many measurements: the diagonal
+        return np.asarray(estimate.innovation / np.sqrt(np.where(S > 0, S, 1.0)))
+    sound = np.diagonal(S, axis1=1, axis2=2).min(axis=1) > 0
+    root = np.linalg.cholesky(np.where(sound[:, None, None], S, np.eye(S.shape[-1])))
+    return np.asarray(np.linalg.solve(root, estimate.innovation[..., None])[..., 0])

@@ -1,0 +1,275 @@
+"""The closed loop, without time, files or ports: exposures and estimates in, the mirror's inputs out, by fast step."""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from aolink.control.controller import Controller, ControllerRow, Seen
+from aolink.control.drift import Fit, FitMonitor
+from aolink.control.registry import find_controller
+from aolink.errors import AolinkError, ControlError
+from aolink.estimation import Estimate, Needs, Status
+from aolink.estimation.frames.measure import measure
+from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
+from aolink.rig import Rig
+
+BLIND_EXPOSURES = 5
+"""Exposures in a row without a measurement over which the prediction is believed."""
+TRUSTED_EXPOSURES = 3
+"""Exposures in a row with a measurement after which a loop that was lost is closed again."""
+_CENTROIDS = Needs(what="moments", orders=(1,))
+
+
+class State(enum.IntEnum):
+    """What the loop does. The numbers are those of the recording's schema."""
+
+    CLOSED = 0
+    HELD = 1
+    """The mirror holds the input that it had when the loop was lost."""
+    PARKED = 2
+    """The mirror is commanded to its safe input."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Act:
+    """What the loop made of one exposure."""
+
+    frame_id: int
+    first_step: int
+    """The first fast step whose input it changed."""
+    delay_steps: int
+    """From the exposure's end to that step."""
+    late: bool
+    """Whether that is later than ``control.delay_s`` asks for."""
+    state: State
+    reason: str
+    """Why the loop is open; empty while it is closed."""
+    slope_rms: float
+    """Root mean square of the centroids, slope units; NaN where none was measured."""
+    path_rms: float
+    """Root mean square of the estimated path inside the exposure, slope units; NaN without an estimate."""
+    clipped_steps: int
+    """Fast steps from the exposure before to this one whose wanted input limits or slew have changed."""
+    fit: Fit | None
+    """How well the model fits; None while that is not known."""
+
+
+def centroids(rig: Rig, exposure: Exposure) -> FloatArray:
+    """Mean of each slope over an exposure, by the centroids of its frame, slope units, (n_outputs,); NaN for none."""
+    measured, _ = measure(rig, exposure, _CENTROIDS)
+    if measured is None:
+        return np.full(rig.n_outputs, np.nan)
+    value = np.asarray(measured.value, dtype=np.float64)  # type: ignore[union-attr] # moments were asked for
+    if measured.usable is not None:
+        value = np.where(measured.usable[:, None], value, np.nan)
+    return value.reshape(rig.n_outputs)
+
+
+class ControlLoop:
+    """A controller on a rig: it knows what the mirror is to hold in each fast step, and keeps it within limits.
+
+    Parameters
+    ----------
+    controller:
+        Its name, or its row.
+    first_step:
+        First fast step of the session. Until the first exposure is seen the mirror holds its safe input.
+
+    Raises
+    ------
+    ControlError
+        As `find_controller`.
+    """
+
+    def __init__(self, rig: Rig, controller: str | ControllerRow, first_step: int = 0) -> None:
+        row = find_controller(controller, rig) if isinstance(controller, str) else controller
+        self.name, self.needs_state = row.name, row.needs_state
+        self.delay_steps = delay_steps(rig)
+        self.state, self.reason = State.CLOSED, ""
+        self.fit: Fit | None = None
+        self._rig, self._controller = rig, _made(row, rig)
+        mirror = rig.mirror
+        self._low, self._high, self._park = mirror.input_min, mirror.input_max, mirror.park
+        self._most_change = mirror.slew_max_per_s * rig.timing.fast_step_s or math.inf
+        self._oldest = first_step
+        """Fast step of the first of the rows, of which the older ones are dropped."""
+        self._sent: list[FloatArray] = []
+        """Inputs as they are commanded, step by step, ..."""
+        self._held: list[FloatArray] = []
+        """... and as the mirror holds them."""
+        self._limited: list[bool] = []
+        """Whether that is what limits or slew have made of what was wanted."""
+        self._before = (self._park, self._park)
+        """Both for the step before the oldest."""
+        self._last_end = first_step
+        """End of the newest exposure with a measurement; of the session's beginning before."""
+        self._seen_any = False
+        self._blind = self._trusted = 0
+        self._clipped = 0
+        self._monitor = FitMonitor()
+        timing = rig.timing
+        self._patience = (BLIND_EXPOSURES + 1) * timing.frame_period_steps + self.delay_steps
+
+    @property
+    def next_step(self) -> int:
+        """The first fast step that no input is fixed for."""
+        return self._oldest + len(self._sent)
+
+    def begin(self, first_step: int) -> None:
+        """Name the first fast step, before anything else."""
+        self._oldest = self._last_end = first_step
+
+    def inputs(self, first_step: int, n_steps: int) -> FloatArray:
+        """Inputs to command for ``n_steps`` fast steps from ``first_step``, (n_steps, n_inputs); the same when asked
+        again, until an exposure changes them. Raises ControlError as the controller's own code fails."""
+        while self.next_step < first_step + n_steps:
+            self._go_on()
+        start = first_step - self._oldest
+        if start < 0:
+            raise ValueError(f"fast step {first_step} is before {self._oldest}: its input is forgotten")
+        return np.array(self._sent[start : start + n_steps]).reshape(n_steps, len(self._park))
+
+    def applied(self, first_step: int, u: FloatArray) -> None:
+        """What the mirror reports that it held from ``first_step`` on, (k, n_inputs)."""
+        for step, row in enumerate(u, first_step):
+            if 0 <= step - self._oldest < len(self._held):
+                self._held[step - self._oldest] = row
+
+    def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> Act:
+        """Take the next exposure, with its estimate where the controller needs one.
+
+        Parameters
+        ----------
+        earliest_step:
+            The first fast step whose input can still be changed. Steps before it stay as they are; those from the
+            returned ``first_step`` on are to be sent anew, also where they were sent before.
+        """
+        end = exposure.first_step + exposure.n_steps
+        first = max(end + self.delay_steps, earliest_step)
+        while self.next_step < first:
+            self._go_on()
+        slopes = centroids(self._rig, exposure)
+        self._judge(slopes, estimate, end)
+        if first - end > self._patience:
+            self._trusted = 0
+            self.lose(f"frame {exposure.frame_id} came {first - end} fast steps late")
+        self._forget_from(first)
+        pending = np.array(self._held[end - self._oldest : first - self._oldest]).reshape(-1, len(self._park))
+        if self.state is State.CLOSED and len(pending):
+            state = None if estimate is None else estimate.end_state
+            self._ask(lambda: self._controller.see(Seen(slopes=slopes, state=state, pending=pending)))
+            self._seen_any = True
+        if estimate is not None:
+            self.fit = self._monitor.add(estimate)
+        self._drop_before(exposure.first_step)
+        clipped, self._clipped = self._clipped, 0
+        return Act(
+            frame_id=exposure.frame_id,
+            first_step=first,
+            delay_steps=first - end,
+            late=first > end + self.delay_steps,
+            state=self.state,
+            reason=self.reason,
+            slope_rms=_rms(slopes),
+            path_rms=math.nan if estimate is None else _rms(estimate.path),
+            clipped_steps=clipped,
+            fit=self.fit,
+        )
+
+    def lose(self, reason: str) -> None:
+        """Open the loop: hold or park the mirror, as the rig file says, until exposures can be trusted again."""
+        if self.state is State.CLOSED:
+            self.state = State.PARKED if self._rig.control.when_lost == "park" else State.HELD
+            self._trusted = 0
+        self.reason = reason
+
+    def _judge(self, slopes: FloatArray, estimate: Estimate | None, end: int) -> None:
+        """Decide whether the loop is closed, from what this exposure is worth."""
+        status = Status.OK if estimate is None else estimate.status
+        if status in (Status.DIVERGED, Status.REINITIALISED):
+            self._trusted = 0
+            self.lose(f"the estimator says {status.name.lower()} of frame {estimate.frame_id}" if estimate else "")
+            return
+        if not np.isfinite(slopes).any() or status is Status.GATED:
+            self._blind, self._trusted = self._blind + 1, 0
+            if self._blind > BLIND_EXPOSURES:
+                self.lose(f"{self._blind} exposures in a row gave no measurement")
+            return
+        if self._seen_any and end - self._last_end > self._patience:
+            self.lose(f"no measurement had come for {end - self._last_end} fast steps")
+        self._blind, self._trusted, self._last_end = 0, self._trusted + 1, end
+        if self.state is not State.CLOSED and self._trusted >= TRUSTED_EXPOSURES:
+            self.state, self.reason = State.CLOSED, ""
+
+    def _go_on(self) -> None:
+        """Fix the input of the next step."""
+        step = self.next_step
+        sent, held = (self._sent[-1], self._held[-1]) if self._sent else self._before
+        lost = self.state is not State.CLOSED or step - self._last_end > self._patience
+        if not self._seen_any or (lost and self._rig.control.when_lost == "park"):
+            wanted = self._park
+        else:
+            wanted = sent if lost else self._wanted(held)
+        u = np.minimum(np.maximum(wanted, self._low), self._high)
+        if self._most_change < math.inf:
+            u = np.minimum(np.maximum(u, sent - self._most_change), sent + self._most_change)
+        self._limited.append(bool((u != wanted).any()))
+        self._sent.append(u)
+        self._held.append(self._rig.mirror.quantise(u))
+
+    def _wanted(self, held: FloatArray) -> FloatArray:
+        u: FloatArray = self._ask(lambda: self._controller.step(held))
+        if np.shape(u) != self._park.shape or not np.isfinite(u).all():
+            found = "a number that is not finite" if np.shape(u) == self._park.shape else f"an array of {np.shape(u)}"
+            raise ControlError(
+                f"the controller {self.name} gives {found}, expected ({len(self._park)},) finite inputs: the mirror is"
+                " parked"
+            )
+        return u
+
+    def _ask(self, call: Callable[[], FloatArray | None]) -> FloatArray:
+        try:
+            return call()  # type: ignore[return-value] # `see` gives nothing, and nobody looks
+        except AolinkError:
+            raise
+        except Exception as error:  # whatever another package does wrong
+            raise ControlError(f"the controller {self.name} failed: {error!r}; the mirror is parked") from error
+
+    def _forget_from(self, step: int) -> None:
+        """The inputs of the steps from this one on are open again."""
+        for rows in (self._sent, self._held, self._limited):
+            del rows[step - self._oldest :]
+
+    def _drop_before(self, step: int) -> None:
+        n = min(step - self._oldest, len(self._sent) - 1)
+        if n > 0:
+            self._before = self._sent[n - 1], self._held[n - 1]
+            self._clipped += sum(self._limited[:n])
+            for rows in (self._sent, self._held, self._limited):
+                del rows[:n]
+            self._oldest += n
+
+
+def delay_steps(rig: Rig) -> int:
+    """``control.delay_s`` in whole fast steps, one at least: the step after an exposure's last has begun by its end."""
+    return max(1, math.ceil(rig.control.delay_s / rig.timing.fast_step_s - 1e-9))
+
+
+def _made(row: ControllerRow, rig: Rig) -> Controller:
+    try:
+        return row.build(rig)
+    except AolinkError:
+        raise
+    except Exception as error:  # whatever another package does wrong
+        raise ControlError(f"the controller {row.name} cannot work on the rig {rig.name}: {error!r}") from error
+
+
+def _rms(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else math.nan

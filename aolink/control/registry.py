@@ -1,0 +1,51 @@
+"""The registry of controllers: one row for each, those of other packages with ours.
+
+Another package adds one with an entry point in its pyproject.toml, whose name is the controller's:
+
+    [project.entry-points."aolink.controllers"]
+    mine = "my_package.controller:ROW"
+"""
+
+from __future__ import annotations
+
+from aolink.control.controller import ControllerRow
+from aolink.control.integrator import Integrator
+from aolink.control.lqg import LQG
+from aolink.errors import ControlError
+from aolink.extensions import described, installed, loaded
+from aolink.rig import Rig
+
+GROUP = "aolink.controllers"
+_OURS = {
+    row.name: row
+    for row in (
+        ControllerRow(
+            name="integrator", summary="leaky integrator on the centroids, modal", build=Integrator, needs_state=False
+        ),
+        ControllerRow(name="lqg", summary="predicts the estimator's state, and cancels it at the fast rate", build=LQG),
+    )
+}
+
+
+def controller_names() -> tuple[str, ...]:
+    """Names of all controllers; nothing of other packages is loaded for it."""
+    return (*_OURS, *(name for name in installed(GROUP) if name not in _OURS))
+
+
+def find_controller(name: str, rig: Rig) -> ControllerRow:
+    """The row of a name; aolink's own comes first.
+
+    Raises
+    ------
+    ControlError
+        There is no such controller, the installed package that has it is broken, or it cannot work on this rig.
+    """
+    if (row := _OURS.get(name)) is None:
+        if (point := installed(GROUP).get(name)) is None:
+            raise ControlError(f"there is no controller {name!r}: use one of {', '.join(controller_names())}")
+        row = loaded(point, "controller", ControlError)
+        if not isinstance(row, ControllerRow) or row.name != name:
+            raise ControlError(f"{described(point, 'controller')} is not a ControllerRow of this name")
+    if reason := row.refusal(rig):
+        raise ControlError(reason)
+    return row

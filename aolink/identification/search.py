@@ -1,0 +1,370 @@
+"""The fit of a model to readings: a coarse grid, which contains the aliases of each frequency, then local maxima."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import optimize
+
+from aolink.errors import IdentificationError
+from aolink.identification.likelihood import Likelihood
+from aolink.identification.models import PARAMETERS, PLANTS, IdentifiedPlant, Process, ProcessSum
+from aolink.identification.readings import Readings, by_slot
+from aolink.numerics.arrays import FloatArray
+
+BLOCK = 16
+"""Exposures in a block: more of them tell little more, and take longer."""
+CYCLES = 4.0
+"""Highest frequency that is searched, in cycles per exposure."""
+_SPACING = 0.06
+"""Of the grid of frequencies, in cycles per frame period: below the width of a maximum with the grid's damping."""
+_DECAY = 0.4
+"""By how much a resonance of the grid decays in a frame period, in nats."""
+_STARTS = 8
+_MOST = 3000
+"""Most points of a grid of several processes."""
+KEPT = 12.0
+"""Local maxima that are lower than the highest by more than this, in nats, are forgotten."""
+_SAME = 0.02
+"""Maxima whose parameters differ by less than this share are one."""
+_RIDGE = 0.5
+_STEP = 1e-3
+_NEVER = 1e12
+Told = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Space:
+    """The parameters of a sum of processes as a vector of logarithms, and their limits."""
+
+    kinds: tuple[str, ...]
+    with_noise: bool
+    """Whether a factor of the pixels' noise variance is one more parameter, ..."""
+    with_kernel: bool
+    """... and the kernel's variance over the rig file's another."""
+    kernel_variance: float
+    bounds: tuple[tuple[float, float], ...]
+    plant: str | None = None
+    """The kind of plant that is fitted as well; its parameters come first. None: the plant is known."""
+    sign: float = 1.0
+    """Of the plant's gain."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters, with the kind before them where there are several processes."""
+        several = len(self.kinds) > 1
+        names = [
+            f"{kind}{'' if self.kinds.count(kind) == 1 else self.kinds[: k + 1].count(kind)}.{name}"
+            if several
+            else name
+            for k, kind in enumerate(self.kinds)
+            for name in PARAMETERS[kind]
+        ]
+        names = [f"plant.{name}" for name in self._of_plant] + names
+        return (*names, *(["noise"] if self.with_noise else []), *(["kernel"] if self.with_kernel else []))
+
+    @property
+    def _of_plant(self) -> tuple[str, ...]:
+        return PLANTS[self.plant] if self.plant else ()
+
+    def fitted_plant(self, x: FloatArray) -> IdentifiedPlant | None:
+        """The plant of a vector, where one is fitted."""
+        if self.plant is None:
+            return None
+        gain, *rest = np.exp(x[: len(self._of_plant)]).tolist()
+        return IdentifiedPlant(self.plant, (self.sign * gain, *rest))
+
+    def model(self, x: FloatArray) -> ProcessSum:
+        """The disturbance of a vector, with that by the fitted plant's own noise before the others."""
+        plant = self.fitted_plant(x)
+        values = np.exp(x[len(self._of_plant) :]).tolist()
+        processes = [plant.noise] if plant else []
+        for kind in self.kinds:
+            n = len(PARAMETERS[kind])
+            processes.append(Process(kind, tuple(values[:n])))
+            values = values[n:]
+        return ProcessSum(tuple(processes))
+
+    def others(self, x: FloatArray) -> tuple[float, float]:
+        """Factor of the pixels' noise variance, and what the kernel's variance has over the rig file's."""
+        own = len(self._of_plant) + sum(len(PARAMETERS[kind]) for kind in self.kinds)
+        rest = np.exp(x[own:]).tolist()
+        noise = rest.pop(0) if self.with_noise else 1.0
+        return noise, (rest[0] - 1) * self.kernel_variance if self.with_kernel else 0.0
+
+    def log_likelihood(self, x: FloatArray, of: Sequence[Likelihood], nodes: int | None = None) -> float:
+        """The sum over recordings, -inf outside of the limits."""
+        if any(not low <= value <= high for value, (low, high) in zip(x, self.bounds, strict=True)):
+            return -math.inf
+        model, (noise, wider) = self.model(x), self.others(x)
+        return sum(self.driven(x, each)(model, noise, wider, nodes) for each in of)
+
+    def driven(self, x: FloatArray, of: Likelihood, draws: int = 1) -> Likelihood:
+        """A recording's likelihood with the fitted plant's response to its inputs, where a plant is fitted.
+
+        ``draws``: how often the recording's outputs are there, with the same inputs.
+        """
+        if self.plant is None:
+            return of
+        first = of.seen.of_outputs(range(len(of.seen.mean) // draws))
+        return of.with_response(np.tile(self.response(x, first), (draws, 1, 1)))
+
+    def response(self, x: FloatArray, seen: Readings) -> FloatArray:
+        """Response to the inputs of a recording, (outputs, slots, N + 1)."""
+        plant = self.fitted_plant(x)
+        if plant is None:
+            return seen.response
+        path = plant.response(seen.inputs[:, 0], seen.step_s)
+        return by_slot(path, seen.slots, seen.n_steps, seen.period_steps, seen.offset)
+
+
+def space_of(
+    kinds: Sequence[str], seen: Sequence[Readings], kernel_variance: float, *, with_noise: bool, with_kernel: bool,
+    highest_hz: float | None = None, plant: str | None = None,
+) -> Space:  # fmt: skip
+    """The parameters of a sum of processes, and of a plant, within limits that the recordings set.
+
+    Raises
+    ------
+    IdentificationError
+        A frequency is asked for that the fast rate cannot follow, or a plant, and the inputs say nothing of it.
+    """
+    one = seen[0]
+    exposure, period = one.n_steps * one.step_s, one.period_steps * one.step_s
+    whole = max(each.slots for each in seen) * period
+    top = highest_hz or min(CYCLES / exposure, 0.25 / one.step_s)
+    if top > 0.5 / one.step_s:
+        raise IdentificationError(f"{top:g} Hz is above half of the fast rate, {0.5 / one.step_s:g} Hz")
+    limits = {
+        "frequency_hz": (0.5 / whole, top),
+        "damping": (1e-4, 0.95),
+        "sd": (1e-4 * one.reach, 4 * one.reach),
+        "correlation_s": (exposure / 100, 10 * whole),
+        "intensity": (1e-8 * one.reach**2 / whole, 100 * one.reach**2 / exposure),
+    }
+    span = max(float(np.ptp(each.inputs)) for each in seen)
+    if plant is not None and span == 0:
+        raise IdentificationError(
+            "the inputs of the recording never change, so it holds no input to identify a plant from: record with a"
+            " [drive], or take the plant as known"
+        )
+    if plant is not None and any(each.inputs.shape[1] != 1 for each in seen):
+        raise IdentificationError(
+            f"a plant is identified where one input moves one output, here {one.inputs.shape[1]} move a copy of it"
+        )
+    of_plant = (
+        []
+        if plant is None
+        else [limits | {"gain": (1e-3 * one.reach / span, 1e3 * one.reach / span), "damping": (1e-4, 30.0)}]
+    )
+    bounds = [each[name] for each in of_plant for name in PLANTS[plant or ""]]
+    bounds += [limits[name.removeprefix("second_")] for kind in kinds for name in PARAMETERS[kind]]
+    bounds += [(0.01, 100.0)] * with_noise + [(0.25, 4.0)] * with_kernel
+    return Space(
+        tuple(kinds), with_noise, with_kernel, kernel_variance,
+        tuple((math.log(low), math.log(high)) for low, high in bounds), plant, _sign(seen) if plant else 1.0,
+    )  # fmt: skip
+
+
+def _sign(seen: Sequence[Readings]) -> float:
+    """Of the gain of a plant that hardly delays: that of the covariance of the means with the inputs'."""
+    total = 0.0
+    for each in seen:
+        u = np.cumsum(each.inputs[:, 0], axis=1)
+        smooth = by_slot(np.pad(u, ((0, 0), (1, 0))), each.slots, each.n_steps, each.period_steps, 0.0)
+        mean = (smooth[:, :, -1] - smooth[:, :, 0]) / each.n_steps
+        y = each.mean + each.centre
+        good = each.usable
+        total += float(((mean - mean[good].mean()) * (y - y[good].mean()))[good].sum())
+    return math.copysign(1.0, total)
+
+
+@dataclass(frozen=True, eq=False)
+class Maximum:
+    """A local maximum of the log-likelihood."""
+
+    x: FloatArray
+    log_likelihood: float
+    nodes: int
+
+
+def maxima(space: Space, seen: Sequence[Readings], tell: Told | None = None) -> list[Maximum]:
+    """The local maxima within `KEPT` of the highest, the highest first."""
+    of = [Likelihood(each, BLOCK) for each in seen]
+    points = [np.array([*point, *[0.0] * (space.with_noise + space.with_kernel)]) for point in _grid(space, seen)]
+    points = [np.clip(point, *np.array(space.bounds).T) for point in points]
+    values = []
+    for k, point in enumerate(points):
+        values.append(space.log_likelihood(point, of))
+        if tell:
+            tell(k)
+    order = np.argsort(values)[::-1]
+    chosen: list[FloatArray] = []
+    for k in order:
+        if (
+            len(chosen) < _STARTS
+            and math.isfinite(values[k])
+            and not any(_near(space, points[k], o, 0.04) for o in chosen)
+        ):
+            chosen.append(points[k])
+    found: list[Maximum] = []
+    for start in chosen:
+        _add(space, found, climb(space, start, of, enough=0.1))
+    for each in sorted(found, key=lambda each: -each.log_likelihood)[:2]:
+        for start in _aliases(space, each.x, seen[0]):
+            _add(space, found, climb(space, start, of, enough=0.1))
+    best: list[Maximum] = []
+    highest = max(each.log_likelihood for each in found)
+    for each in found:
+        if each.log_likelihood > highest - KEPT:
+            _add(space, best, climb(space, each.x, of))
+    if not best:
+        raise IdentificationError("no model of this kind has a likelihood here: are there readings at all?")
+    apart: list[Maximum] = []
+    for each in sorted(best, key=lambda each: -each.log_likelihood):
+        # Halfway along a ridge it is no lower: that is one maximum, not yet reached from both ends.
+        middles = (space.log_likelihood((each.x + other.x) / 2, of, other.nodes) for other in apart)
+        if not any(middle > each.log_likelihood - _RIDGE for middle in middles):
+            apart.append(each)
+    return apart
+
+
+def _aliases(space: Space, x: FloatArray, one: Readings) -> list[FloatArray]:
+    """Points whose frequencies have the same values at the exposures' starts, with the same decay."""
+    rate = 1 / (one.period_steps * one.step_s)
+    out = []
+    for k, name in enumerate(space.names):
+        if name.endswith("frequency_hz"):
+            low, high = np.exp(space.bounds[k])
+            f = math.exp(x[k])
+            for m in range(1, math.ceil((high + f) / rate) + 1):
+                for alias in (m * rate - f, m * rate + f, f - m * rate):
+                    if low < alias < high:
+                        other = x.copy()
+                        other[k] = math.log(alias)
+                        other[k + 1] = np.clip(x[k + 1] + x[k] - other[k], *space.bounds[k + 1])  # its damping
+                        out.append(other)
+    return out
+
+
+def _near(space: Space, a: FloatArray, b: FloatArray, share: float) -> bool:
+    """Whether two points have frequencies that differ by less than this share, or have none."""
+    where = [k for k, name in enumerate(space.names) if name.endswith("frequency_hz")] or list(range(len(a)))
+    return bool((np.abs(a[where] - b[where]) < share).all())
+
+
+def _add(space: Space, found: list[Maximum], new: Maximum) -> None:
+    if not math.isfinite(new.log_likelihood):
+        return
+    for k, old in enumerate(found):
+        if (np.abs(old.x - new.x) < _SAME).all() or (
+            _near(space, old.x, new.x, 5e-3) and abs(old.log_likelihood - new.log_likelihood) < 0.1
+        ):
+            found[k] = max(old, new, key=lambda each: each.log_likelihood)
+            return
+    found.append(new)
+
+
+def climb(space: Space, start: FloatArray, of: Sequence[Likelihood], enough: float = 1e-3) -> Maximum:
+    """The local maximum that a start leads to, to ``enough`` nats."""
+    nodes = max(each.nodes(space.model(start)) for each in of)
+    nodes += 4 if nodes < of[0].seen.n_steps - 4 else 0
+
+    def cost(x: FloatArray) -> float:
+        value = space.log_likelihood(x, of, nodes)
+        return -value if math.isfinite(value) else _NEVER
+
+    # Frequencies are known far better than the rest: in units of each one's own curvature all are alike.
+    low, high = np.array(space.bounds).T
+    at = np.clip(start, low + 2 * _STEP, high - 2 * _STEP)
+    here, scale = cost(at), np.empty(len(at))
+    for k, step in enumerate(_STEP * np.eye(len(at))):
+        scale[k] = min(1 / math.sqrt(max(cost(at + step) + cost(at - step) - 2 * here, 0.0) / _STEP**2 + 1), 1.0)
+
+    def whitened(u: FloatArray) -> float:
+        return cost(at + u * scale)
+
+    done = optimize.minimize(
+        whitened, np.zeros(len(at)), method="L-BFGS-B",
+        bounds=list(zip((low - at) / scale, (high - at) / scale, strict=True)),
+        options={"maxiter": 60, "eps": 1e-3, "ftol": enough / max(abs(here), 1.0)},
+    )  # fmt: skip
+    return Maximum(at + done.x * scale, -float(done.fun) if done.fun < _NEVER else -math.inf, nodes)
+
+
+def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
+    """Points of the coarse grid, logarithms."""
+    one = seen[0]
+    exposure, period = one.n_steps * one.step_s, one.period_steps * one.step_s
+    variance = max(each.motion for each in seen) ** 2
+    share = variance / max(len(space.kinds) + (space.plant is not None), 1)
+    sd = math.sqrt(share)
+    at = [name for kind in space.kinds for name in PARAMETERS[kind]]
+    low, high = next(
+        (np.exp(space.bounds[k]) for k, name in enumerate(at) if name.endswith("frequency_hz")), (1.0, 1.0)
+    )
+    first = max(low, 0.05 / period)
+    frequencies = np.arange(first, high + _SPACING / period / 2, _SPACING / period)
+    frequencies = np.minimum(frequencies, high)
+
+    def pairs() -> list[tuple[float, float]]:
+        return [(f, min(_DECAY / (2 * math.pi * f * period), 0.5)) for f in frequencies]
+
+    def points(kind: str) -> list[tuple[float, ...]]:
+        if kind == "random-walk":
+            return [(share / exposure * c,) for c in (0.01, 0.1, 1.0)]
+        if kind == "ornstein-uhlenbeck":
+            return [(c * exposure, 2 * share / (c * exposure)) for c in (0.3, 3.0, 30.0)]
+        if kind == "second-order":
+            return [(c * exposure, c * exposure * d, sd) for c in (0.3, 3.0, 30.0) for d in (0.1, 0.5)]
+        if kind == "resonance":
+            return [(f, z, sd) for f, z in pairs()]
+        if kind == "ar3":
+            return [(f, z, c * exposure, sd) for f, z in pairs() for c in (0.1, 2.0)]
+        return [
+            (f, z, g, y, sd) for (f, z), (g, y) in itertools.combinations(pairs()[::2], 2)
+        ]  # ar4: two pairs, whose order does not matter
+
+    each = [points(kind) for kind in space.kinds]
+    if space.plant is not None:
+        each.insert(0, _plant_grid(space, seen, sd))
+    while math.prod(len(some) for some in each) > _MOST:
+        longest = max(range(len(each)), key=lambda k: len(each[k]))
+        each[longest] = each[longest][::2]
+    grid = []
+    for product in itertools.product(*each):
+        # Of equal processes, the order of the frequencies does not matter.
+        own = product[1:] if space.plant is not None else product
+        if all(
+            a[0] < b[0] or kind != other
+            for (a, kind), (b, other) in itertools.pairwise(zip(own, space.kinds, strict=True))
+        ):
+            grid.append(tuple(math.log(value) for part in product for value in part))
+    return grid
+
+
+def _plant_grid(space: Space, seen: Sequence[Readings], sd: float) -> list[tuple[float, ...]]:
+    """Points of the coarse grid of a plant; gains are those of least squares of the means."""
+    low, high = np.exp(space.bounds[1])
+    scales = np.geomspace(low, high, 24)
+    if space.plant == "first-order":
+        shapes: list[tuple[float, ...]] = [(scale,) for scale in scales]
+    else:
+        shapes = [(scale, damping) for scale in scales for damping in (0.02, 0.3, 1.5, 6.0)]
+    points = []
+    for shape in shapes:
+        top = bottom = 0.0
+        for each in seen:
+            path = IdentifiedPlant(space.plant or "", (1.0, *shape, sd)).response(each.inputs[:, 0], each.step_s)
+            slots = by_slot(path, each.slots, each.n_steps, each.period_steps, each.offset)
+            mean, y, good = slots[:, :, :-1].mean(axis=2), each.mean + each.centre, each.usable
+            mean = mean - mean[good].mean()
+            top += float((mean * y)[good].sum())
+            bottom += float((mean * mean)[good].sum())
+        gain = abs(top) / max(bottom, 1e-300)
+        points.append((min(max(gain, 1e-300), 1e300), *shape, sd / 2))
+    return points

@@ -1,0 +1,168 @@
+"""The job of `aolink identify`: recordings of blurred frames into a rig file with a model of what disturbs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from aolink.errors import IdentificationError
+from aolink.identification import (
+    CANDIDATES,
+    Identified,
+    IdentifiedPlant,
+    ProcessSum,
+    Readings,
+    Tried,
+    chosen,
+    identified,
+    identified_text,
+    kinds_of,
+    maxima,
+    readings,
+    space_of,
+    tried,
+)
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import check_has_exposures
+from aolink.rig import Rig
+
+_MOST_OUTPUTS = 24
+"""Outputs that a model is fitted to; of more, as many at equal distances."""
+_APART = 2
+"""Up to so many outputs of a copy of the plant have a model each; more have one for all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """What is to be identified."""
+
+    models: tuple[str, ...] = CANDIDATES
+    """Sums of kinds to choose from; one is taken as it is."""
+    plant: str | None = None
+    """Kind of the plant, where it is fitted as well."""
+    noise: bool = False
+    """Whether the pixels' noise is fitted as well."""
+    kernel: bool = False
+    """Whether the kernel's width is fitted as well."""
+    highest_hz: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found:
+    """What was identified of one output, or of all that share a model."""
+
+    output: str
+    model: ProcessSum
+    """The disturbance, without the noise of a plant that was fitted."""
+    plant: IdentifiedPlant | None
+    noise: float
+    wider: float
+    parameters: tuple[Identified, ...]
+    tried: tuple[Tried, ...]
+    """Empty where one model was asked for."""
+    log_likelihood: float
+    exposures: int
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """All outputs, and the text of the rig file that they make."""
+
+    found: tuple[Found, ...]
+    text: str
+
+
+Tell = Callable[[str, int, int], None]
+"""Told what is done, how many of it, of how many."""
+
+
+def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, tell: Tell | None = None) -> Result:
+    """Identify from recordings of one rig; ``rig`` in the place of their own where given.
+
+    Raises
+    ------
+    IdentificationError
+        They are of several rigs, too short, without pixels, or without inputs to identify a plant from.
+    RecordingError
+        One cannot be read.
+    """
+    for name in wanted.models:
+        kinds_of(name)
+    first = rig or recordings[0].rig
+    plant_known = wanted.plant is None
+    seen = []
+    for number, recording in enumerate(recordings):
+        check_has_exposures(recording)
+        own = rig or recording.rig
+        if (own.n_outputs, own.timing) != (first.n_outputs, first.timing):
+            raise IdentificationError(
+                f"{recording.path} is of another rig than {recordings[0].path}: timing and outputs must be the same"
+            )
+        seen.append(readings(own, list(recording.exposures()), plant_known=plant_known))
+        if tell:
+            tell("recordings", number + 1, len(recordings))
+    found = [_of_output(first, label, each, wanted, tell) for label, each in _by_output(first, seen)]
+    one = found[0]
+    if wanted.plant and len(found) > 1:
+        raise IdentificationError("a plant is identified where one input moves one output of a copy of it")
+    text = identified_text(
+        first.toml, first, [each.model for each in found], plant=one.plant, noise=one.noise, wider=one.wider
+    )
+    return Result(found=tuple(found), text=text)
+
+
+def _by_output(rig: Rig, seen: Sequence[Readings]) -> list[tuple[str, list[Readings]]]:
+    """The readings of each output of a copy of the plant, or of all where they are many."""
+    per_copy = rig.plant.n_outputs
+    if per_copy > _APART:
+        return [("all outputs", [_some(each, list(range(rig.n_outputs))) for each in seen])]
+    groups = [list(range(o, rig.n_outputs, per_copy)) for o in range(per_copy)]
+    labels = ["x", "y"] if per_copy == 2 else ["the output" if rig.plant.axes == 1 else "each output"]
+    return [(label, [_some(each, which) for each in seen]) for label, which in zip(labels, groups, strict=True)]
+
+
+def _some(seen: Readings, which: list[int]) -> Readings:
+    seeing = [o for o in which if seen.usable[o].any()]
+    if not seeing:
+        raise IdentificationError("no exposure shows a spot of this output")
+    chosen_outputs = np.unique(np.linspace(0, len(seeing) - 1, min(len(seeing), _MOST_OUTPUTS)).round().astype(int))
+    return seen.of_outputs([seeing[k] for k in chosen_outputs])
+
+
+def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None) -> Found:
+    def space(kinds: Sequence[str]):  # type: ignore[no-untyped-def]
+        return space_of(
+            kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
+            highest_hz=wanted.highest_hz, plant=wanted.plant,
+        )  # fmt: skip
+
+    candidates: list[Tried] = []
+    if len(wanted.models) > 1:
+        for number, name in enumerate(wanted.models):
+            if tell:
+                tell(f"models, {output}", number, len(wanted.models))
+            candidates.append(tried(name, space, seen))
+        name = chosen(candidates).name
+    else:
+        name = wanted.models[0] if wanted.models else ""
+    of = space(kinds_of(name) if name else ())
+    if tell:
+        tell(f"fit, {output}", 0, len(of.names) + 1)
+    tops = maxima(of, seen)
+    sets = identified(of, tops, seen, (lambda k: tell(f"fit, {output}", k + 1, len(of.names) + 1)) if tell else None)
+    x, plant = tops[0].x, of.fitted_plant(tops[0].x)
+    whole = of.model(x)
+    noise, wider = of.others(x)
+    notes = []
+    for each in sets:
+        if each.name.endswith("frequency_hz") and len(each.pieces) > 1:
+            rest = ", ".join(f"{piece.best:.4g}" for piece in each.pieces if not piece.low <= each.best <= piece.high)
+            notes.append(f"{each.name}: {rest} Hz explains the exposures nearly as well: an alias that remains")
+    return Found(
+        output=output, model=replace(whole, processes=whole.processes[1 if plant else 0 :]), plant=plant, noise=noise,
+        wider=wider, parameters=sets, tried=tuple(candidates), log_likelihood=tops[0].log_likelihood,
+        exposures=sum(int(each.usable.any(axis=0).sum()) for each in seen), notes=tuple(notes),
+    )  # fmt: skip

@@ -1,0 +1,87 @@
+"""Whether a decoded message can be what it says, before anything is computed with it."""
+
+from __future__ import annotations
+
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import Message
+
+from aolink.estimation.estimate import Status
+from aolink.recording import schemas_pb2 as pb
+from aolink.rig import Rig
+from aolink.wire import messages_pb2 as wire
+from aolink.wire.runs_pb2 import Run
+
+_LAST_NS = 1 << 62
+"""Times and fast steps up to this, in ns, can be added and subtracted in 64 bits: 146 years."""
+_WITHOUT_INPUTS = (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
+
+
+def what_is_wrong(message: Message, rig: Rig) -> str:
+    """The field of a message that contradicts itself, the rig or the calendar, in words; empty where none does."""
+    if isinstance(message, wire.Applied | wire.CommandBlock | Run):
+        return _of_run(message, rig)
+    if isinstance(message, pb.ExposureInfo):
+        return _of_exposure(message, rig)
+    if isinstance(message, pb.Estimate):
+        return _of_estimate(message, rig)
+    if isinstance(message, wire.Truth):
+        return _of_truth(message, rig)
+    if isinstance(message, RawImage):
+        return "" if message.width and message.height else "a picture without pixels"
+    return ""
+
+
+def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
+    if (run.first_step + run.n_steps) * rig.timing.fast_step_ns > _LAST_NS:
+        return "first_step is beyond all times"
+    if isinstance(run, wire.Applied) and run.source in _WITHOUT_INPUTS:
+        return ""
+    # Inputs as bytes have 8 of them a number. A report without the inputs of its steps would stand for all of these.
+    count = len(run.u) / 8 if isinstance(run, Run) else len(run.u)
+    return "" if count == run.n_steps * rig.n_inputs else "u has not the inputs of its steps"
+
+
+def _of_exposure(info: pb.ExposureInfo, rig: Rig) -> str:
+    if info.frame_id > _LAST_NS:
+        return "frame_id is beyond all counts"
+    if info.last_step + 1 - info.first_step != rig.timing.exposure_steps:
+        return "last_step is not at the end of an exposure"
+    if info.last_step * rig.timing.fast_step_ns > _LAST_NS:
+        return "first_step is beyond all times"
+    if info.exposure_offset_ns >= rig.timing.fast_step_ns:
+        return "exposure_offset_ns is not below a fast step"
+    times = (
+        info.device_start_ns, info.device_end_ns, info.host_start_ns, info.host_receive_ns, info.host_first_byte_ns,
+    )  # fmt: skip
+    if not all(-_LAST_NS <= each <= _LAST_NS for each in times):
+        return "a time is beyond the calendar"
+    sigmas = (info.clock_sigma_ns, info.alignment_sigma_ns)  # NaN: it is not known
+    return "" if not any(each < 0 or each > _LAST_NS for each in sigmas) else "a standard deviation is impossible"
+
+
+def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
+    axes, n, c, m = message.axes, message.n_states, message.n_coefficients, message.n_measurements
+    spread = message.innovation_variance or message.innovation_covariance
+    lengths = (
+        (message.end_state, (axes * n,)), (message.end_covariance, (axes * n * n,)),
+        (message.coefficients, (axes * c,)), (message.coefficient_covariance, (axes * c * c,)),
+        (message.innovation, (axes * m,)), (spread, (axes * m, axes * m * m)), (message.nis, (axes,)),
+    )  # fmt: skip
+    if (axes, n) != (rig.plant.axes, rig.plant.n_states) or c < n:
+        return "the states are not the rig's"
+    if not all(len(values) in expected for values, expected in lengths):
+        return "it has not as many numbers as it says"
+    if not message.estimator.isprintable():
+        return "its estimator's name is no text"
+    if int(message.status) not in {int(each) for each in Status}:
+        return "its status is none that this aolink knows"
+    return "" if message.n_steps == rig.timing.exposure_steps else "n_steps is not the length of an exposure"
+
+
+def _of_truth(message: wire.Truth, rig: Rig) -> str:
+    n_path = rig.n_outputs * rig.timing.exposure_steps
+    states = {len(message.start_state), len(message.end_state)} - {0}
+    if (message.n_outputs, len(message.path or message.path_single)) != (rig.n_outputs, n_path):
+        return "its path is not that of an exposure"
+    fits = len(states) < 2 and all(each % max(message.axes, 1) == 0 for each in states)
+    return "" if fits else "its states do not fit its axes"

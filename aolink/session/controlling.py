@@ -1,0 +1,110 @@
+"""The closed loop in a session: which steps an exposure may still change, and what is recorded and reported of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aolink.control import Act, ControlLoop, State
+from aolink.errors import ControlError
+from aolink.estimation import Estimate
+from aolink.exposure import Exposure
+from aolink.recording import convert
+from aolink.recording import schemas_pb2 as pb
+from aolink.rig import Rig
+from aolink.session.report import ControlReport
+from aolink.wire import messages_pb2 as wire
+
+MARGIN_S = 0.003
+"""Real time: how long a block may take to the mirror, at least, before its first step begins."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """What came of an exposure for the session."""
+
+    message: pb.Control
+    first_step: int
+    """Commands from this fast step on are to be sent anew."""
+    warning: str
+    """What a person should know now; empty while nothing has changed."""
+
+
+class Controlling:
+    """A controller in a session, and the estimator that serves it: the first one of the session.
+
+    Raises
+    ------
+    ControlError
+        There is no such controller, it cannot work on this rig, or it needs an estimator and has none.
+    """
+
+    def __init__(self, rig: Rig, controller: str, estimators: Sequence[str]) -> None:
+        self.loop = ControlLoop(rig, controller)
+        self.estimator = estimators[0] if estimators and self.loop.needs_state else ""
+        if self.loop.needs_state and not estimators:
+            raise ControlError(f"the controller {controller} needs an estimator's state: give one, such as moments")
+        self.report = ControlReport(controller=controller, estimator=self.estimator)
+        self.cause_frame = 0
+        """The newest exposure that the inputs know."""
+        self._step_s, self._period = rig.timing.fast_step_s, rig.timing.frame_period_steps
+        self._steps, self._n_inputs = rig.timing.exposure_steps, rig.n_inputs
+        self._first_step = 0
+        self._state, self._fits = State.CLOSED, True
+
+    def begin(self, first_step: int) -> None:
+        """The session begins with this fast step."""
+        self._first_step = first_step
+        self.loop.begin(first_step)
+
+    def horizon(self, device_step: int) -> int:
+        """Virtual time: the first fast step whose input the next exposure to end may still change.
+
+        Commands go no further: the rig runs to their end at once.
+        """
+        ended = max(0, (device_step - self._first_step - self._steps) // self._period + 1)
+        return self._first_step + ended * self._period + self._steps + self.loop.delay_steps
+
+    def applied(self, applied: wire.Applied) -> None:
+        """Take a report of what the mirror held."""
+        if applied.u:
+            self.loop.applied(applied.first_step, np.array(applied.u).reshape(applied.n_steps, self._n_inputs))
+
+    def see(self, exposure: Exposure, estimate: Estimate | None, earliest_step: int) -> Change:
+        """Take the next exposure, or its estimate. Raises ControlError where the controller fails."""
+        act = self.loop.see(exposure, estimate, earliest_step)
+        self.cause_frame = act.frame_id
+        self.report.add(act, self._step_s)
+        message = convert.control_message(act, self.loop.name, self.estimator)
+        return Change(message=message, first_step=act.first_step, warning=self._news(act))
+
+    def _news(self, act: Act) -> str:
+        """What has changed with an exposure, in words."""
+        news, frame = [], act.frame_id
+        if act.state is not self._state:
+            held = "the mirror holds its input" if act.state is State.HELD else "the mirror goes to its safe input"
+            lost = f"the loop is open from frame {frame} on, {held}: {act.reason}"
+            news.append(f"the loop is closed again from frame {frame} on" if act.state is State.CLOSED else lost)
+        if act.fit is not None and act.fit.fits != self._fits:
+            self._fits = act.fit.fits
+            fits = "fits again" if act.fit.fits else "no longer fits what is seen"
+            news.append(f"the rig file's model {fits} (frame {frame}): {act.fit.text()}")
+        self._state = act.state
+        return "; ".join(news)
+
+
+def facts(rig: Rig, controlling: Controlling, stability: str) -> dict[str, str]:
+    """What a recording says of its controller, for its metadata."""
+    control = rig.control
+    numbers = {
+        "delay_s": control.delay_s, "when_lost": control.when_lost, "gain": control.gain, "leak": control.leak,
+        "least_singular_value": control.least_singular_value, "effort": control.effort,
+    }  # fmt: skip
+    return {
+        "controller": controlling.loop.name,
+        "control_estimator": controlling.estimator,
+        "control": ", ".join(f"{name} {value}" for name, value in numbers.items()),
+        "control_stability": stability,
+    }

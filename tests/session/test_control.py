@@ -1,0 +1,312 @@
+"""Sessions that close their loop, over real pseudo terminals: what is commanded, what is recorded, what is safe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.control import State
+from aolink.devices.gate import Gate
+from aolink.devices.identity import identify
+from aolink.devices.native import NativeCamera, NativeMirror
+from aolink.errors import ControlError
+from aolink.jobs.closed_loop import closed_loop, replayed
+from aolink.jobs.demo import simulated_rig
+from aolink.recording import schemas_pb2 as pb
+from aolink.recording import topics
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, reestimate
+from aolink.rig import Rig, load_rig, parse_rig
+from aolink.session import Report, record
+from aolink.session.replay import would_command
+from aolink.wire import messages_pb2 as wire
+from tests.control.rigs import DRIFT, LINE, small_rig
+from tests.kinds import must_be
+from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
+
+FAULTS = """
+[simulation.faults]
+bit_flip_rate = 0.02
+packet_loss_rate = 0.04
+command_loss_rate = 0.05
+duplicate_rate = 0.03
+"""
+
+
+def rig_file(folder: Path, rig: Rig, more: str = "") -> Path:
+    path = folder / "rig.toml"
+    path.write_text(rig.toml + more)
+    return path
+
+
+def close(
+    path: Path, folder: Path, controller: str, *estimators: str, exposures: int = 40, how: tuple[str, ...] = ()
+) -> Report:
+    with simulated_rig(path, *how) as (camera, mirror):
+        return record(
+            load_rig(path), camera, mirror, folder / "a.mcap", estimators=estimators, exposures=exposures,
+            control=controller, overwrite=True,
+        )  # fmt: skip
+
+
+def acts(folder: Path) -> list[pb.Control]:
+    return [must_be(pb.Control, each.message) for each in Recording(folder / "a.mcap").messages(topics.CONTROL)]
+
+
+@pytest.mark.parametrize(("controller", "estimator"), [("integrator", ""), ("lqg", "o1")])
+def test_on_virtual_time_the_session_is_the_loop_in_memory_bit_for_bit(
+    tmp_path: Path, controller: str, estimator: str
+) -> None:
+    path = rig_file(tmp_path, small_rig(DRIFT, LINE))
+    report = close(path, tmp_path, controller, *([estimator] if estimator else []))
+    assert report.ended == "complete"
+    assert report.steps_commanded == report.steps_applied == 40 * 40
+    memory = list(closed_loop(load_rig(path), controller, estimator, 40))
+    for ours, theirs, act in zip(Recording(tmp_path / "a.mcap").exposures(), memory, acts(tmp_path), strict=True):
+        assert np.array_equal(ours.inputs, theirs.exposure.inputs)
+        assert ours.truth is not None
+        assert theirs.exposure.truth is not None
+        assert np.array_equal(ours.truth.path, theirs.exposure.truth.path)
+        assert theirs.act is not None
+        assert (act.frame_id, act.first_step, act.delay_steps) == (
+            theirs.act.frame_id,
+            theirs.act.first_step,
+            theirs.act.delay_steps,
+        )
+
+
+def test_the_recording_says_who_closed_the_loop_and_how(tmp_path: Path) -> None:
+    path = rig_file(tmp_path, small_rig(DRIFT, control="gain = 0.4"))
+    report = close(path, tmp_path, "lqg", "moments", "o1")
+    facts = Recording(tmp_path / "a.mcap").metadata
+    assert (facts["controller"], facts["control_estimator"]) == ("lqg", "moments")
+    assert "gain 0.4" in facts["control"]
+    assert "stable with up to" in facts["control_stability"]
+    assert report.control is not None
+    assert facts["control_exposures"] == "40"
+    assert float(facts["control_delay_ms"]) == 10.0
+    assert float(facts["control_slope_rms"]) == report.control.slope_rms
+    for act in acts(tmp_path):
+        assert (act.controller, act.estimator, act.delay_steps, act.late) == ("lqg", "moments", 10, False)
+        assert act.slope_rms > 0
+    # Each block knows the newest exposure that had changed the inputs when it was sent.
+    changed = {act.first_step: act.frame_id for act in acts(tmp_path)}
+    for each in Recording(tmp_path / "a.mcap").messages(topics.COMMAND):
+        block = must_be(wire.CommandBlock, each.message)
+        assert block.cause_frame_id == max(
+            (frame for step, frame in changed.items() if step <= block.first_step), default=0
+        )
+
+
+def test_estimates_of_a_closed_loop_are_the_same_offline(tmp_path: Path) -> None:
+    path = rig_file(tmp_path, small_rig(LINE))
+    close(path, tmp_path, "lqg", "o1")
+    recording = Recording(tmp_path / "a.mcap")
+    assert first_difference(recording.estimates("o1"), reestimate(recording, ["o1"])["o1"]) is None
+
+
+def test_faults_on_the_wire_leave_the_loop_closed_and_every_step_accounted_for(tmp_path: Path) -> None:
+    """Frames are lost, commands and reports come again; and the same seed gives the same bytes."""
+    path = rig_file(tmp_path, small_rig(LINE), FAULTS)
+    first = close(path, tmp_path, "lqg", "o1")
+    bytes_of_first = (tmp_path / "a.mcap").read_bytes()
+    report = close(path, tmp_path, "lqg", "o1")
+    assert (tmp_path / "a.mcap").read_bytes() == bytes_of_first
+    assert report.counts() == first.counts()
+    assert report.ended == "complete"
+    assert 0 < report.frames_lost < 20
+    assert report.blocks_retransmitted > 0
+    ends = ("applied", "superseded", "late", "refused", "not_reported")
+    assert report.steps_commanded == sum(getattr(report, f"steps_{end}") for end in ends)
+    assert report.steps_applied + report.steps_parked == 40 * 40
+    truths = [each.truth for each in list(Recording(tmp_path / "a.mcap").exposures())[10:]]
+    assert np.sqrt(np.mean([truth.path**2 for truth in truths if truth is not None])) < 0.07  # 0.1 in the open loop
+
+
+def test_in_real_time_every_step_is_accounted_for_and_within_limits(tmp_path: Path) -> None:
+    """Nothing is said about how fast: only that each step ends once, and each exposure has its delay."""
+    path = rig_file(tmp_path, small_rig(DRIFT))
+    report = close(path, tmp_path, "lqg", "o1", exposures=50, how=("--real-time",))
+    assert report.ended == "complete"
+    ends = ("applied", "superseded", "late", "refused", "not_reported")
+    assert report.steps_commanded == sum(getattr(report, f"steps_{end}") for end in ends)
+    rig, recording = load_rig(path), Recording(tmp_path / "a.mcap")
+    for act in acts(tmp_path):
+        assert act.delay_steps >= 10
+    held: dict[int, float] = {}
+    commanded: dict[int, dict[int, float]] = {}
+    for each in recording.messages(topics.COMMAND, topics.APPLIED):
+        if isinstance(each.message, wire.CommandBlock):
+            block = each.message
+            commanded[block.block_id] = {block.first_step + k: u for k, u in enumerate(block.u)}
+            assert rig.mirror.input_min[0] <= min(block.u) <= max(block.u) <= rig.mirror.input_max[0]
+        elif isinstance(each.message, wire.Applied) and each.message.source == wire.Applied.COMMAND:
+            applied = each.message
+            for k, u in enumerate(applied.u):
+                assert abs(u - commanded[applied.block_id][applied.first_step + k]) < 1e-4
+                held[applied.first_step + k] = u
+    assert len(held) == report.steps_applied
+
+
+def test_an_estimator_that_is_too_slow_to_control_opens_the_loop_and_costs_nothing_else(tmp_path: Path) -> None:
+    """`sampled` takes longer for an exposure than six of them last: the mirror holds, and the recording has it all."""
+    path = rig_file(tmp_path, small_rig(DRIFT))
+    report = close(path, tmp_path, "lqg", "sampled", exposures=60, how=("--real-time",))
+    assert (report.ended, report.exposures) == ("complete", report.frames_received)
+    assert report.steps_applied + report.steps_parked + report.steps_not_reported == 60 * 40
+    assert report.control is not None
+    assert report.control.exposures < report.exposures
+    assert report.control.late_exposures == report.control.exposures
+
+
+@pytest.mark.parametrize(("when_lost", "state"), [("hold", State.HELD), ("park", State.PARKED)])
+def test_a_light_that_goes_out_opens_the_loop(tmp_path: Path, when_lost: str, state: State) -> None:
+    """The camera sees nothing: the mirror stays where the rig file says, and the session goes on."""
+    path = rig_file(tmp_path, small_rig(DRIFT, control=f'when_lost = "{when_lost}"', light="dark"))
+    report = close(path, tmp_path, "lqg", "o1", exposures=20)
+    assert report.ended == "complete"
+    assert [int(act.state) for act in acts(tmp_path)][-10:] == [int(state)] * 10
+    assert any("the loop is open from frame" in warning for warning in report.warnings)
+    logged = [str(each.message.message) for each in Recording(tmp_path / "a.mcap").messages(topics.LOG)]  # type: ignore[attr-defined]
+    assert any("the loop is open from frame" in text for text in logged)
+
+
+def test_a_model_that_no_longer_fits_is_said(tmp_path: Path) -> None:
+    """The rig is shaken five times as much as the session's rig file says."""
+    path = rig_file(tmp_path, small_rig(DRIFT.replace("0.15", "0.6")))
+    with simulated_rig(path) as ports:
+        report = record(
+            small_rig(DRIFT), *ports, tmp_path / "a.mcap", estimators=["moments"], exposures=80, control="lqg"
+        )
+    assert any("the rig file's model no longer fits what is seen" in warning for warning in report.warnings)
+    assert not acts(tmp_path)[-1].model_fits
+    assert report.control is not None
+    assert report.control.misfit_exposures > 0
+
+
+@pytest.mark.parametrize(
+    ("controller", "estimators", "rig", "message"),
+    [
+        ("pid", [], small_rig(), "there is no controller 'pid'"),
+        ("lqg", [], small_rig(), "the controller lqg needs an estimator's state: give one, such as moments"),
+        ("integrator", [], small_rig(control="gain = 4.0"), "is unstable: .* close it all the same with --force"),
+    ],
+)
+def test_a_loop_that_cannot_be_closed_is_refused_before_anything_is_opened(
+    tmp_path: Path, controller: str, estimators: list[str], rig: Rig, message: str
+) -> None:
+    with pytest.raises(ControlError, match=message):
+        record(rig, "/dev/none", "/dev/none", tmp_path / "a.mcap", estimators=estimators, control=controller)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unstable_loop_that_is_forced_stays_within_the_limits(tmp_path: Path) -> None:
+    path = rig_file(tmp_path, small_rig(DRIFT, control="gain = 20.0"))
+    with simulated_rig(path) as ports:
+        report = record(load_rig(path), *ports, tmp_path / "a.mcap", exposures=20, control="integrator", force=True)
+    assert report.ended == "complete"
+    assert report.control is not None
+    assert report.control.clipped_steps > 0
+    u = np.concatenate([exposure.inputs for exposure in Recording(tmp_path / "a.mcap").exposures()])
+    assert np.abs(u).max() <= 1 + 1e-9
+    assert np.abs(u).max() > 0.99
+
+
+def test_several_spots_and_a_mirror_of_many_actuators_run_in_a_closed_loop(tmp_path: Path) -> None:
+    """sh-8x8: 48 lenslets, 16 actuators, a turning plate of turbulence; the mirror's modes are what is controlled."""
+    rig = load_rig("sh-8x8")
+    series = list(closed_loop(rig, "integrator", "", 12))
+    still = list(closed_loop(rig, "", "", 12))
+    ours, theirs = (
+        np.sqrt(np.mean([each.exposure.truth.path**2 for each in some[4:] if each.exposure.truth is not None]))
+        for some in (series, still)
+    )
+    assert ours < theirs
+
+
+def test_a_controller_asked_offline_says_what_it_commanded_in_the_session(tmp_path: Path) -> None:
+    """And for a simulated rig, what came of it: the same numbers as in the session, from the same seed."""
+    path = rig_file(tmp_path, small_rig(LINE))
+    close(path, tmp_path, "lqg", "o1")
+    recording = Recording(tmp_path / "a.mcap")
+    for each in would_command(recording, "lqg", "o1"):
+        assert np.array_equal(each.inputs[: len(each.recorded)], each.recorded)
+    result = replayed(recording, "lqg", "o1", lambda: False, lambda done: None)
+    assert (result.exposures, result.difference_rms, result.seed) == (40, 0.0, 3)
+    assert result.closed_rms == result.recorded_rms < 0.5 * result.open_rms
+
+
+def test_another_controller_offline_answers_to_what_was_recorded(tmp_path: Path) -> None:
+    path = rig_file(tmp_path, small_rig(DRIFT))
+    with simulated_rig(path, "--seed", "8") as ports:
+        record(load_rig(path), *ports, tmp_path / "a.mcap", exposures=30)
+    result = replayed(Recording(tmp_path / "a.mcap"), "integrator", "o1", lambda: False, lambda done: None)
+    assert (result.estimator, result.seed) == ("", 8)
+    assert result.recorded_rms == result.open_rms > result.closed_rms
+    assert result.difference_rms > 0
+
+
+def on_simulated_time(tmp_path: Path, rig: Rig, exposures: int = 40) -> Run:
+    """A session in real time on a simulated clock: what is queued is superseded, and it is the same every time."""
+    hub = SimulatedTimeHub(rig)
+    return run_session(hub, rig, tmp_path / "a.mcap", exposures, controller="lqg", estimators=["o1"])
+
+
+def test_with_a_queue_the_loop_is_as_good_as_its_delay(tmp_path: Path) -> None:
+    """Three blocks of lead, which are longer than a frame, delay nothing: each exposure acts after 10 ms, as asked."""
+    rig = small_rig(LINE)
+    run = on_simulated_time(tmp_path, rig)
+    assert run.error is None
+    report = run.report
+    assert report.steps_superseded > 40 * 20
+    assert report.steps_late == report.steps_parked == 0
+    assert {act.delay_steps for act in acts(tmp_path)} == {10}
+    truths = [each.truth for each in list(Recording(tmp_path / "a.mcap").exposures())[10:]]
+    assert np.sqrt(np.mean([truth.path**2 for truth in truths if truth is not None])) < 0.05  # 0.1 in the open loop
+    ends = ("applied", "superseded", "late", "refused", "not_reported")
+    assert report.steps_commanded == sum(getattr(report, f"steps_{end}") for end in ends)
+
+
+def test_commands_that_are_lost_while_others_replace_them_are_accounted_for(tmp_path: Path) -> None:
+    rig = parse_rig(small_rig(LINE).toml + "[simulation.faults]\ncommand_loss_rate = 0.2\npacket_loss_rate = 0.05\n")
+    run = on_simulated_time(tmp_path, rig)
+    assert run.error is None
+    report = run.report
+    assert report.ended == "complete"
+    assert report.blocks_retransmitted > 0
+    ends = ("applied", "superseded", "late", "refused", "not_reported")
+    assert report.steps_commanded == sum(getattr(report, f"steps_{end}") for end in ends)
+    held = [source for step, (_, source) in run.hub.truth().items() if 0 <= step - run.first_step < 40 * 40]
+    assert report.steps_applied + report.steps_not_reported >= held.count(wire.Applied.COMMAND)
+
+
+def test_a_block_that_was_replaced_is_never_sent_again(tmp_path: Path) -> None:
+    """It is lost; another one takes its place; when the line is mended, only that one comes."""
+    rig = small_rig()
+    hub = SimulatedTimeHub(rig)
+    camera_link, mirror_link = hub.links
+    asked_ns = hub.now_ns()
+    identities = identify(hub, camera_link, 1), identify(hub, mirror_link, 2)
+    gate = Gate(rig, hub, identities, asked_ns)
+    hub.native = [
+        NativeCamera(hub, camera_link, identities[0], gate),
+        NativeMirror(hub, mirror_link, identities[1], gate),
+    ]
+    mirror = must_be(NativeMirror, hub.native[1])
+    first = hub.server.devices.step + 200
+    hub.cut()
+    lost = mirror.send_block(first, np.full((40, 1), 0.1), 0, hub.now_ns())
+    assert mirror.withdraw(first + 40) == first + 40
+    assert mirror.withdraw(first + 20) == first
+    hub.cut(to_device=False, to_host=False)
+    mirror.send_block(first, np.full((40, 1), 0.2), 0, hub.now_ns())
+    while hub.server.devices.step < first + 40:
+        for _ in hub.events(0.005):
+            pass
+        mirror.serve(hub.now_ns())
+    blocks = {hub.truth()[step][0] for step in range(first, first + 40)}
+    assert lost.block_id not in blocks
+    assert len(blocks) == 1
+    assert mirror.in_flight == 0

@@ -1,0 +1,158 @@
+"""Sessions in real time with the simulated rig, and with the reference device, which was written from the page alone.
+
+The clock runs here, so nothing is said about how fast; only that order and counts are right.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import aolink
+from aolink.estimation import score
+from aolink.jobs.demo import simulated_rig
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import first_difference, reestimate
+from aolink.rig import load_rig
+from aolink.session import Report, record
+from tests.needs import missing
+from tests.session.native import open_native
+
+Ports = Callable[[], AbstractContextManager[tuple[str, str]]]
+RIG = load_rig("section-vi")
+DEVICE = Path(__file__).parents[2] / "tools" / "device"
+SANITISED = "-std=c99 -O1 -g -Wall -Wextra -Werror -pedantic -fsanitize=address,undefined -fno-sanitize-recover=all"
+
+
+@contextlib.contextmanager
+def reference_device(program: Path) -> Iterator[tuple[str, str]]:
+    """The C program behind two pseudo terminals; it must end without a word from a sanitiser."""
+    process = subprocess.Popen([program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
+    assert process.stdout is not None
+    try:
+        select.select([process.stdout], [], [], 20)
+        ports = dict(process.stdout.readline().split() for _ in range(2))
+        yield ports["camera"], ports["mirror"]
+    finally:
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+    assert "runtime error" not in said
+    assert "Sanitizer" not in said
+
+
+@pytest.fixture(scope="module", params=["simulated rig", "reference device"])
+def serve(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ports:
+    if request.param == "simulated rig":
+        return lambda: simulated_rig("section-vi", "--real-time")
+    build = tmp_path_factory.mktemp("device")
+    command = ["make", "-s", "-C", str(DEVICE), f"BUILD={build}", f"CFLAGS={SANITISED}"]
+    try:
+        made = subprocess.run(command, capture_output=True, text=True)
+    except FileNotFoundError as error:
+        missing("make", error)
+    if made.returncode:
+        missing("a C compiler with sanitisers", RuntimeError(made.stderr))
+    return lambda: reference_device(build / "device")
+
+
+def test_a_session_has_latencies_and_accounts_for_every_step(serve: Ports, tmp_path: Path) -> None:
+    path = tmp_path / "real.mcap"
+    with serve() as (camera, mirror):
+        report = record(RIG, camera, mirror, path, estimators=["o3"], exposures=4)
+    assert (report.ended, report.exposures, report.virtual_time) == ("complete", 4, False)
+    assert report.steps_commanded == report.steps_applied + report.steps_parked == 800
+    assert report.steps_late == report.steps_parked
+    assert len(report.latencies) == 4
+    for latency in report.latencies:
+        assert 0 < latency.first_byte_ns <= latency.complete_ns <= latency.estimated_ns
+    exposures = list(Recording(path).exposures())
+    assert [e.frame_id for e in exposures] == [1, 2, 3, 4]
+    for exposure in exposures:
+        assert exposure.host_receive_ns > exposure.host_start_ns
+        assert 0 < exposure.clock_sigma_ns < 10_000_000
+    recording = Recording(path)
+    assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"], as_recorded=True)["o3"]) is None
+
+
+def test_the_frames_show_where_the_truth_says_the_spot_was(serve: Ports, tmp_path: Path) -> None:
+    """Two programs, one plant: the mean of the recorded path is where each frame's light is, within its noise."""
+    path = tmp_path / "a.mcap"
+    with serve() as (camera, mirror):
+        record(RIG, camera, mirror, path, exposures=15)
+    recording = Recording(path)
+    exposures = list(recording.exposures())
+    estimates = aolink.estimate(recording, "profile")
+    assert len(exposures) == 15
+    errors = np.array(
+        [
+            estimate.path.mean() - exposure.truth.path.mean()
+            for estimate, exposure in zip(estimates, exposures, strict=True)
+            if exposure.truth is not None
+        ]
+    )
+    assert np.sqrt((errors[3:] ** 2).mean()) < 0.02
+    assert score(exposures, estimates).path_rmse < 0.03
+
+
+def stopped_host(serve: Ports, path: Path, seconds: float) -> Report:
+    """A session whose host is held up in the middle of its second exposure."""
+
+    def inputs(first_step: int, n_steps: int) -> np.ndarray:
+        if first_step == 300:
+            time.sleep(seconds)  # the fault itself, not a wait for something
+        return RIG.drive.inputs(first_step, n_steps, RIG.timing.fast_step_s)
+
+    with serve() as (camera, mirror):
+        return record(RIG, camera, mirror, path, exposures=8, inputs=inputs)
+
+
+@pytest.mark.parametrize("seconds", [0.3, 1.0])
+def test_a_host_that_is_held_up_has_every_step_accounted_for(serve: Ports, tmp_path: Path, seconds: float) -> None:
+    report = stopped_host(serve, tmp_path / "a.mcap", seconds)
+    assert report.ended == "complete"
+    assert report.frames_received + report.frames_lost == 8
+    assert report.steps_applied + report.steps_parked == 1600
+    assert report.steps_parked > 0
+    assert report.steps_superseded == report.steps_not_reported == 0
+    assert report.steps_commanded == report.steps_applied + report.steps_late + report.steps_refused
+    if not report.rearmed:  # otherwise the watchdog had parked the mirror by then: it refused what came until told
+        assert report.steps_late == report.steps_parked
+
+
+def test_what_a_killed_host_left_behind_is_not_in_the_next_session(serve: Ports, tmp_path: Path) -> None:
+    """The camera still runs and commands are queued, with a gap before them; the next session knows nothing of it."""
+    path = tmp_path / "a.mcap"
+    with serve() as ports:
+        with open_native(RIG, *ports) as (hub, camera, mirror):
+            first = mirror.identity.next_step + 300
+            camera.start(first, 0)
+            mirror.send_block(first + 50, np.full((50, 1), 0.01), 0, hub.now_ns())
+            mirror.send_block(first + 100, np.full((50, 1), 0.01), 0, hub.now_ns())
+            hub.wait(0.1)
+        report = record(RIG, *ports, path, estimators=["o3"], exposures=3)
+    assert (report.ended, report.exposures, report.frames_received) == ("complete", 3, 3)
+    exposures = list(Recording(path).exposures())
+    assert [e.first_step - exposures[0].first_step for e in exposures] == [0, 200, 400]
+    assert np.abs(exposures[0].inputs[0]).max() < 1e-5
+
+
+def test_a_silent_host_leaves_the_mirror_latched_and_the_next_session_rearms_it(serve: Ports, tmp_path: Path) -> None:
+    with serve() as ports:
+        with open_native(RIG, *ports) as (hub, _, mirror):
+            first = mirror.identity.next_step + 100
+            mirror.send_block(first, np.full((50, 1), 0.01), 0, hub.now_ns())
+            hub.wait(0.1)
+            time.sleep(2 * RIG.mirror.watchdog_s)  # the fault itself: nothing is sent
+        with open_native(RIG, *ports) as (_, _, mirror):
+            assert (mirror.identity.mirror.parked, mirror.identity.mirror.latched) == (True, True)
+        report = record(RIG, *ports, tmp_path / "a.mcap", exposures=3)
+    assert (report.ended, report.exposures, report.steps_applied) == ("complete", 3, 600)

@@ -1,0 +1,102 @@
+"""Pictures and arrays that hold more than they should: one error, before the memory is asked for."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.errors import AolinkError, FrameError, ImportingError, RestorationError
+from aolink.importing.readers import open_film
+from aolink.limits import VARIABLE, limits, load_array
+from aolink.optics.frame_file import read_frame
+from aolink.optics.pictures import read_picture
+
+CARDS = ("SIMPLE  =                    T", "BITPIX  =                    8", "NAXIS   =                    2")
+
+
+def fits(columns: int, rows: int) -> bytes:
+    cards = (*CARDS, f"NAXIS1  = {columns:20}", f"NAXIS2  = {rows:20}", "END")
+    return "".join(card.ljust(80) for card in cards).ljust(2880).encode()
+
+
+def png(path: Path, width: int, height: int) -> Path:
+    """A picture of black pixels, written row by row."""
+    packer = zlib.compressobj(1)
+    data = b"".join(packer.compress(bytes(1 + width)) for _ in range(height)) + packer.flush()
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    with path.open("wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for kind, content in ((b"IHDR", head), (b"IDAT", data), (b"IEND", b"")):
+            file.write(struct.pack(">I", len(content)) + kind + content)
+            file.write(struct.pack(">I", zlib.crc32(kind + content)))
+    return path
+
+
+def test_a_small_fits_file_that_holds_gigabytes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.fits.gz"
+    with gzip.open(path, "wb", compresslevel=1) as file:
+        file.write(fits(8192, 8192))
+        for _ in range(64):
+            file.write(bytes(1 << 20))
+    assert path.stat().st_size < 1 << 20
+    assert read_frame(path).shape == (8192, 8192)
+    monkeypatch.setenv(VARIABLE, "unpacked_bytes=3e7")
+    for read, error in ((read_frame, FrameError), (open_film, ImportingError)):
+        with pytest.raises(error, match="very much more than its size without compression, which is above the limit"):
+            read(path)
+
+
+def test_a_picture_with_too_many_pixels_is_refused_before_they_are_read(tmp_path: Path) -> None:
+    path = png(tmp_path / "a.png", 13000, 13000)
+    with pytest.raises(RestorationError, match=r"a\.png: it has 13000 x 13000 pixels, which is above the limit"):
+        read_picture(path)
+    with pytest.raises(ImportingError, match="13000 x 13000 pixels"):
+        open_film(tmp_path)
+    assert read_picture(png(tmp_path / "b.png", 300, 200)).shape == (200, 300)
+
+
+def test_an_archive_that_holds_more_than_it_should_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.savez_compressed(tmp_path / "a.npz", frames=np.zeros((100, 100, 100)))
+    assert open_film(tmp_path / "a.npz").count == 100
+    monkeypatch.setenv(VARIABLE, "unpacked_bytes=1e6")
+    with pytest.raises(ImportingError, match=r"it holds 8000\d* bytes without compression, which is above the limit"):
+        open_film(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "empty.fits", "empty.png", "empty.npy", "empty.npz", "none.fits"])
+def test_what_is_no_picture_is_one_error(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name.startswith("empty"):
+        path.touch()
+    for read in (read_frame, read_picture, open_film):
+        with pytest.raises(AolinkError) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_an_array_holds_what_its_header_says(tmp_path: Path) -> None:
+    for version, values in (((1, 0), np.arange(6.0).reshape(2, 3)), ((2, 0), np.zeros((0, 3)))):
+        with (tmp_path / "a.npy").open("wb") as file:
+            np.lib.format.write_array(file, values, version=version)
+        found = load_array((tmp_path / "a.npy").read_bytes())
+        assert found.tolist() == values.tolist()
+    data = (tmp_path / "a.npy").read_bytes().replace(b"(0, 3)", b"(9, 3)")
+    with pytest.raises(ValueError, match=r"it is cut off: \(9, 3\) numbers are announced"):
+        load_array(data)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("frames.npy", data)
+    with pytest.raises(ImportingError, match="it is cut off"):
+        open_film(tmp_path / "a.npz")
+
+
+def test_the_limits_are_those_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = limits()
+    monkeypatch.setenv(VARIABLE, "picture_pixels=1e9, chunk_bytes=2000")
+    assert (limits().picture_pixels, limits().chunk_bytes) == (10**9, 2000)
+    assert limits().record_bytes == usual.record_bytes
