@@ -12,24 +12,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RigError
+from aolink.rig.parts import Faults
 
 FloatArray = NDArray[np.float64]
 _Read = TypeVar("_Read")
 
 _KEYS = """
-A actuators amplitude axes B B_w bias_v bit_depth bit_error_rate bit_flip_rate black_level black_level_sd block_steps
-C calibration camera clock_drift_ppm clock_offset_s command_loss_rate correlation_s counts_per_density
+A actuators amplitude axes B B_w bias_v bit_depth black_level black_level_sd block_steps
+C calibration camera clock_drift_ppm clock_offset_s correlation_s counts_per_density
 counts_per_density_sd counts_per_intensity coupling dac_bits damping dark_frames delay_s delay_sd_s devices
-disturbance drift_s drive driver duplicate_rate exposure_offset exposure_steps fast_step_s faults field flat_frames
+disturbance drift_s drive driver exposure_offset exposure_steps fast_step_s faults field flat_frames
 focal_length_m footprint_m frame_period_steps frequency_hz gain gamma grid initial_covariance initial_mean input_max
 input_min kernel kernel_sigma_sd kind latency_s layers least_light lenslets light max_v mirror name noise_density
-noise_density_sd noise_sd obstruction offset outer_scale_m packet_loss_rate pad_radius_m park period_s photoelectrons
+noise_density_sd noise_sd obstruction offset outer_scale_m pad_radius_m park period_s photoelectrons
 photoelectrons_sd picture picture_pixels pitch_m pixel_scale pixels plant plant_noise process_noise pupil_m
 queue_steps r0_m radius_m recorded resonance_hz scene sd seed sensor shape sigma simulation slew_max_per_s
 slope_unit_rad sources still_frames summary tension_n_per_m timing turbulence unmodelled vibration voltage watchdog_s
 wavelength_m wind_m_s window zernike_m
 """
-KEYS = frozenset(_KEYS.split())
+KEYS = frozenset(_KEYS.split()) | frozenset(Faults.__dataclass_fields__)
 """Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.
 
 Where a key is missing, a key of the file that is not among these is taken for a misspelling of it if the two look
@@ -119,13 +120,19 @@ class Table:
         return value
 
     def number(
-        self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf
+        self,
+        name: str,
+        default: float | None = None,
+        *,
+        low: float = -math.inf,
+        above: float = -math.inf,
+        high: float = math.inf,
     ) -> float:
         value = self.get(name, default)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         self._expect(name, value, is_number and abs(value) <= sys.float_info.max, "a finite number")
-        if value < low or value <= above:
-            bound = f"at least {low:g}" if value < low else f"above {above:g}"
+        if not (low <= value <= high and value > above):
+            bound = f"at least {low:g}" if value < low else f"at most {high:g}" if value > high else f"above {above:g}"
             raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
         return float(value)
 
