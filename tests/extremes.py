@@ -28,10 +28,14 @@ def changes(kind: type[Message]) -> Iterator[tuple[str, object, Change]]:
 def _changes(field: Any, name: str, owner: Callable[[Any], Any]) -> Iterator[tuple[str, object, Change]]:
     if field.message_type is not None:
         for inner in field.message_type.fields:
-            yield from _changes(inner, f"{name}.{inner.name}", lambda message, f=field.name: getattr(owner(message), f))
+            yield from _changes(inner, f"{name}.{inner.name}", _within(owner, field.name))
         return
     for value in _values(field):
         yield name, value, _setting(owner, field.name, value)
+
+
+def _within(owner: Callable[[Any], Any], name: str) -> Callable[[Any], Any]:
+    return lambda message: getattr(owner(message), name)
 
 
 def _setting(owner: Callable[[Any], Any], name: str, value: object) -> Change:

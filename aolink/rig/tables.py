@@ -211,12 +211,12 @@ def read_simulation(table: Table) -> Simulation:
 
 def _faults(table: Table) -> Faults:
     faults = {}
-    for name, field in Faults.__dataclass_fields__.items():
+    for name, default in asdict(Faults()).items():
         if name.endswith("_rate"):
             faults[name] = table.rate(name)
         else:
             low = -_MOST_FAULT_S if name == "clock_step_s" else 0.0
-            faults[name] = table.number(name, field.default, low=low, high=_MOST_FAULT_S)
+            faults[name] = table.number(name, default, low=low, high=_MOST_FAULT_S)
     return Faults(**faults)
 
 

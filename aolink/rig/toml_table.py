@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RigError
-from aolink.rig.parts import Faults
 
 FloatArray = NDArray[np.float64]
 _Read = TypeVar("_Read")
@@ -30,7 +29,12 @@ queue_steps r0_m radius_m recorded resonance_hz scene sd seed sensor shape sigma
 slope_unit_rad sources still_frames summary tension_n_per_m timing turbulence unmodelled vibration voltage watchdog_s
 wavelength_m wind_m_s window zernike_m
 """
-KEYS = frozenset(_KEYS.split()) | frozenset(Faults.__dataclass_fields__)
+_FAULTS = """
+bit_error_rate bit_flip_rate burst_rate byte_insert_rate byte_loss_rate byte_repeat_rate chunk_loss_rate
+clock_step_at_s clock_step_s command_loss_rate dark_rate delay_to_device_s delay_to_host_s duplicate_rate jitter_s
+late_rate packet_loss_rate saturation_rate stall_rate stall_s
+"""
+KEYS = frozenset(_KEYS.split() + _FAULTS.split())
 """Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.
 
 Where a key is missing, a key of the file that is not among these is taken for a misspelling of it if the two look
