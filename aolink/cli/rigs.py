@@ -96,6 +96,10 @@ def rig(
             help="What the camera sees, start by start: dark, flat, flat:DENSITY, still, moving; the last stays.",
         ),
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUE", help="A fault of the line or the devices: bitflip=1e-6, stall=0.01, ..."),
+    ] = None,
     tied: Annotated[bool, typer.Option("--tied", help="End when standard input ends, for a parent process.")] = False,
     film: Annotated[
         Path | None,
@@ -112,7 +116,7 @@ def rig(
     as_json: JsonOption = False,
 ) -> None:
     """Run a simulated rig: print its two ports and serve them until stopped (Ctrl-C)."""
-    from aolink.rig import load_rig, parse_light
+    from aolink.rig import load_rig, parse_light, with_faults
 
     if film is not None:
         _write_first_rig(Path(rig), film, topic, film_settings(rate, frames, track, at, invert, gamma), overwrite)
@@ -126,6 +130,9 @@ def rig(
     loaded = load_checked(rig)
     if light is not None:
         loaded = replace(loaded, simulation=replace(loaded.simulation, light=parse_light(light, "--light")))
+    if fault:
+        faults = with_faults(loaded.simulation.faults, fault)
+        loaded = replace(loaded, simulation=replace(loaded.simulation, faults=faults))
     from aolink.simulation.server import RigServer
     from aolink.simulation.streams import open_streams
 

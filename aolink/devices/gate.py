@@ -32,8 +32,8 @@ MOST_RATE_ERROR = 1e-3
 """No crystal is off by more."""
 _SLACK_S = 1.0
 """How far a device may be ahead of what its crystal explains."""
-_DELAY_S = 0.01
-"""On virtual time, how long a packet may take beyond four times the rig file's latency."""
+_DELAY_S = 1.0
+"""On virtual time, how long a packet may take beyond four times the rig file's latency: a rig may inject stalls."""
 _LONGEST_TEXT = 1000
 _REMEMBERED_BLOCKS = 65_536
 _REMEMBERED_INPUTS = 64
@@ -233,10 +233,10 @@ class Gate:
         """
         hub, before = self._hub, link.handed
         for each in hub.links:
-            name = f"{each.name}_packets"
+            name = f"{each.name}_bytes"
             taken, least = getattr(handed, name), getattr(before, name) if before else 0
-            if not least <= taken <= each.sent_packets:
-                raise lie(link.name, f"VirtualTime.{name}", taken, f"{least} to {each.sent_packets}")
+            if not least <= taken <= each.sent_bytes:
+                raise lie(link.name, f"VirtualTime.{name}", taken, f"{least} to {each.sent_bytes}")
         delay_s = _SLACK_S + (_DELAY_S + 4 * self._rig.simulation.latency_s) * sum(e.sent_packets for e in hub.links)
         driven_s = (self._sent_end - self._first_step) * self._step_ns / 1e9 * (1 + MOST_RATE_ERROR)
         first_ns = before.host_ns if before else 0

@@ -41,7 +41,7 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     if identity.schema_hash != schema_hash():
         raise DeviceError(
             f"the device on the {link.name} port was built with another messages.proto"
-            f" ({identity.schema_hash.hex()}, here {schema_hash().hex()}): update the older of the two"
+            f" ({identity.schema_hash[:8].hex()}, here {schema_hash().hex()}): update the older of the two"
         )
     check_identity(link, identity)
     return identity

@@ -165,6 +165,8 @@ class _Flight:
     """End of the block's last step, after which no try can help."""
     heard_ns: int
     """When the mirror last answered for the block; before that, when it was first sent."""
+    first_ns: int
+    """When it was first sent."""
     last_ns: int = 0
     """Time of the last try."""
     timeouts: int = 0
@@ -195,6 +197,10 @@ class NativeMirror(_NativeDevice):
         self.latched = identity.mirror.latched
         self.outage_s = 0.0
         self._watchdog_s = identity.mirror.watchdog_s
+        self._full_s = (
+            identity.mirror.queue_steps * identity.fast_step_ns / 1e9 + _PATIENCE_WATCHDOGS * self._watchdog_s
+        )
+        """A block that finds the queue full for longer will find it full forever."""
         self._block_ids = count(1)
         self._flights: dict[int, _Flight] = {}
         self._withdrawn: dict[int, _Flight] = {}
@@ -243,7 +249,7 @@ class NativeMirror(_NativeDevice):
             cause_frame_id=cause_frame_id,
         )
         first_ns, over_ns = self._begins_ns(first_step), self._begins_ns(first_step + len(u))
-        flight = _Flight(block, first_ns - self._timeout_ns() / 2, over_ns, now_ns)
+        flight = _Flight(block, first_ns - self._timeout_ns() / 2, over_ns, now_ns, now_ns)
         self._gate.sent(block)
         self._flights[block.block_id] = flight
         self._reports.begin(first_step)
@@ -340,6 +346,9 @@ class NativeMirror(_NativeDevice):
             self._measure(max(0, receive_ns - sent_ns) / 1e9)
         if ack.code == pb.QUEUE_FULL:  # not an answer to keep: it is sent again when its time-out comes
             flight.heard_ns = receive_ns
+            if (full_s := (receive_ns - flight.first_ns) / 1e9) > self._full_s:
+                expected = f"room in a queue of {self.identity.mirror.queue_steps} steps by then"
+                raise lie(self.name, "CommandAck.code", f"QUEUE_FULL for {full_s:.1f} s", expected)
             return []
         for flights in (self._flights, self._withdrawn):
             flights.pop(ack.block_id, None)

@@ -4,7 +4,7 @@ from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig
 from aolink.rig.parts import Control, Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing
 from aolink.rig.sensor_tables import CalibrationTable
-from aolink.rig.tables import parse_light
+from aolink.rig.tables import parse_light, with_faults
 
 __all__ = [
     "CalibrationTable",
@@ -24,4 +24,5 @@ __all__ = [
     "load_rig",
     "parse_light",
     "parse_rig",
+    "with_faults",
 ]

@@ -182,18 +182,67 @@ class Control:
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """Faults that the simulated rig injects, by rate and by seed; all zero means a perfect link."""
+    """Faults that the simulated rig injects, by rate and by seed; all zero means a perfect link.
 
-    bit_flip_rate: float = 0.0
-    """Probability that a packet from the device has one bit flipped."""
+    Rates are probabilities. Those of bits and bytes hold in both directions, from the byte after Identify on,
+    delimiters included. What the host sees of a fault is what a real line would show it: nothing is marked.
+    """
+
     bit_error_rate: float = 0.0
-    """Probability that a bit is flipped, in packets either way: long packets are damaged more often than short ones."""
+    """A bit is flipped."""
+    byte_loss_rate: float = 0.0
+    """A byte is lost."""
+    byte_repeat_rate: float = 0.0
+    """A byte comes twice."""
+    byte_insert_rate: float = 0.0
+    """A random byte comes before a byte."""
+    burst_rate: float = 0.0
+    """A burst of noise begins at a byte: 1 to 64 bytes are replaced by random ones, as far as the packet goes."""
+    bit_flip_rate: float = 0.0
+    """A packet from the device has one bit flipped."""
     packet_loss_rate: float = 0.0
-    """Probability that a packet from the device is lost."""
+    """A packet from the device is lost."""
     command_loss_rate: float = 0.0
-    """Probability that a packet to the device is lost."""
+    """A packet to the device is lost."""
     duplicate_rate: float = 0.0
-    """Probability that a packet from the device is sent twice."""
+    """A packet from the device is sent twice."""
+    stall_rate: float = 0.0
+    """The line stands still for ``stall_s`` before a packet; those behind it wait as well."""
+    stall_s: float = 0.1
+    """How long it stands still, s."""
+    jitter_s: float = 0.0
+    """Mean of a random, exponentially distributed delay of each packet, s; packets keep their order."""
+    delay_to_device_s: float = 0.0
+    """Constant delay of what the host sends, s."""
+    delay_to_host_s: float = 0.0
+    """Constant delay of what the device sends, s."""
+    clock_step_s: float = 0.0
+    """By how much the device's clock is set forward, s; negative: back. Its fast steps go on."""
+    clock_step_at_s: float = 1.0
+    """When, s after the rig has begun."""
+    late_rate: float = 0.0
+    """A command block is taken only when half of its steps have gone by."""
+    chunk_loss_rate: float = 0.0
+    """The camera does not send a chunk of a frame."""
+    saturation_rate: float = 0.0
+    """A pixel is at full scale."""
+    dark_rate: float = 0.0
+    """A frame without light: black level and noise of reading alone."""
+
+
+FAULT_NAMES = {
+    "bitflip": "bit_error_rate",
+    "lost": "byte_loss_rate",
+    "repeated": "byte_repeat_rate",
+    "inserted": "byte_insert_rate",
+    "burst": "burst_rate",
+    "stall": "stall_rate",
+    "late": "late_rate",
+    "missing": "chunk_loss_rate",
+    "saturated": "saturation_rate",
+    "dark": "dark_rate",
+}
+"""Short names of faults, as ``aolink rig --fault`` takes them beside the keys themselves."""
 
 
 @dataclass(frozen=True, kw_only=True)

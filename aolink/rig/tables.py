@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import asdict, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,18 @@ from aolink.errors import RigError
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.rig.disturbance import DisturbanceModel
 from aolink.rig.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
-from aolink.rig.parts import Control, Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, UnmodelledSlopes
+from aolink.rig.parts import (
+    FAULT_NAMES,
+    Control,
+    Drive,
+    Faults,
+    Light,
+    MirrorDriver,
+    Plant,
+    Simulation,
+    Timing,
+    UnmodelledSlopes,
+)
 from aolink.rig.sensor_tables import read_grid
 from aolink.rig.toml_table import Table, shape_text
 
@@ -24,6 +36,7 @@ _MOST_INPUTS = 10_000
 # Each output has a coefficient of its own for the slopes that the model leaves out, and estimators keep the covariance
 # of all coefficients: for 512 it is 2 MB an exposure.
 _MOST_UNMODELLED = 512
+_MOST_FAULT_S = 60.0
 
 
 def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing) -> Plant:
@@ -239,7 +252,32 @@ def read_simulation(table: Table) -> Simulation:
 
 
 def _faults(table: Table) -> Faults:
-    return Faults(**{name: table.rate(name) for name in Faults.__dataclass_fields__})
+    faults = {}
+    for name, default in asdict(Faults()).items():
+        if name.endswith("_rate"):
+            faults[name] = table.rate(name)
+        else:
+            low = -_MOST_FAULT_S if name == "clock_step_s" else 0.0
+            faults[name] = table.number(name, default, low=low, high=_MOST_FAULT_S)
+    return Faults(**faults)
+
+
+def with_faults(faults: Faults, texts: Iterable[str]) -> Faults:
+    """Faults with some changed: ``NAME=VALUE`` each, where a name is a key of the table or one of `FAULT_NAMES`.
+
+    Raises RigError.
+    """
+    values: dict[str, object] = asdict(faults)
+    for text in texts:
+        name, _, number = text.partition("=")
+        key = FAULT_NAMES.get(name, name)
+        if key not in values:
+            raise RigError(f"--fault {text}: expected NAME=VALUE with one of {', '.join([*FAULT_NAMES, *values])}")
+        try:
+            values[key] = float(number)
+        except ValueError:
+            raise RigError(f"--fault {text}: expected a number after {name}=") from None
+    return _faults(Table(values, "--fault"))
 
 
 def parse_light(text: str, name: str) -> tuple[Light, ...]:

@@ -18,19 +18,24 @@ FloatArray = NDArray[np.float64]
 _Read = TypeVar("_Read")
 
 _KEYS = """
-A actuators amplitude axes B B_w bias_v bit_depth bit_error_rate bit_flip_rate black_level black_level_sd block_steps
-C calibration camera clock_drift_ppm clock_offset_s coefficients command_loss_rate control correlation_s
-counts_per_density counts_per_density_sd counts_per_intensity coupling dac_bits damping dark_frames delay_s delay_sd_s
-devices disturbance drift_s drive driver duplicate_rate effort exposure_offset exposure_steps fast_step_s faults field
-flat_frames focal_length_m footprint_m frame_period_steps frequency_hz gain gamma grid initial_covariance initial_mean
-input_max input_min kernel kernel_sigma_sd kind latency_s layers leak least_light least_singular_value lenslets light
-max_v mirror model modes name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m
-packet_loss_rate pad_radius_m park period_s photoelectrons photoelectrons_sd picture picture_pixels pitch_m
-pixel_scale pixels plant plant_noise process_noise pupil_m queue_steps r0_m radius_m recorded resonance_hz scene sd
-seed sensor shape sigma simulation slew_max_per_s slope_unit_rad sources step_sd still_frames summary tension_n_per_m
-timing turbulence unmodelled vibration voltage watchdog_s wavelength_m when_lost wind_m_s window zernike_m
+A actuators amplitude axes B B_w bias_v bit_depth black_level black_level_sd block_steps C calibration camera
+clock_drift_ppm clock_offset_s coefficients control correlation_s counts_per_density counts_per_density_sd
+counts_per_intensity coupling dac_bits damping dark_frames delay_s delay_sd_s devices disturbance drift_s drive driver
+effort exposure_offset exposure_steps fast_step_s faults field flat_frames focal_length_m footprint_m
+frame_period_steps frequency_hz gain gamma grid initial_covariance initial_mean input_max input_min kernel
+kernel_sigma_sd kind latency_s layers leak least_light least_singular_value lenslets light max_v mirror model modes
+name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m pad_radius_m park period_s
+photoelectrons photoelectrons_sd picture picture_pixels pitch_m pixel_scale pixels plant plant_noise process_noise
+pupil_m queue_steps r0_m radius_m recorded resonance_hz scene sd seed sensor shape sigma simulation slew_max_per_s
+slope_unit_rad sources step_sd still_frames summary tension_n_per_m timing turbulence unmodelled vibration voltage
+watchdog_s wavelength_m when_lost wind_m_s window zernike_m
 """
-KEYS = frozenset(_KEYS.split())
+_FAULTS = """
+bit_error_rate bit_flip_rate burst_rate byte_insert_rate byte_loss_rate byte_repeat_rate chunk_loss_rate
+clock_step_at_s clock_step_s command_loss_rate dark_rate delay_to_device_s delay_to_host_s duplicate_rate jitter_s
+late_rate packet_loss_rate saturation_rate stall_rate stall_s
+"""
+KEYS = frozenset(_KEYS.split() + _FAULTS.split())
 """Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.
 
 Where a key is missing, a key of the file that is not among these is taken for a misspelling of it if the two look
@@ -136,13 +141,19 @@ class Table:
         return value
 
     def number(
-        self, name: str, default: float | None = None, *, low: float = -math.inf, above: float = -math.inf
+        self,
+        name: str,
+        default: float | None = None,
+        *,
+        low: float = -math.inf,
+        above: float = -math.inf,
+        high: float = math.inf,
     ) -> float:
         value = self.get(name, default)
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         self._expect(name, value, is_number and abs(value) <= sys.float_info.max, "a finite number")
-        if value < low or value <= above:
-            bound = f"at least {low:g}" if value < low else f"above {above:g}"
+        if not (low <= value <= high and value > above):
+            bound = f"at least {low:g}" if value < low else f"at most {high:g}" if value > high else f"above {above:g}"
             raise RigError(f"{self.key(name)} = {value:g} must be {bound}")
         return float(value)
 

@@ -69,6 +69,8 @@ class SimulatedDevices:
         """Whether the watchdog runs: a block was taken, and nothing has parked the mirror for good since."""
         self.latched = False
         """Whether the watchdog has parked the mirror and no Rearm has come since."""
+        self.clock_set_ns = 0
+        """By how much the clock that the device's stamps are read from has been set forward."""
 
     @property
     def step(self) -> int:
@@ -89,8 +91,12 @@ class SimulatedDevices:
         return end
 
     def device_ns(self, step: int) -> int:
-        """Device time at which a fast step begins."""
+        """Device time at which a fast step begins, on the clock as it was at the start."""
         return self._step_zero_ns + step * self.rig.timing.fast_step_ns
+
+    def _stamp_ns(self, step: int) -> int:
+        """The same on the clock as it is now: what the device says."""
+        return self.device_ns(step) + self.clock_set_ns
 
     def next_report_step(self) -> int:
         """The step before which the next report is due: the end of a block or of an exposure.
@@ -159,7 +165,7 @@ class SimulatedDevices:
         self._warn(f"mirror parked by its watchdog: no valid packet for {self.rig.mirror.watchdog_s:g} s")
 
     def _warn(self, text: str) -> None:
-        self._say("mirror", pb.Event(level=pb.Event.WARNING, device_ns=self.device_ns(self.step), text=text))
+        self._say("mirror", pb.Event(level=pb.Event.WARNING, device_ns=self._stamp_ns(self.step), text=text))
 
     def advance_to(self, step: int) -> None:
         """Let the plant run until ``step`` is the next one; reports and frames are in the outbox."""
@@ -198,7 +204,7 @@ class SimulatedDevices:
             schema_hash=schema_hash(),
             fast_step_ns=rig.timing.fast_step_ns,
             next_step=self.queue_end,
-            step_zero_ns=self._step_zero_ns,
+            step_zero_ns=self._stamp_ns(0),
             virtual_time=self._virtual_time,
             rig_digest=rig.digest,
         )
@@ -322,7 +328,7 @@ class SimulatedDevices:
                     n_steps=k - start,
                     u=np.concatenate([each.u for each in held[start:k]]),
                     source=held[start].source,
-                    device_ns=self.device_ns(first + k),
+                    device_ns=self._stamp_ns(first + k),
                 )
             )
             start = k
@@ -355,8 +361,8 @@ class SimulatedDevices:
                 height=height,
                 first_step=frame.first_step,
                 last_step=last_step,
-                exposure_start_ns=self.device_ns(frame.first_step) + late_ns,
-                exposure_end_ns=self.device_ns(last_step + 1) + late_ns,
+                exposure_start_ns=self._stamp_ns(frame.first_step) + late_ns,
+                exposure_end_ns=self._stamp_ns(last_step + 1) + late_ns,
                 exposure_offset_ns=late_ns,
                 data=data[offset : offset + MAX_CHUNK],
                 plane=plane,

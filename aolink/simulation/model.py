@@ -49,9 +49,9 @@ class RigModel:
         self.step = 0
         """The next fast step."""
         # 5 to 7 are the link's.
-        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(9)
-        streams = map(np.random.default_rng, (*seeds[:5], seeds[8]))
-        initial, self._process_noise, self._pixel_noise, self._electrons, disturbed, seen = streams
+        seeds = np.random.SeedSequence(rig.simulation.seed if seed is None else seed).spawn(10)
+        streams = map(np.random.default_rng, (*seeds[:5], *seeds[8:]))
+        initial, self._process_noise, self._pixel_noise, self._electrons, disturbed, seen, self._faulty = streams
         scatter = initial.standard_normal((plant.axes, plant.n_states, 1))
         self._state = plant.initial_mean + (psd_root(plant.initial_covariance) @ scatter)[..., 0]
         self._noise_input = plant.B_w @ psd_root(plant.process_noise)
@@ -117,20 +117,25 @@ class RigModel:
         return states
 
     def _frame(self, first_step: int, end_state: FloatArray) -> CameraFrame:
-        sensor = self.rig.sensor
+        sensor, faults = self.rig.sensor, self.rig.simulation.faults
         path = np.concatenate(self._pieces).T.copy()
         self._frames += 1
         path, density = self._illuminate(path, end_state)
+        if faults.dark_rate and self._faulty.random() < faults.dark_rate:
+            density = np.zeros_like(density)
         if sensor.photoelectrons:
             density_of_one = shot_gain(sensor)
             density = np.asarray(self._electrons.poisson(np.maximum(density, 0) / density_of_one) * density_of_one)
         noise = self._pixel_noise.standard_normal(sensor.shape)
         density = density + pixel_noise_sd(sensor) * noise
+        pixels = to_counts(sensor, density)
+        if faults.saturation_rate:
+            pixels[self._faulty.random(pixels.shape) < faults.saturation_rate] = (1 << sensor.bit_depth) - 1
         return CameraFrame(
             frame_id=self._frames,
             first_step=first_step,
             n_steps=path.shape[1],
-            pixels=to_counts(sensor, density),
+            pixels=pixels,
             scene=None if self._scene is None else self._scene.frame(*self._held(path, end_state), self._light.kind),
             truth=Truth(start_state=self._start_state.copy(), end_state=end_state.copy(), path=path),
         )

@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 import selectors
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from google.protobuf.message import DecodeError, Message
 
 from aolink.rig import Faults, Rig
 from aolink.simulation.devices import Line, Outgoing, SimulatedDevices
+from aolink.simulation.faults import Way
 from aolink.simulation.streams import Stream
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import (
@@ -35,83 +37,108 @@ _TURNAROUND_NS = 5_000
 """Between a clock query and its reply."""
 _IDLE_S = 0.5
 """Longest sleep in real time: the plant is never further behind than this."""
+_MOST_REST = 16 << 10
+"""Bytes without a delimiter that are held: more than any packet has."""
+_LAST_NS = 1 << 62
+_LONGEST_PAUSE_NS = 3_600_000_000_000
+"""Virtual time goes on with the host's clock queries, but no further at once."""
 _UNREAD_LIMIT = 16 << 20
 """Bytes that wait for a host that does not read; in real time, what is beyond it is dropped."""
 
 
-class FaultInjector:
-    """Damages packets by rate and by seed."""
-
-    def __init__(self, faults: Faults, seed: np.random.SeedSequence) -> None:
-        self._faults = faults
-        # One for each direction: how packets in and packets out take turns is a matter of speed.
-        self._incoming, self._outgoing = (np.random.default_rng(each) for each in seed.spawn(2))
-
-    def loses_command(self, n_bytes: int) -> bool:
-        """Whether a packet of ``n_bytes`` from the host is lost, or so damaged that its checksum is wrong."""
-        damaged = 1 - (1 - self._faults.bit_error_rate) ** (8 * n_bytes)
-        return _hits(self._incoming, self._faults.command_loss_rate) or _hits(self._incoming, damaged)
-
-    def damage(self, packet: bytes) -> bytes:
-        """The bytes that are sent for a packet to the host: none, the packet twice, with bits flipped, or as it is."""
-        if _hits(self._outgoing, self._faults.packet_loss_rate):
-            return b""
-        bits = 8 * (len(packet) - 1)  # not those of the delimiter
-        flips = 1 if _hits(self._outgoing, self._faults.bit_flip_rate) else 0
-        if self._faults.bit_error_rate:
-            flips += int(self._outgoing.binomial(bits, self._faults.bit_error_rate))
-        if flips:
-            damaged = bytearray(packet)
-            for bit in self._outgoing.integers(bits, size=flips):
-                damaged[bit // 8] ^= 1 << bit % 8
-            packet = bytes(damaged)
-        if _hits(self._outgoing, self._faults.duplicate_rate):
-            packet *= 2
-        return packet
-
-
 class LineEnd:
-    """The device's end of one line: bytes in and out, packets, counts."""
+    """The device's end of one line: bytes in and out, their faults and delays, packets, counts.
 
-    def __init__(self, line: Line, stream: Stream, faults: FaultInjector) -> None:
+    Faults act on the bytes of whole packets between the port and the decoder. They begin after Identify and Identity:
+    who is there is asked in real time, so again on a slow machine. `VirtualTime` is a side channel and suffers none.
+    """
+
+    def __init__(self, line: Line, stream: Stream, faults: Faults, seed: np.random.SeedSequence) -> None:
         self.line, self.stream = line, stream
         self.taken = 0
-        """Packets of this session that have been dealt with, lost and damaged ones included."""
+        """Bytes from this session's Identify on that have been dealt with, lost and damaged ones included."""
         self.unsent = bytearray()
-        self._faults = faults
+        # One for each direction: how packets in and packets out take turns is a matter of speed.
+        incoming, outgoing = (np.random.default_rng(each) for each in seed.spawn(2))
+        self.to_device, self.to_host = Way(faults, incoming, to_host=False), Way(faults, outgoing, to_host=True)
+        self._faulty = faults != Faults()
         self._decoder = PacketDecoder()
         self._messages = MessageDecoder()
+        self._rest = b""
+        """The beginning of a packet whose delimiter has not come yet."""
+        self._incoming: deque[tuple[int, bytes]] = deque()
+        """Real time: packets that a slow line still has, and when they come."""
+        self._outgoing: deque[tuple[int, bytes]] = deque()
         self._sequence = 0
 
-    def receive(self) -> list[tuple[Message | None, int]]:
-        """(message, sequence) of every packet that came; the message is None for a lost, damaged or partial one."""
-        received: list[tuple[Message | None, int]] = []
-        # Piece by piece, so that every packet, damaged or not, is counted in its place.
-        for piece in _pieces(self.stream.read()):
-            before = self._decoder.seen
-            packets = self._decoder.feed(piece)
-            for packet in packets:
-                # Who is there is asked in real time, so again on a slow machine: faults begin after it.
-                lost = packet.type != PacketType.IDENTIFY and self._faults.loses_command(len(piece))
-                received.append((None if lost else self._parse(packet), packet.sequence))
-            received.extend([(None, 0)] * (self._decoder.seen - before - len(packets)))
-        return received
+    def read(self, now_ns: int, *, real_time: bool) -> None:
+        """Take what has come at the port; with the line's delay if time is real."""
+        *whole, self._rest = (self._rest + self.stream.read()).split(DELIMITER)
+        pieces = [piece + DELIMITER for piece in whole]
+        if len(self._rest) > _MOST_REST:
+            pieces, self._rest = [*pieces, self._rest], b""
+        for piece in pieces:
+            delay_ns = self.to_device.delay_ns() if real_time and piece != DELIMITER else 0
+            self._put_off(self._incoming, now_ns + delay_ns, piece)
+
+    def take_undelimited(self) -> bool:
+        """Take what has come without a delimiter as well; False if there is none."""
+        if self._rest:
+            self._incoming.append((0, self._rest))
+            self._rest = b""
+            return True
+        return False
+
+    def pieces(self, now_ns: int) -> Iterator[bytes]:
+        """What has come by now, packet by packet, as the host sent it."""
+        while self._incoming and self._incoming[0][0] <= now_ns:
+            yield self._incoming.popleft()[1]
+
+    def messages(self, piece: bytes) -> list[tuple[Message, int]]:
+        """(message, sequence) of what the line makes of the bytes of a packet."""
+        if self._faulty and piece != DELIMITER:
+            identify = any(packet.type == PacketType.IDENTIFY for packet in PacketDecoder().feed(piece))
+            piece = DELIMITER + piece if identify else self.to_device.damage(piece)
+        packets = self._decoder.feed(piece)
+        return [(m, packet.sequence) for packet in packets if (m := self._parse(packet)) is not None]
 
     def begin_session(self) -> None:
         """On Identify: what was not sent yet is for a host that is gone."""
-        self.unsent.clear()
-        self._sequence, self.taken = 0, 0
+        self._outgoing.clear()
+        self.unsent[:] = DELIMITER  # ends what was sent of a packet
+        self._sequence = 0
 
-    def put(self, message: Message) -> None:
-        """Queue a message for sending; `VirtualTime` is a side channel and is never damaged."""
+    def put(self, message: Message, due_ns: int = 0) -> None:
+        """Queue a message for sending at ``due_ns``."""
         for packet in encode_packets(message, self._sequence):
             self._sequence = (self._sequence + 1) & 0xFFFF
             if isinstance(message, pb.VirtualTime):
-                self.unsent += DELIMITER + packet  # ends whatever damage is before it
-            elif isinstance(message, pb.Identity):
-                self.unsent += packet
-            else:
-                self.unsent += self._faults.damage(packet)
+                packet = DELIMITER + packet  # ends whatever damage is before it
+            elif not isinstance(message, pb.Identity) and self._faulty:
+                packet = self.to_host.damage(packet)
+            self._put_off(self._outgoing, due_ns, packet)
+
+    def flush(self, now_ns: int) -> None:
+        """Send what the port takes now."""
+        while self._outgoing and self._outgoing[0][0] <= now_ns:
+            self.unsent += self._outgoing.popleft()[1]
+        while self.unsent:
+            sent = self.stream.write(bytes(self.unsent[:65_536]))
+            if not sent:
+                return
+            del self.unsent[:sent]
+
+    def waiting(self) -> int:
+        """Bytes that wait for the line or for the host."""
+        return len(self.unsent) + sum(len(data) for _, data in self._outgoing)
+
+    def due_ns(self) -> float:
+        """When the next bytes come out of a slow line, one way or the other."""
+        return min((way[0][0] for way in (self._incoming, self._outgoing) if way), default=math.inf)
+
+    def _put_off(self, way: deque[tuple[int, bytes]], due_ns: int, data: bytes) -> None:
+        """Queue bytes in order: none overtakes those before."""
+        way.append((max(due_ns, way[-1][0]) if way else due_ns, data))
 
     def _parse(self, packet: Packet) -> Message | None:
         if packet.version != PROTOCOL_VERSION:
@@ -120,14 +147,6 @@ class LineEnd:
             return self._messages.take(packet)
         except DecodeError:
             return None
-
-    def flush(self) -> None:
-        """Send what the port takes now."""
-        while self.unsent:
-            sent = self.stream.write(bytes(self.unsent[:65_536]))
-            if not sent:
-                return
-            del self.unsent[:sent]
 
 
 class RigServer:
@@ -145,8 +164,7 @@ class RigServer:
         simulation = rig.simulation
         seeds = np.random.SeedSequence(simulation.seed if seed is None else seed).spawn(8)[5:]
         self._lines: dict[Line, LineEnd] = {
-            line: LineEnd(line, stream, FaultInjector(simulation.faults, seeds[i]))
-            for i, (line, stream) in enumerate(streams.items())
+            line: LineEnd(line, stream, simulation.faults, seeds[i]) for i, (line, stream) in enumerate(streams.items())
         }
         self._latency_rng = np.random.default_rng(seeds[2])
         self._real_time, self._clock_ns = real_time, clock_ns
@@ -157,8 +175,12 @@ class RigServer:
         self._now_ns = self._start_ns  # virtual time
         self._last_valid_ns = self._start_ns
         self._told: dict[Line, int] = {}
+        self._late_rate, self._chunk_loss_rate = simulation.faults.late_rate, simulation.faults.chunk_loss_rate
+        self._late: list[tuple[int, pb.CommandBlock, int]] = []
+        """Blocks that a fault holds back, each with the step at which it comes and its sequence number."""
+        self._clock_step = round(simulation.faults.clock_step_s * 1e9), round(simulation.faults.clock_step_at_s * 1e9)
         self._watchdog_ns = round(rig.mirror.watchdog_s * 1e9)
-        self._step_ns = rig.timing.fast_step_ns
+        self._step_ns, self._queue_steps = rig.timing.fast_step_ns, rig.mirror.queue_steps
         self.devices = SimulatedDevices(rig, seed, virtual_time=not real_time, step_zero_ns=self._step_zero_ns)
 
     def run(self, stop: Callable[[], bool]) -> None:
@@ -172,21 +194,24 @@ class RigServer:
         if self._real_time:
             self._catch_up(whole_reports=True)
         for line in self._lines.values():
-            for message, sequence in line.receive():
-                self._deal_with(line, message, sequence)
+            line.read(self._host_ns(), real_time=self._real_time)
+            for piece in line.pieces(self._host_ns()):
+                self._deal_with(line, piece)
         if self._real_time:
+            self._take_late()
             self._watch()
             self._post(self.devices.outbox)
         for line in self._lines.values():
-            line.flush()
+            line.flush(self._host_ns())
 
     def idle_s(self) -> float:
         """How long there is nothing to do if nothing comes, s; at most half a second."""
         if not self._real_time:
             return _IDLE_S
-        due_ns = self.devices.device_ns(self.devices.next_report_step()) - self._device_ns()
+        due_ns: float = self.devices.device_ns(self.devices.next_report_step()) - self._device_ns()
         if self.devices.armed:
             due_ns = min(due_ns, self._last_valid_ns + self._watchdog_ns - self._host_ns())
+        due_ns = min(due_ns, *(line.due_ns() - self._host_ns() for line in self._lines.values()))
         return min(max(due_ns / 1e9, 0.0), _IDLE_S)
 
     def _wait(self) -> None:
@@ -195,7 +220,10 @@ class RigServer:
             for line in self._lines.values():
                 events = selectors.EVENT_READ | (selectors.EVENT_WRITE if line.unsent else 0)
                 selector.register(line.stream.fileno(), events)
-            selector.select(timeout)
+            idle = not selector.select(timeout)
+        if idle and not self._real_time:  # a delimiter was damaged on its way, and the host waits
+            for line in self._lines.values():
+                line.take_undelimited()
 
     def _host_ns(self) -> int:
         return self._clock_ns() if self._real_time else self._now_ns
@@ -203,52 +231,91 @@ class RigServer:
     def _device_ns(self) -> int:
         return self._step_zero_ns + math.floor((self._host_ns() - self._start_ns) * self._clock_rate)
 
-    def _deal_with(self, line: LineEnd, message: Message | None, sequence: int) -> None:
-        if isinstance(message, pb.Identify):
-            line.begin_session()
-            self._told.pop(line.line, None)
-        if message is not None:
+    def _deal_with(self, line: LineEnd, piece: bytes) -> None:
+        """Deal with what the line makes of a packet that the host has sent; on virtual time with all that follows."""
+        if piece == DELIMITER:  # before an Identify: it ends what was left on the line
+            line.messages(piece)
+            return
+        size_ns, at_ns = self._clock_step
+        if size_ns and self._host_ns() - self._start_ns >= at_ns:
+            self.devices.clock_set_ns = size_ns
+        for message, sequence in line.messages(piece):
+            if isinstance(message, pb.Identify):
+                line.begin_session()
+                line.taken = 0
+                self._told.pop(line.line, None)
             if line.line == "mirror":  # the camera's line may be alive while the mirror's is dead
                 self._last_valid_ns = self._host_ns()
             if isinstance(message, pb.ClockQuery):
                 self._answer_clock(line, message)
+            elif isinstance(message, pb.CommandBlock) and line.to_device.hits(self._late_rate):
+                self._put_off(message, sequence)
             else:
-                if self._real_time:  # what is late is judged by the clock, not by the last report
-                    self._catch_up(whole_reports=False)
-                self.devices.handle(line.line, message, sequence)
+                self._handle(line, message, sequence)
         if not self._real_time:
+            self._take_late()
             self._post(self.devices.outbox)
             self.devices.advance_to(self.devices.ready_end)
             self._post(self.devices.outbox)
-        line.taken += 1
+        line.taken += len(piece)  # only now: the host waits for all that follows from it
         if not self._real_time:
             for each in self._lines.values():
                 self._tell_time(each, done=True)
 
+    def _handle(self, line: LineEnd, message: Message, sequence: int) -> None:
+        if self._real_time:  # what is late is judged by the clock, not by the last report
+            self._catch_up(whole_reports=False)
+        self.devices.handle(line.line, message, sequence)
+
+    def _put_off(self, block: pb.CommandBlock, sequence: int) -> None:
+        """A block that comes late: when half of its steps have gone by, unless that is never."""
+        step = block.first_step + block.n_steps // 2
+        if step <= self.devices.step + self._queue_steps:
+            self._late.append((step, block, sequence))
+
+    def _take_late(self) -> None:
+        """Take the blocks that come late and are due now; on virtual time nothing else moves time on to them."""
+        late, self._late = self._late, []
+        for step, block, sequence in late:
+            if not self._real_time:
+                self.devices.advance_to(step)
+            if step <= self.devices.step:
+                self._handle(self._lines["mirror"], block, sequence)
+            else:
+                self._late.append((step, block, sequence))
+
     def _answer_clock(self, line: LineEnd, query: pb.ClockQuery) -> None:
         if not self._real_time:
-            self._now_ns = max(self._now_ns, query.host_send_ns) + self._draw_latency()
-        received = self._device_ns()
+            latest_ns = min(self._now_ns + _LONGEST_PAUSE_NS, _LAST_NS)
+            if self._now_ns < query.host_send_ns <= latest_ns:
+                self._now_ns = query.host_send_ns
+            self._now_ns += self._draw_latency() + line.to_device.delay_ns()
+        received = self._device_ns() + self.devices.clock_set_ns
         if not self._real_time:
             self._now_ns += _TURNAROUND_NS
-        sent = self._device_ns()
+        sent = self._device_ns() + self.devices.clock_set_ns
         if not self._real_time:
-            self._now_ns += self._draw_latency()
+            self._now_ns += self._draw_latency() + line.to_host.delay_ns()
             self._tell_time(line)
-        line.put(
+        self._send(
+            line,
             pb.ClockReply(
                 query_id=query.query_id,
                 host_send_ns=query.host_send_ns,
                 device_receive_ns=received,
                 device_send_ns=sent,
-            )
+            ),
         )
+
+    def _send(self, line: LineEnd, message: Message) -> None:
+        line.put(message, self._host_ns() + line.to_host.delay_ns() if self._real_time else 0)
 
     def _draw_latency(self) -> int:
         """One way: never under 80 % of the median, with a tail."""
         return round(self._latency_ns * (0.8 + 0.29 * float(self._latency_rng.standard_exponential())))
 
     def _post(self, outbox: list[Outgoing]) -> None:
+        delays = {} if self._real_time else {name: end.to_host.delay_ns() for name, end in self._lines.items()}
         for out in outbox:
             line = self._lines[out.line]
             if not self._real_time:
@@ -256,11 +323,13 @@ class RigServer:
                 if out.after_step is not None:
                     elapsed = (out.after_step + 1) * self._step_ns
                     left = max(left, self._start_ns + math.ceil(elapsed / self._clock_rate))
-                self._now_ns = max(self._now_ns, left + self._latency_ns)
+                self._now_ns = max(self._now_ns, left + self._latency_ns + delays.pop(out.line, 0))
                 self._tell_time(line)
-            elif len(line.unsent) > _UNREAD_LIMIT:
+            elif line.waiting() > _UNREAD_LIMIT:
                 continue
-            line.put(out.message)
+            if isinstance(out.message, pb.FrameChunk) and line.to_host.hits(self._chunk_loss_rate):
+                continue
+            self._send(line, out.message)
         outbox.clear()
 
     def _tell_time(self, line: LineEnd, *, done: bool = False) -> None:
@@ -268,9 +337,7 @@ class RigServer:
         if done or self._told.get(line.line) != self._now_ns:
             self._told[line.line] = self._now_ns
             taken = {name: end.taken for name, end in self._lines.items()}
-            line.put(
-                pb.VirtualTime(host_ns=self._now_ns, camera_packets=taken["camera"], mirror_packets=taken["mirror"])
-            )
+            line.put(pb.VirtualTime(host_ns=self._now_ns, camera_bytes=taken["camera"], mirror_bytes=taken["mirror"]))
 
     def _catch_up(self, *, whole_reports: bool) -> None:
         """Real time: let the plant run to now; with ``whole_reports``, only to the end of a report."""
@@ -284,13 +351,3 @@ class RigServer:
         if self.devices.armed and self._host_ns() - self._last_valid_ns >= self._watchdog_ns:
             self._catch_up(whole_reports=False)
             self.devices.watchdog_expires()
-
-
-def _hits(rng: np.random.Generator, rate: float) -> bool:
-    return rate > 0 and float(rng.random()) < rate
-
-
-def _pieces(data: bytes) -> list[bytes]:
-    """Cut after every delimiter."""
-    *whole, rest = data.split(DELIMITER)
-    return [piece + DELIMITER for piece in whole] + ([rest] if rest else [])

@@ -181,8 +181,8 @@ class TcpStream:
 
 
 def begins_with_identify(data: bytes) -> bool | None:
-    """Whether bytes begin with a whole Identify packet; None while that cannot be known yet."""
-    piece, end, _ = data.partition(DELIMITER)
+    """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while it cannot be known."""
+    piece, end, _ = data.removeprefix(DELIMITER).partition(DELIMITER)
     if not end:
         return False if len(data) > _MOST_INTRODUCTION else None
     packets = PacketDecoder().feed(piece + end)

@@ -223,6 +223,6 @@ class Hub:
         handed = link.handed
         if handed is None:
             return False
-        taken = {"camera": handed.camera_packets, "mirror": handed.mirror_packets}
+        taken = {"camera": handed.camera_bytes, "mirror": handed.mirror_bytes}
         # More than were sent is what it had taken in a session before.
-        return all(taken[each.name] == each.sent_packets for each in senders)
+        return all(taken[each.name] == each.sent_bytes for each in senders)

@@ -9,7 +9,15 @@ from dataclasses import dataclass
 from google.protobuf.message import DecodeError, Message
 
 from aolink.wire import messages_pb2 as pb
-from aolink.wire.packet import PROTOCOL_VERSION, MessageDecoder, PacketDecoder, encode_packets
+from aolink.wire.packet import (
+    DELIMITER,
+    PROTOCOL_VERSION,
+    MessageDecoder,
+    Packet,
+    PacketDecoder,
+    PacketType,
+    encode_packets,
+)
 from aolink.wire.port import Transport
 
 _REMEMBERED = 64
@@ -61,6 +69,8 @@ class Link:
         """Raises DeviceError for a time that cannot be."""
         self.sent_packets = 0
         """Since the last Identify, which is packet 1."""
+        self.sent_bytes = 0
+        """Bytes since then, those of the Identify included: the rig on virtual time says how many it has taken."""
         self.last_sent_ns = 0
         """Host time at which something was sent last."""
         self.before_send: Callable[[], None] = lambda: None
@@ -81,9 +91,11 @@ class Link:
         """Send a message; gives the sequence number of its packet, or of its last part's. Raises PortError."""
         self.before_send()
         if isinstance(message, pb.Identify):
-            self._next_sequence, self.sent_packets = 0, 0
+            self._next_sequence = self.sent_packets = self.sent_bytes = 0
+            self.transport.write(DELIMITER)  # ends what a host before has left on the line
         for data in encode_packets(message, self._next_sequence):
             self.transport.write(data)
+            self.sent_bytes += len(data)
             self._next_sequence = (self._next_sequence + 1) & 0xFFFF
             self.sent_packets += 1
             self.counts.packets_sent += 1
@@ -104,6 +116,9 @@ class Link:
                 self.foreign_version = packet.version
                 self.counts.bad_payload += 1
                 continue
+            if _begins_identity(packet):  # the device counts anew: what came before is of another session
+                self._recent.clear()
+                self._last_sequence = None
             if self._is_duplicate(packet.sequence):
                 self.counts.duplicates += 1
                 continue
@@ -119,8 +134,6 @@ class Link:
                 self.check_virtual_time(message)
                 self.handed = message
                 continue
-            if isinstance(message, pb.Identity):
-                self._recent.clear()
             received.append(Received(message, self.handed.host_ns if self.virtual and self.handed else now))
         self.counts.bad_crc = self._decoder.bad_crc
         self.counts.bad_framing = self._decoder.bad_framing
@@ -137,3 +150,14 @@ class Link:
                 self.counts.sequence_gaps += gap
         self._last_sequence = sequence
         return False
+
+
+def _begins_identity(packet: Packet) -> bool:
+    """Whether a packet is an Identity, or the first part of one."""
+    if packet.type != PacketType.PART:
+        return packet.type == PacketType.IDENTITY
+    try:
+        part = pb.Part.FromString(packet.payload)
+    except DecodeError:
+        return False
+    return part.type == PacketType.IDENTITY and part.offset == 0

@@ -327,11 +327,11 @@ class Truth(_message.Message):
     def __init__(self, frame_id: _Optional[int] = ..., axes: _Optional[int] = ..., n_outputs: _Optional[int] = ..., start_state: _Optional[_Iterable[float]] = ..., end_state: _Optional[_Iterable[float]] = ..., path: _Optional[_Iterable[float]] = ..., path_single: _Optional[_Iterable[float]] = ..., path_sd: _Optional[float] = ...) -> None: ...
 
 class VirtualTime(_message.Message):
-    __slots__ = ("host_ns", "camera_packets", "mirror_packets")
+    __slots__ = ("host_ns", "camera_bytes", "mirror_bytes")
     HOST_NS_FIELD_NUMBER: _ClassVar[int]
-    CAMERA_PACKETS_FIELD_NUMBER: _ClassVar[int]
-    MIRROR_PACKETS_FIELD_NUMBER: _ClassVar[int]
+    CAMERA_BYTES_FIELD_NUMBER: _ClassVar[int]
+    MIRROR_BYTES_FIELD_NUMBER: _ClassVar[int]
     host_ns: int
-    camera_packets: int
-    mirror_packets: int
-    def __init__(self, host_ns: _Optional[int] = ..., camera_packets: _Optional[int] = ..., mirror_packets: _Optional[int] = ...) -> None: ...
+    camera_bytes: int
+    mirror_bytes: int
+    def __init__(self, host_ns: _Optional[int] = ..., camera_bytes: _Optional[int] = ..., mirror_bytes: _Optional[int] = ...) -> None: ...

@@ -78,7 +78,7 @@ class SerialPort:
             size = max(1, self._serial.in_waiting) if self._is_device else _SOCKET_READ
             data: bytes = self._serial.read(size)
         except (OSError, TypeError) as error:  # TypeError: pyserial's port closed under it
-            raise PortError(f"lost {self.url}: {_plain(error)}; is the device still there?") from None
+            raise self._lost(error) from None
         return data
 
     def write(self, data: bytes) -> None:
@@ -95,7 +95,11 @@ class SerialPort:
                     raise PortError(f"{self.url} took no data for {waited_s:.0f} s; is the device running?")
                 select.select([], [descriptor], [], _SLICE_S)
         except (OSError, TypeError, serial.SerialException) as error:
-            raise PortError(f"lost {self.url}: {_plain(error)}; is the device still there?") from None
+            raise self._lost(error) from None
+
+    def _lost(self, error: Exception) -> PortError:
+        other = "" if self._is_device else " Does it serve another host?"
+        return PortError(f"lost {self.url}: {_plain(error)}; is the device still there?{other}")
 
     def unsent(self) -> int:
         if not self._is_device:

@@ -230,6 +230,7 @@ def run_session(
             except Exception as unsafe:
                 loop.report.warnings.append(str(unsafe))
             loop.close_account()
+            loop.finish_estimates(0.0)
         writer.close(loop.report.counts())
     hub.truth()
     return run

@@ -73,15 +73,16 @@ MIRROR = [
     (pb.CommandAck, "block_id", HUGE),
     (pb.CommandAck, "block_id", 0),
     (pb.CommandAck, "code", 77),
+    (pb.CommandAck, "code", pb.QUEUE_FULL),
     (pb.CommandAck, "late_steps", 2**32 - 1),
     (pb.CommandAck, "superseded_steps", 51),
     (pb.CommandAck, "queue_end_step", HUGE),
     (pb.ClockReply, "device_receive_ns", HUGE),
     (pb.VirtualTime, "host_ns", lambda handed: handed.host_ns + 7_400_000_000_000_000_000),
-    (pb.VirtualTime, "host_ns", lambda handed: handed.host_ns + 10_000_000_000),
+    (pb.VirtualTime, "host_ns", lambda handed: handed.host_ns + 1_000_000_000_000),
     (pb.VirtualTime, "host_ns", 1),
     (pb.VirtualTime, "host_ns", -1),
-    (pb.VirtualTime, "mirror_packets", HUGE),
+    (pb.VirtualTime, "mirror_bytes", HUGE),
 ]
 CAMERA = [
     (pb.FrameChunk, "frame_id", HUGE),
@@ -179,7 +180,7 @@ def test_a_real_device_cannot_take_over_the_clock(tmp_path: Path) -> None:
     """On real time `VirtualTime` changes nothing; who claims virtual time and drives none is not waited for forever."""
 
     def handing(message: Message) -> Iterator[Message]:
-        yield pb.VirtualTime(host_ns=9 * 10**18, camera_packets=1, mirror_packets=1)
+        yield pb.VirtualTime(host_ns=9 * 10**18, camera_bytes=1, mirror_bytes=1)
         yield message
 
     with lying_rig(RIG, camera=handing, mirror=handing, real_time=True) as ports:

@@ -32,7 +32,7 @@ def test_on_virtual_time_one_line_waits_for_the_other() -> None:
             mirror.send_block(50 * k, np.zeros((50, 1)), 0, before)
             camera.query_clock(before)
             assert camera.link.handed is not None
-            assert camera.link.handed.mirror_packets == mirror.link.sent_packets
+            assert camera.link.handed.mirror_bytes == mirror.link.sent_bytes
             assert hub.now_ns() == before  # what a send sees of the time does not depend on what has come
         answers = [received.message for _, received in hub.wait(1.0)]
         assert [a.block_id for a in answers if isinstance(a, pb.CommandAck)] == [1, 2, 3]

@@ -8,6 +8,7 @@ import socket
 import subprocess
 from collections.abc import Callable
 
+from aolink.errors import PortError
 from aolink.jobs.demo import simulated_rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import encode_message
@@ -34,3 +35,16 @@ def test_other_machines_are_served_on_request_only(aolink: Run) -> None:
     assert result.returncode == 3
     assert "--listen 0.0.0.0:0 lets other machines move the mirror" in result.stderr
     assert "--allow-remote" in result.stderr
+
+
+def test_the_second_host_of_a_port_is_told_so(aolink: Run) -> None:
+    with simulated_rig("section-vi", "--real-time", "--listen", "127.0.0.1:0") as (_, mirror):
+        address, port = mirror.removeprefix("socket://").rsplit(":", 1)
+        with socket.create_connection((address, int(port)), 20) as first:
+            first.sendall(encode_message(pb.Identify(nonce=1), 0))
+            assert first.recv(65_536)
+            second = aolink("devices", mirror)
+            first.sendall(encode_message(pb.Identify(nonce=2), 0))
+            assert first.recv(65_536)
+    assert second.returncode == PortError.exit_code
+    assert "Does it serve another host?" in second.stderr

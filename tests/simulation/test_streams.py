@@ -70,7 +70,7 @@ def test_a_host_that_identifies_itself_is_served(stream: TcpStream) -> None:
     "sent",
     [
         POST + b"\0" + IDENTIFY + COMMAND,
-        b"\0" + IDENTIFY + COMMAND,
+        b"\0\0" + IDENTIFY + COMMAND,
         b"G" + IDENTIFY,
         COMMAND,
         encode_packet(Packet(2, 1, 0, b"")),

@@ -127,3 +127,12 @@ def test_nothing_listens() -> None:
 def test_a_port_in_use_is_refused(peer: Peer, link: Link) -> None:
     with pytest.raises(PortError, match=f"port {peer.path} is in use by another program"):
         SerialPort(peer.path)
+
+
+def test_an_identity_is_no_duplicate_of_what_was_left_on_the_line(peer: Peer, link: Link) -> None:
+    """The device counts anew from its Identity on; packets of the session before had the same numbers."""
+    peer.say(event("a", 0) + event("b", 1) + b"half of a pa" + b"\0" + encode_message(pb.Identity(nonce=3), 0))
+    peer.say(event("c", 1))
+    found = receive(link, 4)
+    assert [type(message).__name__ for message in found] == ["Event", "Event", "Identity", "Event"]
+    assert (link.counts.duplicates, link.counts.sequence_gaps, link.counts.bad_framing) == (0, 0, 1)

@@ -35,7 +35,7 @@ enum source { SOURCE_COMMAND, SOURCE_PARKED, SOURCE_CLIPPED, SOURCE_WATCHDOG, SO
 enum level { LEVEL_INFO, LEVEL_WARNING, LEVEL_ERROR };
 
 /* The first 8 bytes of the SHA-256 of messages.proto without comments and white space; `make test` compares. */
-#define SCHEMA_HASH "\xf4\x9d\x16\x37\xb9\x79\x60\x97"
+#define SCHEMA_HASH "\xff\x0c\x33\xc9\xf1\x2e\x60\x02"
 
 /* A payload being written. When it does not fit, `overflow` is set and nothing more is written. */
 struct writer {
