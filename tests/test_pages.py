@@ -101,6 +101,7 @@ NO_CODE = {
     "estimator   RMSE start": "test_demo_figures.py runs the demo and compares",
     "errors, files, limits, signals": "test_the_architecture_names_what_there_is",
     "Copyright (c)": "a licence",
+    "make ": "tests/tools/test_device.py makes the reference device, tests/session/test_real_time.py runs it",
 }
 """How indented blocks begin that are no commands, and what holds them."""
 SHELL = [block for block in BLOCKS if not block.language and not block.text.startswith(tuple(NO_CODE))]
