@@ -47,6 +47,9 @@ COMMANDS = {
     "export": "export {session} -o a.npz",
     "slopes": "slopes {frame} --reference {reference} -o a.npz",
     "view": "view {session} --save a.rrd",
+    "report": "report {session} -o a.html",
+    "plot": "plot {session} blur -o a.png",
+    "identify": "identify {session} -o a.toml",
 }
 """A call of every command, for the places of files and ports."""
 
