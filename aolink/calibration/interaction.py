@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -19,6 +20,8 @@ from aolink.rig import Rig
 
 # A pixel counts if its density exceeds this many sd of noise: pixels far from the spot only add noise.
 _THRESHOLD_SD = 4.0
+_LONGEST_RAMP_S = 60.0
+"""A poke that takes longer to reach is not meant so: drift would count as the mirror's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +55,40 @@ class Interaction:
 def poke_inputs(rig: Rig, amplitude: FloatArray | float, rest_exposures: int = 1) -> FloatArray:
     """Inputs at each fast step that push each input up and down in turn.
 
-    Each value is held for ``rest_exposures`` frame periods, in which the mirror settles, and one more to be seen.
+    Each value is held for ``rest_exposures`` frame periods, in which the mirror settles, and one more to be seen. Where
+    the rig file has ``mirror.slew_max_per_s``, a ramp of whole frame periods leads to each value, and from the last to
+    the safe input.
 
     Raises
     ------
     CalibrationError
-        The pokes would go beyond the mirror's limits.
+        The pokes would go beyond the mirror's limits, or a ramp would take longer than a minute.
     """
     size = np.broadcast_to(np.asarray(amplitude, dtype=np.float64), rig.n_inputs)
     pokes = np.concatenate([sign * np.diag(size) for sign in (1.0, -1.0)]) + rig.mirror.park
     pokes = pokes.reshape(2, rig.n_inputs, -1).swapaxes(0, 1).reshape(-1, rig.n_inputs)
     if (pokes < rig.mirror.input_min).any() or (pokes > rig.mirror.input_max).any():
         raise CalibrationError("the pokes go beyond the mirror's limits: take a smaller amplitude")
-    return np.repeat(pokes, (rest_exposures + 1) * rig.timing.frame_period_steps, axis=0)
+    rows, before = [], np.asarray(rig.mirror.park, dtype=np.float64)
+    for value in pokes:
+        rows += [_ramp(rig, before, value), np.tile(value, ((rest_exposures + 1) * rig.timing.frame_period_steps, 1))]
+        before = value
+    return np.concatenate([*rows, _ramp(rig, before, rig.mirror.park)])
+
+
+def _ramp(rig: Rig, begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Inputs from ``begin`` to ``end``, which comes last, no faster than the rig file allows, (n_steps, n_inputs)."""
+    slew, timing = rig.mirror.slew_max_per_s, rig.timing
+    if not slew:
+        return np.zeros((0, rig.n_inputs))
+    needed_s = float(np.abs(end - begin).max()) / slew
+    if needed_s > _LONGEST_RAMP_S:
+        raise CalibrationError(
+            f"mirror.slew_max_per_s = {slew:g} makes the way from one poke to the next {needed_s:.3g} s long, more than"
+            f" {_LONGEST_RAMP_S:g} s: take a smaller amplitude, or correct the rig file"
+        )
+    n_steps = math.ceil(needed_s / (timing.frame_period_steps * timing.fast_step_s)) * timing.frame_period_steps
+    return begin + (end - begin) * np.arange(1, n_steps + 1)[:, None] / max(n_steps, 1)
 
 
 def measure_interaction(

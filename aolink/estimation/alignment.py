@@ -6,6 +6,10 @@ of it. Nor can frames tell it from the plant's own motion, so it is not estimate
 Advances in Control Systems 3 (1966); P. S. Maybeck, Stochastic Models, Estimation, and Control 2 (1982), section 13):
 two copies of the filter are given the same frames with the inputs of some steps earlier and later, and half the
 difference of their estimates is what such an error does to the estimate, with all that earlier exposures contributed.
+
+The clocks are known better the longer they are compared, and worse after a pause. The error is taken to be the same
+number of standard deviations in all exposures, so each is shifted by its own: what an exposure of badly known alignment
+has done to the estimates stays in them until frames have corrected it, however well the later ones are aligned.
 """
 
 from __future__ import annotations
@@ -26,53 +30,63 @@ FloatArray = NDArray[np.float64]
 _NEGLIGIBLE = 0.02
 """An alignment that is known to this part of a fast step changes no estimate that the model has right."""
 
+_ROUNDED = 0.5
+"""A shift of more than this part of a fast step is rounded to whole steps."""
+
 
 def matters(exposure: Exposure, fast_step_ns: int) -> bool:
     """Whether an exposure's alignment is so uncertain that it is to be considered."""
     return exposure.alignment_sigma_ns > _NEGLIGIBLE * fast_step_ns
 
 
-def shift_for(exposure: Exposure, fast_step_ns: int) -> int:
-    """How far the copies' inputs are shifted: about the root of three standard deviations, in whole fast steps."""
-    return max(1, round(math.sqrt(3) * exposure.alignment_sigma_ns / fast_step_ns))
+def share_of_shift(exposure: Exposure, fast_step_ns: int) -> float:
+    """The standard deviation of an alignment as a part of the shift of the copies' inputs: one over the root of three.
+
+    It is rounded so that the shift of this exposure, and of all that are aligned as well, is a number of whole steps.
+    """
+    sigma = exposure.alignment_sigma_ns / fast_step_ns
+    shift = math.sqrt(3) * sigma
+    return sigma / (round(shift) if shift > _ROUNDED else shift)
 
 
 class Shifted:
-    """Exposures with the inputs of some fast steps later, or earlier where ``steps`` is negative.
+    """Exposures with later inputs, or earlier ones where ``share`` is negative.
 
-    They must be given in order. Inputs that have not come yet are taken to be those of the last step that has.
+    Each one's shift is the standard deviation of its alignment over ``share``. They must be given in order. Between two
+    fast steps inputs are interpolated. Inputs that have not come yet are taken to be those of the last step that has;
+    of those before the exposure's lead, as many are known as the longest shift or the exposure before has had.
     """
 
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
+    def __init__(self, share: float, fast_step_ns: int) -> None:
+        self._share, self._fast_step_ns = share, fast_step_ns
         self._before: FloatArray | None = None
-        """Inputs of the last steps before the next exposure's lead, as many as the shift is long."""
 
     def __call__(self, exposure: Exposure) -> Exposure:
+        # Whole steps where the share was made so, in spite of the division.
+        shift = round(exposure.alignment_sigma_ns / self._fast_step_ns / self._share, 6)
         known = np.concatenate([exposure.lead_inputs, exposure.inputs])
-        before = np.tile(known[0], (abs(self.steps), 1)) if self._before is None else self._before
-        self._before = np.concatenate([before, known])[-abs(self.steps) :]
-        if self.steps < 0:
-            known = np.concatenate([before, known])
-        else:
-            known = np.concatenate([known, np.tile(known[-1], (self.steps, 1))])[self.steps :]
-        lead, end = len(exposure.lead_inputs), len(exposure.lead_inputs) + exposure.n_steps
-        return replace(
-            exposure, first_step=exposure.first_step + self.steps, lead_inputs=known[:lead], inputs=known[lead:end],
-            alignment_sigma_ns=0.0,
-        )  # fmt: skip
+        reach, whole = math.ceil(abs(shift)), math.floor(shift)
+        before = known[:0] if self._before is None else self._before
+        held = np.tile((before if len(before) else known)[0], (max(0, reach - len(before)), 1))
+        row = np.concatenate([held, before, known, np.tile(known[-1], (reach + 1, 1))])
+        start = len(held) + len(before) + whole
+        shifted = row[start : start + len(known)]
+        if shift != whole:
+            shifted = shifted + (shift - whole) * (row[start + 1 : start + 1 + len(known)] - shifted)
+        self._before = np.concatenate([before, known])[-max(reach, len(before), len(known)) :]
+        lead = len(exposure.lead_inputs)
+        return replace(exposure, lead_inputs=shifted[:lead], inputs=shifted[lead:], alignment_sigma_ns=0.0)
 
 
 def considered(
     exposures: Sequence[Exposure], nominal: Iterator[Estimate], later: Iterator[Estimate], earlier: Iterator[Estimate],
-    shift: int, fast_step_ns: int,
+    share: float, fast_step_ns: int,
 ) -> Iterator[Estimate]:  # fmt: skip
-    """Estimates with the error of their alignment, from those of filters with inputs ``shift`` steps off."""
+    """Estimates with the error of their alignment, from those of filters with inputs shifted both ways."""
+    scale = share / 2
     for exposure, estimate, late, early in zip(exposures, nominal, later, earlier, strict=True):
-        steps = exposure.alignment_sigma_ns / fast_step_ns
-        scale = steps / (2 * shift)
         alignment = AlignmentError(
-            steps=steps,
+            steps=exposure.alignment_sigma_ns / fast_step_ns,
             coefficients=scale * (late.coefficients - early.coefficients),
             end_state=scale * (late.end_state - early.end_state),
         )

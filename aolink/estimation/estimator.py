@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.alignment import Shifted, considered, matters, shift_for
+from aolink.estimation.alignment import Shifted, considered, matters, share_of_shift
 from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.frames.measure import Measured, Measurements
@@ -170,14 +170,12 @@ class _Considering:
 
     def __init__(self, estimator: Estimator, first: Exposure) -> None:
         rig = self._rig = estimator.rig
-        self._shift = shift_for(first, rig.timing.fast_step_ns)
+        step_ns = rig.timing.fast_step_ns
+        self._share = share_of_shift(first, step_ns)
         shared = {id(part): part for part in (rig, rig.plant, rig.sensor)}
         self._copies = [
-            (copy.deepcopy(estimator, dict(shared)), Shifted(steps)) for steps in (self._shift, -self._shift)
+            (copy.deepcopy(estimator, dict(shared)), Shifted(share, step_ns)) for share in (self._share, -self._share)
         ]
-        for each, shifted in self._copies:
-            if each._next_step is not None:
-                each._next_step += shifted.steps
 
     def estimates(self, batch: Batch, made: Iterator[Estimate]) -> Iterator[Estimate]:
         """The estimates of a batch, with the error of the alignment."""
@@ -185,7 +183,7 @@ class _Considering:
             each.steps(Batch(self._rig, [shifted(exposure) for exposure in batch.exposures]))
             for each, shifted in self._copies
         )
-        return considered(batch.exposures, made, later, earlier, self._shift, self._rig.timing.fast_step_ns)
+        return considered(batch.exposures, made, later, earlier, self._share, self._rig.timing.fast_step_ns)
 
 
 # From good to bad; an estimate has the worst status of its axes.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from aolink.calibration.interaction import measure_interaction, poke_inputs, spot_slopes
+from aolink.devices.gate import CommandLimits
 from aolink.errors import CalibrationError
 from aolink.rig import load_rig
 from aolink.rig.disturbance import Disturbance
@@ -38,6 +39,24 @@ def test_poking_the_rig_gives_the_plants_own_matrix():
     static = must_be(Disturbance, SH.disturbance).zernike_m[0, 1]
     assert static > 0
     assert np.sqrt((found.offset**2).mean()) > 3 * found.residual_rms / np.sqrt(32)  # the aberration is in the offset
+
+
+def test_pokes_go_no_faster_than_the_rig_file_allows_and_measure_the_same():
+    rig = without_turbulence(SH)
+    slow = dataclasses.replace(rig, mirror=dataclasses.replace(rig.mirror, slew_max_per_s=300.0))
+    u = poke_inputs(slow, 8.0)
+    limits, blocks = CommandLimits(slow), np.split(np.tile(u, (2, 1)), 2 * len(u) // slow.timing.frame_period_steps)
+    for k, block in enumerate(blocks):
+        limits.check(k * len(block), block)
+    limits.check(2 * len(u), np.tile(rig.mirror.park, (10, 1)))
+    ramped, jumped = measure_interaction(slow, poked(slow)), measure_interaction(rig, poked(rig))
+    assert ramped.exposures == jumped.exposures == 32
+    apart = np.linalg.norm(ramped.matrix - jumped.matrix) / np.linalg.norm(jumped.matrix)
+    assert apart < 0.08  # each has its own noise
+    with pytest.raises(
+        CalibrationError, match=r"mirror\.slew_max_per_s = 0\.1 makes .* 80 s long, .* smaller amplitude"
+    ):
+        poke_inputs(dataclasses.replace(rig, mirror=dataclasses.replace(rig.mirror, slew_max_per_s=0.1)), 8.0)
 
 
 def test_the_control_matrix_undoes_slopes_that_the_mirror_can_make():

@@ -523,6 +523,28 @@ def test_frames_are_recorded_apart_and_marked(aolink: Run, tmp_path: Path) -> No
     )
 
 
+def test_a_mirror_is_poked_no_faster_than_its_rig_file_allows(aolink: Run, tmp_path: Path) -> None:
+    toml = load_rig("tip-tilt").toml
+    for old, new in (
+        ("dac_bits = 16", "dac_bits = 16\nslew_max_per_s = 20.0"),
+        ("amplitude = [0.20, 0.12]", "amplitude = [0.01, 0.01]"),  # of a vibration that the pokes' rhythm would alias
+    ):
+        assert old in toml
+        toml = toml.replace(old, new)
+    (tmp_path / "slow.toml").write_text(toml)
+    arguments = ("calibrate", "--interaction", "--rig", "slow.toml", "--repeats", "2", "-o", "matrix.npz", "--json")
+    with simulated_rig(tmp_path / "slow.toml") as (camera, mirror):
+        done = aolink(*arguments, "--camera", camera, "--mirror", mirror, "--poke", "0.25", "--keep", "pokes")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["difference_from_plant"] < 0.08
+    rig = load_rig(tmp_path / "slow.toml")
+    held = np.concatenate([each.inputs for each in Recording(tmp_path / "pokes" / "pokes.mcap").exposures()])
+    step = (rig.mirror.input_max - rig.mirror.input_min) / 65535
+    assert (np.abs(np.diff(held, axis=0)) <= 20.0 * rig.timing.fast_step_s + step).all()
+    assert held.max() == pytest.approx(0.5, abs=1e-4)
+
+
 def test_a_mirror_is_poked_for_its_interaction_matrix(aolink: Run, tmp_path: Path) -> None:
     """Recorded over the wire, and compared with the plant of the rig file, which is that of the simulated rig."""
     arguments = ("calibrate", "--interaction", "--rig", "tip-tilt", "--poke", "0.25", "--repeats", "6")

@@ -17,7 +17,10 @@ from hypothesis import strategies as st
 from aolink.devices.mirrors.optotune import OptotuneMirror
 from aolink.devices.paced import PacedMirror
 from aolink.errors import AolinkError, DeviceError, PortError, RigError
+from aolink.estimation import make_estimator
 from aolink.extensions import installed
+from aolink.jobs.calibrate import interaction, record_pokes
+from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig
 from aolink.session import Report, record
 from tests.devices.mirrors import bench
@@ -26,6 +29,8 @@ from tests.devices.simulators.serial_device import Faults
 
 RIG = load_rig("tip-tilt")
 UNIT_RAD = 0.5
+Session = Callable[..., Report]
+RigOf = Callable[[OptotuneSimulator], Rig]
 TAN_50 = math.tan(math.radians(50))
 
 
@@ -131,21 +136,27 @@ def test_an_answer_that_was_garbled() -> None:
 
 
 @pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """Records ten exposures with a simulator."""
+def rig_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    """The rig of a simulator and of a camera that sees it."""
     bench.install(monkeypatch, tmp_path, optotune="aolink.devices.mirrors.optotune:OptotuneMirror")
 
-    def run(simulator: OptotuneSimulator, report: Report | None = None) -> Report:
+    def rig_for(simulator: OptotuneSimulator) -> Rig:
         bench.watch(simulator.held, lambda xy: np.arctan(xy * TAN_50) / UNIT_RAD)
         devices = f'driver = "optotune"\nport = "{simulator.port}"\nunit_rad = {UNIT_RAD}'
-        rig = bench.rig_with(f'[devices.camera]\ndriver = "spot"\n[devices.mirror]\n{devices}\n')
-        return record(rig, None, None, tmp_path / "a.mcap", exposures=10, report=report)
+        return bench.rig_with(f'[devices.camera]\ndriver = "spot"\n[devices.mirror]\n{devices}\n')
 
-    yield run
+    yield rig_for
     installed.cache_clear()
 
 
-Session = Callable[..., Report]
+@pytest.fixture
+def session(rig_of: RigOf, tmp_path: Path) -> Session:
+    """Records ten exposures with a simulator."""
+
+    def run(simulator: OptotuneSimulator, report: Report | None = None) -> Report:
+        return record(rig_of(simulator), None, None, tmp_path / "a.mcap", exposures=10, report=report)
+
+    return run
 
 
 def test_a_session_is_recorded_and_estimated(session: Session, tmp_path: Path) -> None:
@@ -153,6 +164,45 @@ def test_a_session_is_recorded_and_estimated(session: Session, tmp_path: Path) -
         report = session(simulator)
         assert simulator.now() == (0, 0)
     bench.check_session(report, tmp_path / "a.mcap", "Optotune MR-E-3")
+
+
+def test_how_late_inputs_are_taken_is_recorded_and_enters_the_estimates(session: Session, tmp_path: Path) -> None:
+    """The line takes its time for each answer, and the session's only doubt about the alignment is that."""
+    with OptotuneSimulator(faults=Faults(late_s=0.003)) as simulator:
+        report = session(simulator)
+    assert report.ended == "complete"
+    recording = Recording(tmp_path / "a.mcap")
+    step_ns = recording.rig.timing.fast_step_ns
+    exposures = list(recording.exposures())
+    sigma_ns = np.array([each.alignment_sigma_ns for each in exposures[1:]])
+    assert (sigma_ns > 3e6).all()
+    known = (replace(each, alignment_sigma_ns=0.0) for each in exposures)
+    widened = []
+    estimators = make_estimator(recording.rig, "o1"), make_estimator(recording.rig, "o1")
+    for exposure, without in zip(exposures, known, strict=True):
+        doubted, sure = (estimator.step(each) for estimator, each in zip(estimators, (exposure, without), strict=True))
+        assert np.array_equal(doubted.path, sure.path)
+        if exposure.alignment_sigma_ns:
+            assert doubted.alignment is not None
+            assert doubted.alignment.steps == exposure.alignment_sigma_ns / step_ns
+        assert sure.alignment is None
+        widened.append((doubted.path_sd / sure.path_sd).max())
+    assert max(widened) > 1.01
+
+
+def test_a_mirror_without_a_queue_is_poked_no_faster_than_its_rig_file_allows(rig_of: RigOf, tmp_path: Path) -> None:
+    with OptotuneSimulator() as simulator:
+        rig = rig_of(simulator)
+        rig = replace(rig, mirror=replace(rig.mirror, slew_max_per_s=5.0))
+        never = lambda: False  # noqa: E731
+        record_pokes(
+            rig, None, None, tmp_path / "a.mcap", share=0.1, repeats=1, overwrite=False, stop=never,
+            progress=lambda _: None,
+        )  # fmt: skip
+        assert simulator.now() == (0, 0)
+    found = interaction(rig, tmp_path / "a.mcap")
+    assert found.measured.exposures >= 3  # a step is late on a busy machine
+    assert found.difference < 0.1
 
 
 def test_a_driver_that_is_unplugged_ends_the_session_with_what_was_recorded(session: Session, tmp_path: Path) -> None:
