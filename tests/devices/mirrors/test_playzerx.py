@@ -227,6 +227,7 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert ended + report.steps_superseded == report.steps_commanded == 100
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["mirror"] == "Mirrorcle PlayzerX-SX, firmware 1.0.2.0, XYM"
+    assert recording.metadata["mirror_lacks"].split("; ") == [*PlayzerX.lacks]
     exposures = list(recording.exposures())
     assert all(exposure.inputs_assumed == 0 for exposure in exposures[:10])
     assert max(np.abs(exposure.inputs).max() for exposure in exposures) > 0.1
