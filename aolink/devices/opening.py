@@ -19,7 +19,7 @@ from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.devices.no_mirror import NoMirror
 from aolink.devices.paced import PacedMirror
 from aolink.devices.simple import DirectMirror, SimpleCamera, SimpleMirror
-from aolink.errors import DeviceError, RigError
+from aolink.errors import AolinkError, DeviceError, RigError
 from aolink.rig import Rig
 from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.wire import messages_pb2 as pb
@@ -102,7 +102,7 @@ def _open_mirror(rig: Rig, table: DeviceTable, host: Host, stack: ExitStack) -> 
         else:
             _check_whole("mirror", table, driver, SimpleMirror)
         mirror = AdaptedMirror(rig, driver, table.delay or Delay(), host.now_ns)
-        stack.callback(mirror.close)
+        _close_with(stack, mirror.close)
     return mirror
 
 
@@ -114,8 +114,18 @@ def _open_camera(rig: Rig, table: DeviceTable, mirror: Mirror, host: Host, stack
         # Where nothing is known of when a frame arrives, it is some time within the frame period after its exposure.
         delay = table.delay or (Delay() if tells_time else Delay(mean_s=period_s / 2, sd_s=period_s / math.sqrt(12)))
         camera = AdaptedCamera(rig, driver, mirror, delay, host.now_ns)
-        stack.callback(camera.close)
+        _close_with(stack, camera.close)
     return camera
+
+
+def _close_with(stack: ExitStack, close: Callable[[], None]) -> None:
+    """Close a device with ``stack``. Where a session has failed, what closing raises does not hide why."""
+
+    def leave(failed: type[BaseException] | None, *_: object) -> None:
+        with suppress(*([AolinkError] if failed else [])):
+            close()
+
+    stack.push(leave)
 
 
 @contextmanager

@@ -44,8 +44,8 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
 def _of_exposure(info: pb.ExposureInfo, rig: Rig) -> str:
     if info.frame_id > _LAST_NS:
         return "frame_id is beyond all counts"
-    if info.last_step + 1 - info.first_step != rig.timing.exposure_steps:
-        return "last_step is not at the end of an exposure"
+    if not 0 < info.last_step + 1 - info.first_step <= rig.timing.exposure_steps:
+        return "last_step is beyond the end of an exposure"
     if info.last_step * rig.timing.fast_step_ns > _LAST_NS:
         return "first_step is beyond all times"
     if info.exposure_offset_ns >= rig.timing.fast_step_ns:
@@ -75,13 +75,17 @@ def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
         return "its estimator's name is no text"
     if int(message.status) not in {int(each) for each in Status}:
         return "its status is none that this aolink knows"
-    return "" if message.n_steps == rig.timing.exposure_steps else "n_steps is not the length of an exposure"
+    return "" if 0 < message.n_steps <= rig.timing.exposure_steps else "n_steps is beyond the end of an exposure"
 
 
 def _of_truth(message: wire.Truth, rig: Rig) -> str:
-    n_path = rig.n_outputs * rig.timing.exposure_steps
+    n_path = len(message.path or message.path_single)
     states = {len(message.start_state), len(message.end_state)} - {0}
-    if (message.n_outputs, len(message.path or message.path_single)) != (rig.n_outputs, n_path):
+    if (
+        message.n_outputs != rig.n_outputs
+        or n_path % rig.n_outputs
+        or n_path > rig.n_outputs * rig.timing.exposure_steps
+    ):
         return "its path is not that of an exposure"
     fits = len(states) < 2 and all(each % max(message.axes, 1) == 0 for each in states)
     return "" if fits else "its states do not fit its axes"

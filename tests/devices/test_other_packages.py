@@ -148,12 +148,18 @@ def test_a_native_camera_alone_is_recorded(aolink: Run, tmp_path: Path) -> None:
 
 
 FAILING = """
-from aolink_example.devices import Camera as Example
+from aolink_example import devices
 
 calls = []
 
 
-class Camera(Example):
+class Mirror(devices.Mirror):
+    def park(self):
+        calls.append("park")
+        return super().park()
+
+
+class Camera(devices.Camera):
     def frames(self):
         yield from super().frames()
         if len(calls) > 100:
@@ -173,7 +179,7 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(
 ) -> None:
     """The mirror is parked, the camera stopped, both are closed, and the recording is whole."""
     (tmp_path / "failing.py").write_text(FAILING)
-    points = "[aolink.cameras]\nfailing = failing:Camera\n[aolink.mirrors]\nexample = aolink_example.devices:Mirror\n"
+    points = "[aolink.cameras]\nfailing = failing:Camera\n[aolink.mirrors]\nexample = failing:Mirror\n"
     installed_packages.cache_clear()
     info = tmp_path / "failing-1.0.dist-info"
     info.mkdir()
@@ -187,7 +193,8 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(
     what = r"the driver of the camera failed when it was asked for its frames: OSError\('the camera was pulled out'\)"
     with pytest.raises(DeviceError, match=what):
         record(rig, None, None, tmp_path / "a.mcap", report=(report := Report()))
-    assert sys.modules["failing"].calls[-2:] == ["stop", "close"]
+    calls = sys.modules["failing"].calls
+    assert calls[calls.index("park") :] == ["park", "stop", "close"]
     assert Recording(tmp_path / "a.mcap").complete
     ended = report.steps_applied + report.steps_superseded + report.steps_late + report.steps_not_reported
     assert ended == report.steps_commanded > 0

@@ -40,18 +40,18 @@ FIELDS: list[tuple[type[Message], dict[str, Any], str]] = [
     (wire.CommandBlock, {"n_steps": 2**32 - 1, "u": []}, "u has not the inputs of its steps"),
     (pb.ExposureInfo, {"frame_id": MOST}, "frame_id is beyond all counts"),
     (pb.ExposureInfo, {"first_step": 2**63, "last_step": 2**63 + 199}, "first_step is beyond all times"),
-    (pb.ExposureInfo, {"last_step": 999_998}, "last_step is not at the end of an exposure"),
-    (pb.ExposureInfo, {"last_step": 2**40}, "last_step is not at the end of an exposure"),
+    (pb.ExposureInfo, {"last_step": 999_998}, "last_step is beyond the end of an exposure"),
+    (pb.ExposureInfo, {"last_step": 2**40}, "last_step is beyond the end of an exposure"),
     (pb.ExposureInfo, {"exposure_offset_ns": 2**32 - 1}, "exposure_offset_ns is not below a fast step"),
     (pb.ExposureInfo, {"device_end_ns": -(2**63)}, "a time is beyond the calendar"),
     (pb.ExposureInfo, {"clock_sigma_ns": -1.0}, "a standard deviation is impossible"),
     (pb.ExposureInfo, {"alignment_sigma_ns": 1e300}, "a standard deviation is impossible"),
     (RawImage, {"width": 2**31, "height": 0, "data": b""}, "a picture without pixels"),
     (wire.Truth, {"axes": 2**32 - 1}, "its states do not fit its axes"),
-    (wire.Truth, {"path": [0.0] * 7}, "its path is not that of an exposure"),
+    (wire.Truth, {"path": [0.0] * 201}, "its path is not that of an exposure"),
     (pb.Estimate, {"axes": 2**32 - 1}, "the states are not the rig's"),
     (pb.Estimate, {"n_coefficients": 2**32 - 1}, "it has not as many numbers as it says"),
-    (pb.Estimate, {"n_steps": 2**32 - 1}, "n_steps is not the length of an exposure"),
+    (pb.Estimate, {"n_steps": 2**32 - 1}, "n_steps is beyond the end of an exposure"),
     (pb.Estimate, {"estimator": "o3\x1b[2J"}, "its estimator's name is no text"),
     (pb.Estimate, {"status": 77}, "its status is none that this aolink knows"),
 ]
@@ -85,7 +85,7 @@ def test_an_impossible_field_is_a_loss_and_nothing_is_computed_with_it(
 
     recording = Recording(rewritten(recorded.path, tmp_path / "a.mcap", change))
     for exposure in recording.exposures():
-        assert exposure.n_steps == 200
+        assert exposure.n_steps <= 200
     for name in recording.estimators:
         list(recording.iter_estimates(name))
     assert [loss.what for loss in recording.losses if said in loss.what]

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +22,7 @@ from tests.needs import needed
 
 needed("pypylon")
 
+Run = Callable[..., subprocess.CompletedProcess[str]]
 SERIAL = "0815-0000"
 
 
@@ -139,3 +144,15 @@ def test_block_ids_of_64_bits_do_not_wrap() -> None:
     assert [unwrapped(65_535, 65_536), unwrapped(70_000, 70_001), unwrapped(None, 0), unwrapped(0, 1)] == [
         65_536, 70_001, 0, 1,
     ]  # fmt: skip
+
+
+def test_a_camera_that_is_there_is_listed(aolink: Run) -> None:
+    environment = {**os.environ, "PYLON_CAMEMU": "1", "COLUMNS": "200"}
+    drivers = json.loads(aolink("devices", "--json", env=environment).stdout)["drivers"]
+    (found,) = [each for each in drivers if (each["kind"], each["name"]) == ("camera", "basler")]
+    ((serial_number, description),) = found["devices"]
+    assert "Emulation" in description
+    assert not found["search"]
+    text = " ".join(aolink("devices", env=environment).stdout.split())
+    assert serial_number in text
+    assert description in text

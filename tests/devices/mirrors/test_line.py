@@ -9,7 +9,10 @@ import tty
 from collections.abc import Iterator
 
 import pytest
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
 
+from aolink.devices.discovery import find_drivers
 from aolink.devices.mirrors.line import Line
 from aolink.errors import DeviceError, PortError
 
@@ -94,3 +97,31 @@ def test_a_device_that_never_ends_its_answer_is_not_kept_in_memory(device: int, 
 def test_a_line_belongs_to_one_program(line: Line) -> None:
     with pytest.raises(PortError, match="in use by another program"):
         Line("another", line.url, 9600)
+
+
+def test_each_driver_lists_the_usb_ports_of_its_maker_and_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What this machine has is given here, in pyserial's own words: its USB ports cannot be simulated."""
+    there = [
+        ("/dev/ttyACM3", 0x0483, 0xA31E, "MR-E-3"),
+        ("/dev/ttyACM1", 0x0483, 0x5740, "a board with the same maker's chip"),
+        ("/dev/ttyUSB2", 0x1A72, 0x1017, "E-727"),
+        ("/dev/ttyUSB1", 0x1A72, 0x1008, ""),
+        ("/dev/ttyUSB4", 0x0403, 0xFAF0, "KPZ101"),
+        ("/dev/ttyUSB5", 0x0403, 0x6001, "any other converter"),
+        ("/dev/ttyS0", None, None, "no USB at all"),
+    ]
+    ports = []
+    for path, vendor, product, description in there:
+        ports.append(port := ListPortInfo(path))
+        port.vid, port.pid, port.description = vendor, product, description
+    monkeypatch.setattr(list_ports, "comports", lambda: ports)
+    found = {each.name: each for each in find_drivers() if each.kind == "mirror"}
+    expected = {
+        "optotune": [("/dev/ttyACM3", "MR-E-3")],
+        "pi_gcs2": [("/dev/ttyUSB1", ""), ("/dev/ttyUSB2", "E-727")],
+        "thorlabs_aligner": [("/dev/ttyUSB4", "KPZ101")],
+        "thorlabs_piezo": [("/dev/ttyUSB4", "KPZ101")],
+        "playzerx": [],
+    }
+    assert {name: found[name].devices for name in expected} == expected
+    assert [name for name in expected if found[name].search] == ["playzerx"]

@@ -15,8 +15,8 @@ from aolink import estimate
 from aolink.devices.mirrors.microscope import MicroscopeMirror
 from aolink.errors import DeviceError, RigError
 from aolink.recording.reader import Recording
-from aolink.rig import load_rig
-from aolink.session import record
+from aolink.rig import Rig, load_rig
+from aolink.session import Report, record
 from tests.devices.mirrors import bench
 from tests.devices.simulators import spot_camera
 from tests.devices.simulators.deformable import WatchedMirror
@@ -66,19 +66,23 @@ def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.
         opened()
 
 
-def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
-    rig = bench.rig_with(
+def held(time_ns: int) -> Any:
+    """The inputs that the latest mirror holds."""
+    before = [pattern for since_ns, pattern in WatchedMirror.latest.held if since_ns <= time_ns]
+    return 2 * np.array(before[-1]) - 1
+
+
+def session_rig(settings: str = "") -> Rig:
+    return bench.rig_with(
         '[devices.camera]\ndriver = "spot"\n'
-        f'[devices.mirror]\ndriver = "microscope"\ndevice = "{DEVICE}"\nsettings = {{ n_actuators = 2 }}'
+        f'[devices.mirror]\ndriver = "microscope"\ndevice = "{DEVICE}"\nsettings = {{ n_actuators = 2{settings} }}'
     )
 
-    def held(time_ns: int) -> Any:
-        before = [pattern for since_ns, pattern in WatchedMirror.latest.held if since_ns <= time_ns]
-        return 2 * np.array(before[-1]) - 1
 
+def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
     spot_camera.mirror.held = held
-    report = record(rig, None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
+    report = record(session_rig(), None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
     assert report.ended == "complete"
     assert WatchedMirror.latest.is_shut_down
     assert WatchedMirror.latest.held[-1][1] == (0.5, 0.5)
@@ -90,3 +94,32 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     for exposure, found in islice(zip(recording.exposures(), estimate(recording, "o1"), strict=True), 10):
         assert exposure.truth is not None
         assert np.abs(found.path - exposure.truth.path).max() < 0.1  # of 0.3 that the drive moves the spot
+
+
+@pytest.mark.parametrize(
+    ("settings", "parked"), [(", fails = [30, 31]", True), (", fails = [30, inf], keeps_on = true", False)]
+)
+def test_a_device_that_fails_in_a_session_is_parked_where_it_can_be_and_shut_down(
+    settings: str, parked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first thing that went wrong is said, not what could not be done about it."""
+    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
+    spot_camera.mirror.held = held
+    what = r"the driver of the mirror failed .*RuntimeError\(.*no answer from the electronics"
+    with pytest.raises(DeviceError, match=what):
+        record(session_rig(settings), None, None, tmp_path / "a.mcap", report=(report := Report()))
+    assert (WatchedMirror.latest.held[-1][1] == (0.5, 0.5)) == parked
+    assert WatchedMirror.latest.is_shut_down
+    bench.check_ended(report, tmp_path / "a.mcap")
+
+
+def test_a_device_that_cannot_be_shut_down_is_one_line_after_a_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.install(monkeypatch, tmp_path, microscope="aolink.devices.mirrors.microscope:MicroscopeMirror")
+    spot_camera.mirror.held = held
+    what = r"the driver of the mirror failed when it was closed: RuntimeError\(.*cannot be shut down"
+    with pytest.raises(DeviceError, match=what):
+        record(session_rig(", keeps_on = true"), None, None, tmp_path / "a.mcap", exposures=2)
+    assert WatchedMirror.latest.held[-1][1] == (0.5, 0.5)
+    assert Recording(tmp_path / "a.mcap").complete

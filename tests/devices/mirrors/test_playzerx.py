@@ -84,6 +84,7 @@ def rig_with(**changes: str) -> Rig:
     """One with 2 ms fast steps and a long queue; changes are lines of the rig file and what they say instead."""
     text = load_rig("tip-tilt").toml
     settings = {"fast_step_s": "0.002", "resonance_hz": "40.0", "dac_bits": "12", "block_steps": "20", **changes}
+    text = text.replace("[mirror]", "[mirror]\npark = [0.0, 0.0]")
     for name, value in settings.items():
         before = next(line for line in text.splitlines() if line.startswith(f"{name} = "))
         text = text.replace(before, f"{name} = {value}")
@@ -144,9 +145,33 @@ def test_each_step_holds_its_command_and_the_safe_input_between(data_format: str
             assert device.output is not None
             assert device.output.colours == ((9, 9, 9) if data_format == "XYRGB" else (9,))
         mirror.close()
+        assert not device.overflowed
+        assert device.at_rest() == (*simulators.ORIGIN, (0, 0, 0) if data_format == "XYRGB" else (0,))
+
+
+def test_it_is_left_at_a_safe_input_that_is_not_the_origin_with_its_laser_off() -> None:
+    """Emptying the queue alone would leave it at its last sample, with the light on."""
+    with simulators.PlayzerX() as device:
+        mirror = PlayzerX(rig_with(park="[0.25, -0.5]"), port=device.port, laser=200, ahead_s=STALL_S)
+        begin = mirror.time_ns() // STEP_NS + 300
+        mirror.send(begin, np.full((1000, 2), 0.75))
+        told = poll(mirror, told_until(begin + 20))
+        np.testing.assert_allclose(told[0].u[0], [0.25, -0.5], atol=3e-4)
         with device.lock:
-            assert not device.overflowed
-            assert device.output == (*simulators.ORIGIN, (0, 0, 0) if data_format == "XYRGB" else (0,))
+            assert device.output == (3583, 3583, (200,))
+        mirror.close()
+        assert device.at_rest() == (2559, 1024, (0,))
+
+
+@pytest.mark.parametrize("behaviour", [{"analog": True}, {"updates_ms": 1}])
+def test_a_device_is_brought_from_what_it_was_left_in(behaviour: dict[str, Any]) -> None:
+    """Its analog input, and updates for another program between the answers."""
+    with simulators.PlayzerX(**behaviour) as device:
+        mirror = opened(device)
+        poll(mirror, told_until(100))
+        mirror.close()
+        assert device.at_rest() == (*simulators.ORIGIN, (0,))
+        assert device.every_s is None
 
 
 def test_a_command_for_steps_that_are_handed_over_is_late() -> None:
@@ -195,14 +220,14 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     with simulators.PlayzerX(rate_error=-50e-6) as device:
         spot_camera.mirror.held = device.inputs_at
         report = record(session_rig(device), None, None, tmp_path / "a.mcap", estimators=["o1"], exposures=10)
-        with device.lock:
-            assert device.output == (*simulators.ORIGIN, (0,))  # parked, with the laser off
+        assert device.at_rest() == (*simulators.ORIGIN, (0,))  # parked, with the laser off
     assert report.ended == "complete"
     assert report.exposures >= 10
     ended = report.steps_applied + report.steps_late + report.steps_refused + report.steps_not_reported
     assert ended + report.steps_superseded == report.steps_commanded == 100
     recording = Recording(tmp_path / "a.mcap")
     assert recording.metadata["mirror"] == "Mirrorcle PlayzerX-SX, firmware 1.0.2.0, XYM"
+    assert recording.metadata["mirror_lacks"].split("; ") == [*PlayzerX.lacks]
     exposures = list(recording.exposures())
     assert all(exposure.inputs_assumed == 0 for exposure in exposures[:10])
     assert max(np.abs(exposure.inputs).max() for exposure in exposures) > 0.1
@@ -255,6 +280,20 @@ def test_a_device_that_is_unplugged_ends_the_session_with_a_whole_recording(
     assert ended + report.steps_superseded == report.steps_commanded > 0
 
 
+def test_an_error_in_a_session_leaves_it_at_the_safe_input_with_its_laser_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.install(monkeypatch, tmp_path, playzerx=NAMED)
+    with simulators.PlayzerX(faults=Faults(garbled=frozenset([250]))) as device:
+        spot_camera.mirror.held = device.inputs_at
+        toml = session_rig(device).toml.replace("ahead_s = 0.4", "ahead_s = 0.4\nlaser = 200")
+        rig = parse_rig(toml.replace("dac_bits = 12", "dac_bits = 12\npark = [0.25, -0.5]"))
+        with pytest.raises(DeviceError, match=r"answers .* when it is asked how many samples remain, expected"):
+            record(rig, None, None, tmp_path / "a.mcap")
+        assert device.at_rest() == (2559, 1024, (0,))
+    assert Recording(tmp_path / "a.mcap").complete
+
+
 @pytest.mark.parametrize(
     ("keys", "changes", "what"),
     [
@@ -283,8 +322,15 @@ def test_a_device_that_fails_while_it_is_opened_is_left_with_its_laser_off() -> 
     with simulators.PlayzerX(slowest=700) as device:
         with pytest.raises(DeviceError, match="does not play 500 samples a second"):
             opened(device, laser=200)
-        with device.lock:
-            assert device.output == (*simulators.ORIGIN, (0,))
+        assert device.at_rest() == (*simulators.ORIGIN, (0,))
+
+
+def test_a_device_at_another_speed() -> None:
+    class Slower(simulators.PlayzerX):
+        baud_rate = 115_200
+
+    with Slower() as device, pytest.raises(DeviceError, match=r"does not answer .* at 921600 baud"):
+        opened(device)
 
 
 def test_what_it_lacks_is_declared() -> None:

@@ -83,6 +83,19 @@ def test_the_aligner_has_two_outputs() -> None:
 
 
 @pytest.mark.parametrize(
+    "behaviour", [{"faults": Faults(split=True)}, {"faults": Faults(late_s=0.02)}, {"reports": REPORT}]
+)
+def test_a_slow_line_or_other_messages_do_an_aligner_no_harm(behaviour: dict[str, Any]) -> None:
+    with Aligner(**behaviour) as device:
+        mirror = ThorlabsAligner(rig_with(), port=device.port, unit=5.0, zero=1.0)
+        for u in (0.5, -1.0, 0.25):
+            np.testing.assert_allclose(mirror.put(np.array([u, -u])), [u, -u], atol=1e-4)
+            assert device.now() == pytest.approx((1 + 5 * u, 1 - 5 * u), abs=1e-3)
+        mirror.close()
+        assert device.now() == pytest.approx((1, 1), abs=1e-3)
+
+
+@pytest.mark.parametrize(
     ("keys", "what"),
     [
         ({"bays": None, "port": ["a", "b"], "closed_loop": True}, "travel_um: in closed loop cubes need the travel of"),
@@ -128,6 +141,53 @@ def test_an_aligner_has_two_inputs_within_ten_volts() -> None:
 def test_a_unit_that_is_not_as_it_should_be_is_one_line(behaviour: dict[str, Any], what: str) -> None:
     with Piezo("BPC303", bays=2, **behaviour) as device, pytest.raises(AolinkError, match=what):
         opened(device, bays=2, closed_loop=True, unit=8.0, zero=10.0)
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "what"),
+    [
+        (
+            {"faults": Faults(silent_from=0)},
+            "the Thorlabs aligner at .* does not answer .*nothing came: is it",
+        ),
+        ({"faults": Faults(silent_from=5)}, "the Thorlabs aligner at .* does not answer .*nothing came"),
+        ({"faults": Faults(late_s=1.2)}, "the Thorlabs aligner at .* does not answer .*nothing came"),
+        ({"faults": Faults(garbled=frozenset([0]))}, "which is no message of Thorlabs' APT protocol that this driver"),
+        ({"faults": Faults(garbled=frozenset([1]))}, "which is no message of Thorlabs' APT protocol that this driver"),
+        (
+            {"complains_at": 4},
+            "reports an error as it is asked quad_req_positionoutputs: code 7 Actuator not",
+        ),
+        ({"faults": Faults(unplugged_at=3)}, r"lost /dev/pts/\d+"),
+    ],
+)
+def test_an_aligner_that_is_not_as_it_should_be_is_one_line(behaviour: dict[str, Any], what: str) -> None:
+    with Aligner(**behaviour) as device, pytest.raises(AolinkError, match=what):
+        ThorlabsAligner(rig_with(), port=device.port, unit=5.0, zero=1.0)
+
+
+def test_an_aligner_is_parked_after_an_answer_that_was_garbled() -> None:
+    with Aligner(faults=Faults(garbled=frozenset([4]))) as device:
+        mirror = ThorlabsAligner(rig_with(), port=device.port, unit=5.0, zero=1.0)
+        mirror.put(np.array([0.5, 0.5]))
+        with pytest.raises(DeviceError, match="is no message of Thorlabs' APT protocol"):
+            mirror.put(np.array([0.75, 0.75]))
+        mirror.park()
+        assert device.now() == pytest.approx((1, 1), abs=1e-3)
+        mirror.close()
+
+
+def test_units_at_another_speed() -> None:
+    class SlowerPiezo(Piezo):
+        baud_rate = 9600
+
+    class SlowerAligner(Aligner):
+        baud_rate = 9600
+
+    with SlowerPiezo() as device, pytest.raises(DeviceError, match=r"does not answer .*only .* at 115200 baud"):
+        opened(device, device)
+    with SlowerAligner() as unit, pytest.raises(DeviceError, match=r"does not answer .*only .* at 115200 baud"):
+        ThorlabsAligner(rig_with(), port=unit.port)
 
 
 def test_without_the_codec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,3 +236,30 @@ def test_a_unit_that_is_unplugged_ends_the_session_with_a_whole_recording(
     assert Recording(tmp_path / "a.mcap").complete
     ended = report.steps_applied + report.steps_late + report.steps_refused + report.steps_not_reported
     assert ended + report.steps_superseded == report.steps_commanded > 0
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "what"),
+    [
+        ({"complains_at": 60}, "reports an error as it is asked quad_req_positionoutputs: code 7"),
+        ({"faults": Faults(garbled=frozenset([30]))}, "which is no message of Thorlabs' APT protocol"),
+        ({"faults": Faults(unplugged_at=60)}, r"lost /dev/pts/\d+: .*is the device still there\?"),
+    ],
+)
+def test_an_aligner_that_fails_in_a_session_is_parked_where_it_can_be(
+    behaviour: dict[str, Any], what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.install(monkeypatch, tmp_path, thorlabs_aligner="aolink.devices.mirrors.thorlabs:ThorlabsAligner")
+    with Aligner(**behaviour) as device:
+        bench.watch(device.held, lambda volts: (volts - 1) / 5)
+        rig = bench.rig_with(
+            '[devices.camera]\ndriver = "spot"\n[devices.mirror]\ndriver = "thorlabs_aligner"\n'
+            f'port = "{device.port}"\nunit = 5.0\nzero = 1.0'
+        )
+        rig = parse_rig(rig.toml.replace("dac_bits = 16", "dac_bits = 12"))
+        with pytest.raises(AolinkError, match=what):
+            record(rig, None, None, tmp_path / "a.mcap", report=(report := Report()))
+        assert max(abs(volts[0] - 1) for _, volts in device.held[3:]) > 0.1  # it had moved
+        if "lost" not in what:
+            assert device.now() == pytest.approx((1, 1), abs=1e-3)
+    bench.check_ended(report, tmp_path / "a.mcap")

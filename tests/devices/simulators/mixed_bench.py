@@ -71,7 +71,7 @@ class Spot:
     def told(self) -> dict[str, Any]:
         """What really happened."""
         path = self._rig.plant.C @ np.array(self._states).T
-        return {"starts": self._starts, "path": path.tolist(), "output": self._mirror.output}
+        return {"starts": self._starts, "path": path.tolist(), "output": self._mirror.at_rest()}
 
     def _follow(self, zero_ns: int, held: NDArray[np.float64]) -> None:
         """Go on with the samples that the mirror has put out; from the beginning where its queue was emptied."""
@@ -91,7 +91,7 @@ class Truth(NamedTuple):
     path: NDArray[np.float64]
     """Where the spot was at each sample, (2, samples)."""
     output: list[Any]
-    """What the mirror puts out now: x, y and its colours."""
+    """What the mirror goes on putting out: x, y and its colours."""
 
 
 class MixedBench:

@@ -1,4 +1,9 @@
-"""A PlayzerX on a pseudo terminal, written from the maker's page "PlayzerX USB Serial Protocol"."""
+"""A PlayzerX on a pseudo terminal, written from the maker's page "PlayzerX USB Serial Protocol".
+
+What the page does not say was chosen so that a driver can take nothing for granted: when its queue is emptied it goes
+on with the sample that it puts out, light included; with its analog input it takes no sample from the queue; and what
+it sends unasked looks like its answers.
+"""
 
 from __future__ import annotations
 
@@ -64,6 +69,10 @@ class PlayzerX(SerialDevice):
         Its least rate, samples a second.
     left_over:
         What it has sent before, to another program.
+    analog:
+        Whether it is switched on with its analog input.
+    updates_ms:
+        After how long without a command it says how many samples remain, unasked; 0 for never.
     """
 
     baud_rate = 921_600
@@ -71,11 +80,12 @@ class PlayzerX(SerialDevice):
     def __init__(
         self, *, ping: bytes = b"pl-ok\n", data_format: str | None = "XYM", capacity: int = 125_000,
         rate_error: float = 0.0, loses: int | None = None, slowest: int = 50, left_over: bytes = b"",
-        faults: Faults = NO_FAULTS,
+        analog: bool = False, updates_ms: int = 0, faults: Faults = NO_FAULTS,
     ) -> None:  # fmt: skip
         self._ping, self._data_format, self._loses, self._slowest = ping, data_format, loses, slowest
         self._capacity, self._colours = capacity, 3 if data_format == "XYRGB" else 1
-        self._rate_error = rate_error
+        self._rate_error, self._analog = rate_error, analog
+        self.every_s = updates_ms / 1000 or None
         self.lock = threading.RLock()
         """Held while it does anything."""
         self._queue: list[Sample] = []
@@ -87,6 +97,8 @@ class PlayzerX(SerialDevice):
         self.put_out: list[Sample] = []
         """What was put out in each sample period since then."""
         self.overflowed = False
+        self._before = Sample(*ORIGIN, ())
+        """What was put out until then."""
         self._set_rate(POWER_ON_RATE)
         super().__init__(faults)
         os.write(self._device, left_over)
@@ -99,19 +111,31 @@ class PlayzerX(SerialDevice):
             self._pass_time()
             return self._execute(chr(request[2]), request)
 
+    def unasked(self) -> bytes:
+        with self.lock:
+            self._pass_time()
+            return self._remaining()
+
+    def at_rest(self) -> Sample | None:
+        """What it goes on putting out when its queue has run dry; None where its analog input decides."""
+        with self.lock:
+            if self._analog:
+                return None
+            return self._queue[-1] if self._queue else self.output
+
     def inputs_at(self, host_ns: int) -> NDArray[np.float64]:
         """What it puts out at a host time, from -1 to 1, (2,)."""
         with self.lock:
             self._pass_time()
             period = int((host_ns - self.zero_ns) // self.period_ns) if self.zero_ns else -1
-            x, y, _ = self.put_out[min(period, len(self.put_out) - 1)] if period >= 0 else Sample(*ORIGIN, ())
+            x, y, _ = self.put_out[min(period, len(self.put_out) - 1)] if period >= 0 else self._before
         return np.array([x, y]) / 2047.5 - 1
 
     def _pass_time(self) -> None:
         """Put out the samples of the periods that have begun; the last one stays where there is none."""
         now_ns = time.monotonic_ns()
         while self._tick_ns <= now_ns:
-            if self._queue:
+            if self._queue and not self._analog:
                 self.output = self._queue.pop(0)
                 self.zero_ns = self.zero_ns or int(self._tick_ns)
             if self.zero_ns and self.output:
@@ -127,7 +151,11 @@ class PlayzerX(SerialDevice):
                     self._queue.append(read_sample(request))
             case "c", 5:
                 self._queue, self.put_out, self.zero_ns, self._arrived = [], [], 0, 0
-                self.output = Sample(*ORIGIN, (0,) * self._colours)
+                self._before = self.output or self._before
+            case "i", 8:
+                self._analog = request[4:7] == b"ain"
+            case "u", 7:
+                self.every_s = int.from_bytes(request[4:6], "little") / 1000 or None
             case "r", 8:
                 self._set_rate(min(max(int.from_bytes(request[4:7], "little"), self._slowest), 50_000))
             case "p", 5:
@@ -136,8 +164,11 @@ class PlayzerX(SerialDevice):
                 lines = ["pl-info", "PlayzerX-SX", "1.0.2.0", *([self._data_format] if self._data_format else [])]
                 return "".join(f"{line}\n" for line in lines).encode()
             case "g", 5:
-                return b"pl-" + len(self._queue).to_bytes(3, "little")
+                return self._remaining()
         return b""
+
+    def _remaining(self) -> bytes:
+        return b"pl-" + len(self._queue).to_bytes(3, "little")
 
     def _set_rate(self, rate: int) -> None:
         self.period_ns = 1e9 / rate / (1 + self._rate_error)

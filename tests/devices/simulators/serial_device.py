@@ -45,6 +45,8 @@ class SerialDevice:
 
     baud_rate = 115_200
     end = b"\n"
+    every_s: float | None = None
+    """After how long without a request it sends something unasked; None where it never does."""
 
     def __init__(self, faults: Faults, *start: float) -> None:
         self.requests: list[bytes] = []
@@ -61,6 +63,10 @@ class SerialDevice:
 
     def answer(self, request: bytes) -> bytes:
         """What the device sends for a request, which comes without its end; nothing for most commands."""
+        raise NotImplementedError
+
+    def unasked(self) -> bytes:
+        """What the device sends without a request."""
         raise NotImplementedError
 
     def hold(self, *values: float) -> None:
@@ -87,9 +93,12 @@ class SerialDevice:
         waiting = b""
         try:
             while True:
-                ready, _, _ = select.select([self._device, self._woken], [], [])
+                ready, _, _ = select.select([self._device, self._woken], [], [], self.every_s)
                 if self._woken in ready:
                     return
+                if not ready:
+                    os.write(self._device, self.unasked())
+                    continue
                 data = os.read(self._device, 4096)
                 if self._speed() != self.baud_rate:
                     os.write(self._device, bytes(byte ^ 0xA5 for byte in data[::2]))

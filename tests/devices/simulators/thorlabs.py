@@ -125,10 +125,10 @@ class Piezo(AptDevice):
 class Aligner(AptDevice):
     """A KPA101; it holds the volts of its two outputs."""
 
-    def __init__(self, *, faults: Faults = NO_FAULTS) -> None:
+    def __init__(self, *, reports: bytes = b"", complains_at: int = -1, faults: Faults = NO_FAULTS) -> None:
         self.mode = 1
         self._outputs = (0, 0)
-        super().__init__("KPA101", (0x50,), 0.0, 0.0, faults=faults)
+        super().__init__("KPA101", (0x50,), 0.0, 0.0, reports=reports, complains_at=complains_at, faults=faults)
 
     def _do(self, number: int, address: int, request: bytes) -> bytes:
         if number == 0x0870:
