@@ -159,6 +159,8 @@ class Hub:
                         and any(is_it(message, sequence) for sequence in sequences)
                     ):
                         answer = message
+                        if isinstance(request, pb.Identify):  # what came before belongs to a session before
+                            kept = [each for each in kept if each[0] is not link]
                     else:
                         kept.append((source, received))
                 self._pending = kept
