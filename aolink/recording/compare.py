@@ -292,7 +292,7 @@ def _numbers_differ(x: Any, y: Any, relative: float, absolute: float) -> tuple[f
     a, b = (np.atleast_1d(np.asarray(value, dtype=np.float64)) for value in (x, y))
     if a.shape != b.shape:
         return np.inf, np.inf, True, f"{a.size} numbers against {b.size}"
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):  # numbers further apart than a double holds are apart
         gap = np.abs(a - b)
     gap[(a == b) | (np.isnan(a) & np.isnan(b))] = 0.0
     gap[np.isnan(gap)] = np.inf

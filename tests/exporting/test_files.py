@@ -22,6 +22,7 @@ from aolink.recording.editing import RecordingCopy
 from aolink.recording.schemas_pb2 import ExposureInfo
 from aolink.rig import load_rig, parse_rig
 from aolink.wire.messages_pb2 import Truth
+from tests.needs import needed
 from tests.recording.small import write_small
 
 
@@ -40,7 +41,7 @@ def test_numpy_reads_every_array(series: Series, tmp_path: Path) -> None:
 
 
 def test_xarray_reads_the_dataset(series: Series, tmp_path: Path) -> None:
-    pytest.importorskip("h5netcdf", reason="NetCDF is written with it: install aolink[tables]")
+    needed("h5netcdf")
     import xarray
 
     export(series, tmp_path / "out.nc")
@@ -70,8 +71,8 @@ def test_python_reads_the_table(series: Series, tmp_path: Path) -> None:
 
 
 def test_pandas_reads_the_same_of_csv_and_parquet_as_a_notebook_has(series: Series, tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas", reason="it reads the tables: install aolink[tables]")
-    pytest.importorskip("pyarrow", reason="Parquet is written with it: install aolink[parquet]")
+    pandas = needed("pandas")
+    needed("pyarrow")
     expected = series.to_pandas()
     export(series, tmp_path / "out.csv")
     found = pandas.read_csv(tmp_path / "out.csv", parse_dates=["time"], index_col="time", keep_default_na=False)
@@ -89,7 +90,7 @@ def test_pandas_reads_the_same_of_csv_and_parquet_as_a_notebook_has(series: Seri
 
 
 def test_pyarrow_reads_paths_inputs_and_where_they_come_from(series: Series, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="Parquet is written with it: install aolink[parquet]")
+    parquet = needed("pyarrow.parquet")
     export(series, tmp_path / "out.parquet", ["moments"])
     table, plant = parquet.read_table(tmp_path / "out.parquet"), series.rig.plant
     shape = (len(series), plant.axes * plant.n_outputs, -1)

@@ -10,10 +10,11 @@ import pytest
 import aolink
 from aolink.errors import ExportError, RecordingError
 from aolink.exporting.series import Series
+from tests.needs import needed
 from tests.recording.small import write_small
 
-pandas = pytest.importorskip("pandas", reason="tables are its: install aolink[tables]")
-xarray = pytest.importorskip("xarray", reason="datasets are its: install aolink[tables]")
+pandas = needed("pandas")
+xarray = needed("xarray")
 
 
 def test_a_table_has_a_row_for_each_exposure_and_axis(series: Series) -> None:
@@ -64,7 +65,7 @@ def test_a_dataset_is_taken_apart_by_time_and_estimator(lively: Series) -> None:
 
 @pytest.mark.parametrize("name", ["section-vi-lively", "single-lenslet"])
 def test_a_plot_on_axes_of_its_own_or_on_those_given(name: str) -> None:
-    matplotlib = pytest.importorskip("matplotlib", reason="plots are its: install aolink[plot]")
+    matplotlib = needed("matplotlib")
     matplotlib.use("agg")
     from matplotlib import pyplot
 
@@ -90,7 +91,7 @@ def test_a_plot_on_axes_of_its_own_or_on_those_given(name: str) -> None:
 
 
 def test_dark_and_empty_recordings(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason="plots are its: install aolink[plot]").use("agg")
+    needed("matplotlib").use("agg")
     dark = aolink.read(write_small(tmp_path / "dark.mcap", 2, "nothing", missing=True))
     assert dark.to_xarray().sizes["time"] == len(dark.to_pandas()) == 2
     assert not dark.plot()[1].get_lines()

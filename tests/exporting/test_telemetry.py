@@ -14,10 +14,11 @@ from aolink.exporting.files import export
 from aolink.exporting.series import Series
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import parse_rig
+from tests.needs import needed
 from tests.recording.small import write_small
 
-aotpy = pytest.importorskip("aotpy", reason="AOT telemetry is its: install aolink[aot]")
-fits = pytest.importorskip("astropy.io.fits", reason="aotpy brings it: install aolink[aot]")
+aotpy = needed("aotpy")
+fits = needed("astropy.io.fits")
 
 
 def read_system(path: Path) -> Any:

@@ -20,8 +20,9 @@ from aolink.rig import Rig, load_rig
 from tests.importing import others
 from tests.importing.rigs import small_rig
 from tests.kinds import must_be
+from tests.needs import needed
 
-aotpy = pytest.importorskip("aotpy", reason="AOT telemetry is its: install aolink[aot]")
+aotpy = needed("aotpy")
 
 RIGS = ("section-vi-lively", "single-lenslet", "sh-4x4")
 COUNT = 12

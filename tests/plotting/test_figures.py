@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,11 @@ from aolink.plotting.overview import nis_bounds
 from aolink.plotting.style import extremes, hides_swings
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import write_reestimated
+from tests.needs import needed
 from tests.recording.small import write_small
 
-Figure = pytest.importorskip("matplotlib.figure", reason="figures are its: install aolink[plot]").Figure
-StepPatch = pytest.importorskip("matplotlib.patches").StepPatch
+Figure = needed("matplotlib.figure").Figure
+StepPatch = needed("matplotlib.patches").StepPatch
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 
@@ -129,9 +131,9 @@ def test_a_spot_on_a_plane_has_a_line_for_x_and_one_for_y() -> None:
         (lambda series: plotting.save_figure(series, "moon", "x.png"), "no figure 'moon'; there are: blur,"),
     ],
 )
-def test_what_is_not_there_is_one_clear_error(draw: object, text: str) -> None:
+def test_what_is_not_there_is_one_clear_error(draw: Callable[..., object], text: str) -> None:
     with pytest.raises(ExportError, match=text):
-        draw(reference("section-vi-lively"))  # type: ignore[operator]
+        draw(reference("section-vi-lively"))
 
 
 @pytest.fixture(scope="module")

@@ -15,9 +15,10 @@ from aolink.colours import estimator_colour
 from aolink.errors import ExportError
 from aolink.plotting import draw_session
 from aolink.recording.reader import Recording
+from tests.needs import needed
 from tests.recording.small import write_small
 
-pytest.importorskip("matplotlib", reason="the picture is drawn with it: install aolink[plot]")
+needed("matplotlib")
 
 LIVELY = Path(__file__).parents[2] / "recordings" / "section-vi-lively.mcap"
 

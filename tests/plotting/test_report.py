@@ -20,9 +20,10 @@ from aolink.plotting import FIGURES, save_figure, write_report
 from aolink.recording.reader import Recording
 from aolink.rig import load_rig
 from aolink.session import record
+from tests.needs import needed
 from tests.recording.small import write_small
 
-pytest.importorskip("matplotlib", reason="figures are its: install aolink[plot]")
+needed("matplotlib")
 
 ROOT = Path(__file__).parents[2]
 RECORDINGS = ROOT / "recordings"

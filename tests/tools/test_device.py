@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from pathlib import Path
 
@@ -26,8 +27,8 @@ def make(build: Path, *what: str) -> str:
 @pytest.mark.parametrize("compiler", ["cc", "clang"])
 def test_the_vectors_and_the_states_hold(compiler: str, tmp_path: Path) -> None:
     """Every good, broken and parted packet that aolink publishes is taken as the file says."""
-    if compiler == "clang" and subprocess.run(["which", "clang"], capture_output=True).returncode:
-        pytest.skip("clang is a second opinion")
+    if compiler == "clang" and shutil.which("clang") is None:
+        pytest.skip("clang is a second opinion: .ci/run installs gcc only")
     said = make(tmp_path, "test", f"CC={compiler}")
     assert "checks hold" in said
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from aolink.estimation import make_estimator
 from aolink.rig import Rig, load_rig
+from tests.needs import needed
 
-pytest.importorskip("matplotlib", reason="tools/paper draws with it: install aolink[plot]")
+needed("matplotlib")
 
 TOOLS = Path(__file__).parents[2] / "tools"
 FIGURES = (
@@ -110,7 +111,7 @@ def stationary(rig: Rig) -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_is_there_and_not_blank(out: Path, name: str) -> None:
-    image = pytest.importorskip("PIL.Image").open(out / name).convert("RGB")
+    image = needed("PIL.Image").open(out / name).convert("RGB")
     pixels = np.asarray(image)
     assert min(pixels.shape[:2]) > 200
     ink = (pixels != 255).any(axis=2)
@@ -125,7 +126,7 @@ def test_a_figure_is_there_and_not_blank(out: Path, name: str) -> None:
 def test_estimators_have_the_viewers_colours(out: Path) -> None:
     from aolink.colours import estimator_colour
 
-    image = pytest.importorskip("PIL.Image").open(out / "figure-6.png").convert("RGB")
+    image = needed("PIL.Image").open(out / "figure-6.png").convert("RGB")
     colours = {tuple(int(c) for c in each) for each in np.unique(np.asarray(image).reshape(-1, 3), axis=0)}
     assert {estimator_colour("o1"), estimator_colour("o3")} <= colours
 

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-pytest.importorskip("matplotlib", reason="tools/paper draws with it: install aolink[plot]")
-Image = pytest.importorskip("PIL.Image")
+from tests.needs import needed
+
+needed("matplotlib")
+Image = needed("PIL.Image")
 
 TOOLS = Path(__file__).parents[2] / "tools"
 

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from aolink.recording.reader import Recording
+from tests.needs import needed
 
-Image = pytest.importorskip("PIL.Image")
+Image = needed("PIL.Image")
 
 TOOLS = Path(__file__).parents[2] / "tools"
 ROOT = TOOLS.parent
@@ -39,7 +40,7 @@ def test_every_program_is_run_somewhere() -> None:
 
 
 def test_what_protocol_generates_is_what_is_there(tmp_path: Path) -> None:
-    pytest.importorskip("grpc_tools", reason="tools/protocol generates with it: install aolink[dev]")
+    needed("grpc_tools")
     done = run(TOOLS / "protocol", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     made = sorted(each.relative_to(tmp_path) for each in tmp_path.rglob("*") if each.is_file())
@@ -108,7 +109,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
     if room == "restoration":
-        pytest.importorskip("skimage", reason="its rows need it: install aolink[bench]")
+        needed("skimage")
     rooms = importlib.import_module("bench_rows.rooms").ROWS
     module = importlib.import_module(f"bench_rows.{room}")
     measuring = ("Row", "list[Row]")

@@ -11,6 +11,7 @@ import pytest
 
 from aolink.errors import PortError
 from aolink.wire import messages_pb2 as pb
+from aolink.wire.hub import Hub
 from aolink.wire.link import Link
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet
 from aolink.wire.port import SerialPort, wait_readable
@@ -136,3 +137,16 @@ def test_an_identity_is_no_duplicate_of_what_was_left_on_the_line(peer: Peer, li
     found = receive(link, 4)
     assert [type(message).__name__ for message in found] == ["Event", "Event", "Identity", "Event"]
     assert (link.counts.duplicates, link.counts.sequence_gaps, link.counts.bad_framing) == (0, 0, 1)
+
+
+def test_what_came_before_an_identity_is_no_message_of_this_session(peer: Peer) -> None:
+    """A late answer to a host that was killed would be taken for one to the blocks of this session."""
+    hub = Hub()
+    link = hub.connect("mirror", SerialPort(peer.path))
+    late = encode_message(pb.CommandAck(block_id=2), 8) + encode_message(pb.Identity(nonce=6), 9)
+    peer.say(late + encode_message(pb.Identity(nonce=7), 0) + event("of this session", 1))
+    identity = hub.request(link, pb.Identify(nonce=7), pb.Identity, lambda answer, _: answer.nonce == 7)
+    assert identity is not None
+    (received,) = [received for _, received in hub.wait(0.0)]
+    hub.close()
+    assert received.message == pb.Event(text="of this session")

@@ -244,9 +244,8 @@ def test_a_mirror_without_a_queue_is_poked_no_faster_than_its_rig_file_allows(ri
     with OptotuneSimulator() as simulator:
         rig = rig_of(simulator)
         rig = replace(rig, mirror=replace(rig.mirror, slew_max_per_s=5.0))
-        never = lambda: False  # noqa: E731
         record_pokes(
-            rig, None, None, tmp_path / "a.mcap", share=0.1, repeats=1, overwrite=False, stop=never,
+            rig, None, None, tmp_path / "a.mcap", share=0.1, repeats=1, overwrite=False, stop=bool,
             progress=lambda _: None,
         )  # fmt: skip
         assert simulator.now() == (0, 0)
