@@ -101,6 +101,7 @@ NO_CODE = {
     "estimator   RMSE start": "test_demo_figures.py runs the demo and compares",
     "errors, files, limits, signals": "test_the_architecture_names_what_there_is",
     "Copyright (c)": "a licence",
+    "(umask": "test_the_block_of_signed_packets_works",
     "make ": "tests/tools/test_device.py makes the reference device, tests/session/test_real_time.py runs it",
 }
 """How indented blocks begin that are no commands, and what holds them."""
@@ -192,6 +193,19 @@ def test_a_block_of_commands_works(block: CodeBlock, laboratory: Path, tmp_path:
         assert "Traceback" not in done.stderr
         if target:
             assert (folder / target[1]).exists(), command
+
+
+def test_the_block_of_signed_packets_works(tmp_path: Path) -> None:
+    """On loopback: a test does not open a port to other machines."""
+    (block,) = (block for block in BLOCKS if block.text.startswith("(umask"))
+    make, serve, save = commands(block)
+    assert run(make, tmp_path).returncode == 0
+    _, _, rig, *options = serve.replace("0.0.0.0:5000", "127.0.0.1:0").replace("rig.key", f"{tmp_path}/rig.key").split()
+    with simulated_rig(rig, *options) as (camera, mirror):
+        save = save.replace("socket://192.168.1.5:5000", camera).replace("socket://192.168.1.5:5001", mirror)
+        done = run(save, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert Recording(tmp_path / "signed.mcap").complete
 
 
 @pytest.mark.parametrize("block", PYTHON, ids=str)

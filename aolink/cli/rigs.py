@@ -60,6 +60,10 @@ if TYPE_CHECKING:
     from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
+KeyOption = Annotated[
+    Path | None,
+    typer.Option("--key", metavar="FILE", help="Sign packets with the key in this file, which both ends need."),
+]
 
 
 class Light(StrEnum):
@@ -87,7 +91,11 @@ def rig(
     ] = None,
     allow_remote: Annotated[
         bool,
-        typer.Option("--allow-remote", help="Let --listen take an address that other machines can reach."),
+        typer.Option("--allow-remote", help="Let --listen take an address that other machines can reach, with --key."),
+    ] = False,
+    key: KeyOption = None,
+    unsigned: Annotated[
+        bool, typer.Option("--unsigned", help="With --allow-remote, instead of --key: everybody may move the mirror.")
     ] = False,
     light: Annotated[
         str | None,
@@ -135,8 +143,16 @@ def rig(
         loaded = replace(loaded, simulation=replace(loaded.simulation, faults=faults))
     from aolink.simulation.server import RigServer
     from aolink.simulation.streams import open_streams
+    from aolink.wire.signing import read_key
 
-    streams = open_streams(listen, allow_remote=allow_remote)
+    if key and unsigned:
+        raise typer.BadParameter("give --key or --unsigned, not both")
+    streams = open_streams(listen, key=read_key(key) if key else None, allow_remote=allow_remote, unsigned=unsigned)
+    if allow_remote:
+        warn(
+            "other machines can reach this rig: it obeys those that have the key, and what it sends can be read by all"
+            if key else "other machines can reach this rig, and everybody there can move the mirror"
+        )  # fmt: skip
     with StopRequest().installed() as stop:
         server = RigServer(loaded, streams, seed=seed, real_time=real_time)
         ports = {line: stream.name for line, stream in streams.items()}
@@ -148,7 +164,7 @@ def rig(
             print(
                 f"rig {loaded.name}, {'real' if real_time else 'virtual'} time; to record 100 exposures from it:\n"
                 f"  {program()} record --camera {ports['camera']} --mirror {ports['mirror']} --rig {rig}"
-                " --estimator o3 --exposures 100 -o session.mcap\nCtrl-C stops it.",
+                f"{f' --key {key}' if key else ''} --estimator o3 --exposures 100 -o session.mcap\nCtrl-C stops it.",
                 flush=True,
             )
         server.run(lambda: stop() or (tied and input_ended()))
@@ -204,6 +220,7 @@ def devices(
     ports: Annotated[
         list[str] | None, typer.Argument(metavar="[PORT]...", help="Ports whose devices to identify.")
     ] = None,
+    key: KeyOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the serial ports and the drivers of this machine with their devices, or identify what is behind ports."""
@@ -232,7 +249,7 @@ def devices(
     failed: AolinkError | None = None
     for port in ports:
         try:
-            found.append(identify_port(port))
+            found.append(identify_port(port, key))
         except AolinkError as error:
             failed = error
             stderr.print(f"{port}: {escape(str(error))}")
@@ -262,6 +279,7 @@ def record(
         ),
     ] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, likewise.")] = None,
+    key: KeyOption = None,
     estimator: EstimatorOption = None,
     exposures: Annotated[int | None, typer.Option(min=1, max=MOST_EXPOSURES, help="How many exposures.")] = None,
     duration: Annotated[float | None, typer.Option(metavar="S", help="How long to record, s of device time.")] = None,
@@ -304,6 +322,7 @@ def record(
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
     """
     from aolink import session
+    from aolink.devices.opening import signed
     from aolink.recording.mcap_file import WriteOptions
 
     options = WriteOptions(
@@ -320,6 +339,9 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
+    if key:
+        loaded = signed(loaded, camera, mirror, key)
+        camera = mirror = None  # they are in its table now
     get_ready(loaded, estimator or [])
     report = session.Report()
 

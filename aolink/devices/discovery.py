@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from serial.tools import list_ports as serial_ports
 
@@ -16,6 +17,7 @@ from aolink.errors import AolinkError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.port import SerialPort
+from aolink.wire.signing import read_key
 
 
 @dataclass(frozen=True)
@@ -89,11 +91,11 @@ def list_ports() -> list[tuple[str, str]]:
     return sorted((port.device, port.description or "") for port in serial_ports.comports())
 
 
-def identify_port(port: str) -> Found:
-    """Ask the device behind a port who it is. Raises PortError and DeviceError."""
-    hub = Hub()
+def identify_port(port: str, key: str | Path | None = None) -> Found:
+    """Ask the device behind a port who it is, with packets signed by a key file. Raises PortError and DeviceError."""
+    hub, secret = Hub(), read_key(key) if key else None
     try:
-        identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port)), secrets.randbits(48))
+        identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port), secret), secrets.randbits(48))
     finally:
         hub.close()
     camera, mirror = identity.camera, identity.mirror

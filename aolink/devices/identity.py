@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from aolink.devices.gate import MOST_STEP, check_times, lie
-from aolink.errors import DeviceError
+from aolink.errors import DeviceError, PortError
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import Hub
 from aolink.wire.link import Link
-from aolink.wire.packet import PROTOCOL_VERSION, schema_hash
+from aolink.wire.packet import PROTOCOL_VERSION, SIGNED_VERSION, schema_hash
 
 _LONGEST_NAME = 200
 
@@ -21,12 +21,28 @@ def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:
     DeviceError
         The device does not answer, or speaks another version of the protocol.
     """
-    identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
+    identity = None
+    try:
+        identity = hub.request(link, pb.Identify(nonce=nonce), pb.Identity, lambda answer, _: answer.nonce == nonce)
+    except PortError:
+        if not link.refusal:  # who is refused is hung up on
+            raise
+    if identity is None and link.refusal and link.signing:
+        raise DeviceError(
+            f"a packet from the {link.name} port {link.refusal}: with --key both ends need the same key file; a device"
+            " that knows no signed packets is used without, on a line that nobody else can reach"
+        )
+    if identity is None and link.foreign_version == SIGNED_VERSION:
+        raise DeviceError(
+            f"the device on the {link.name} port takes signed packets only: give its key (--key FILE, or key = FILE in"
+            " the rig file's table of the device)"
+        )
     if identity is None and link.foreign_version is not None:
         found = link.foreign_version
     elif identity is None:
         heard = link.counts.bytes_received
         what = f"{heard} bytes came that are not aolink packets" if heard else "nothing came"
+        what += "; does it know signed packets?" if link.signing else ""
         raise DeviceError(
             f"no device answers on the {link.name} port ({what}): is it the right port, is the device switched on,"
             " does another host have it?"

@@ -6,6 +6,8 @@ import math
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from aolink.devices.adapted_camera import AdaptedCamera
@@ -24,6 +26,7 @@ from aolink.rig import Rig
 from aolink.rig.device_tables import Delay, DeviceTable
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.port import SerialPort
+from aolink.wire.signing import read_key
 
 
 @contextmanager
@@ -66,7 +69,10 @@ def open_devices(
     with ExitStack() as stack:
         stack.callback(host.close)
         native_camera, native_mirror, warnings = _open_native(
-            rig, host, {kind: _port(kind, table) for kind, table in tables.items() if table.driver == NATIVE}, stop
+            rig,
+            host,
+            {kind: _port_and_key(kind, table, rig) for kind, table in tables.items() if table.driver == NATIVE},
+            stop,
         )
         mirror: Mirror
         if native_mirror is not None:
@@ -140,23 +146,39 @@ def _closing_what_fails(kind: Kind, close: Callable[[], None]) -> Iterator[None]
         raise
 
 
-def _port(kind: Kind, table: DeviceTable) -> str:
-    port = table.options.get("port")
-    if not isinstance(port, str) or len(table.options) > 1 or table.delay:
+def signed(rig: Rig, camera_port: str | None, mirror_port: str | None, key: str | Path) -> Rig:
+    """The rig whose native devices, those at the ports among them, have their packets signed with a key file."""
+    given = {kind: _table(rig, kind, port) for kind, port in zip(KINDS, (camera_port, mirror_port), strict=True)}
+    return replace(
+        rig,
+        devices={
+            kind: replace(table, options={**table.options, "key": str(Path(key).absolute())})
+            if table.driver == NATIVE
+            else table
+            for kind, table in given.items()
+            if table is not None
+        },
+    )
+
+
+def _port_and_key(kind: Kind, table: DeviceTable, rig: Rig) -> tuple[str, bytes | None]:
+    others = dict(table.options)
+    port, key = others.pop("port", None), others.pop("key", None)
+    if not isinstance(port, str) or not isinstance(key, str | None) or others or table.delay:
         raise RigError(
-            f"devices.{kind}: the driver {NATIVE} takes one key, port, a text; found {table.options}"
+            f"devices.{kind}: the driver {NATIVE} takes port, a text, and key, a file's name; found {table.options}"
             f"{' and a delay' if table.delay else ''}"
         )
-    return port
+    return port, read_key(rig.path_of(key, f"devices.{kind}.key")) if key else None
 
 
 def _open_native(
-    rig: Rig, host: Host, ports: dict[Kind, str], stop: Callable[[], bool]
+    rig: Rig, host: Host, ports: dict[Kind, tuple[str, bytes | None]], stop: Callable[[], bool]
 ) -> tuple[NativeCamera | None, NativeMirror | None, list[str]]:
     """The devices that speak packets, None for those that do not, and warnings about them."""
     if not ports:
         return None, None, []
-    links = {kind: host.connect(kind, SerialPort(port, stop=stop)) for kind, port in ports.items()}
+    links = {kind: host.connect(kind, SerialPort(port, stop=stop), key) for kind, (port, key) in ports.items()}
     asked_ns = host.now_ns()
     identities: dict[str, pb.Identity] = {}
     for kind, link in links.items():

@@ -19,17 +19,17 @@ from google.protobuf.message import DecodeError, Message
 from aolink.rig import Faults, Rig
 from aolink.simulation.devices import Line, Outgoing, SimulatedDevices
 from aolink.simulation.faults import Way
-from aolink.simulation.streams import Stream
+from aolink.simulation.streams import VERSIONS, Stream, refusal_event
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import (
     DELIMITER,
-    PROTOCOL_VERSION,
     MessageDecoder,
     Packet,
     PacketDecoder,
     PacketType,
     encode_packets,
 )
+from aolink.wire.signing import refusal
 
 VIRTUAL_EPOCH_NS = 1_767_225_600_000_000_000
 """Host time at which a virtual session begins: 2026-01-01 00:00 UTC, always the same."""
@@ -110,7 +110,7 @@ class LineEnd:
 
     def put(self, message: Message, due_ns: int = 0) -> None:
         """Queue a message for sending at ``due_ns``."""
-        for packet in encode_packets(message, self._sequence):
+        for packet in encode_packets(message, self._sequence, self.stream.signing):
             self._sequence = (self._sequence + 1) & 0xFFFF
             if isinstance(message, pb.VirtualTime):
                 packet = DELIMITER + packet  # ends whatever damage is before it
@@ -141,8 +141,13 @@ class LineEnd:
         way.append((max(due_ns, way[-1][0]) if way else due_ns, data))
 
     def _parse(self, packet: Packet) -> Message | None:
-        if packet.version != PROTOCOL_VERSION:
+        signing = self.stream.signing
+        if why := refusal(packet, signing):
+            if packet.type == PacketType.IDENTIFY and packet.version in VERSIONS:
+                self.put(refusal_event(why))
             return None
+        if signing is not None:
+            packet = signing.take(packet)
         try:
             return self._messages.take(packet)
         except DecodeError:

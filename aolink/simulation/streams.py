@@ -22,7 +22,17 @@ from google.protobuf.message import DecodeError
 
 from aolink.errors import PortError
 from aolink.simulation.devices import Line
-from aolink.wire.packet import DELIMITER, PROTOCOL_VERSION, MessageDecoder, PacketDecoder, PacketType
+from aolink.wire import messages_pb2 as pb
+from aolink.wire.packet import (
+    DELIMITER,
+    PROTOCOL_VERSION,
+    SIGNED_VERSION,
+    MessageDecoder,
+    PacketDecoder,
+    PacketType,
+    encode_message,
+)
+from aolink.wire.signing import Signing, refusal
 
 INTRODUCTION_S = 2.0
 """Whoever connects and has not sent an Identify packet by then is dropped."""
@@ -30,6 +40,8 @@ IDLE_S = 10.0
 """A host that has sent nothing for so long gives way to the next one that identifies itself."""
 _MOST_GUESTS = 16
 """Connections that may be waiting to identify themselves; beyond that, the oldest is dropped."""
+VERSIONS = (PROTOCOL_VERSION, SIGNED_VERSION)
+"""Of packets whose sender is told why they are refused."""
 _MOST_INTRODUCTION = 64
 """Bytes of an encoded Identify packet, and more than it can have."""
 
@@ -38,6 +50,8 @@ class Stream(Protocol):
     """The device's end of a port."""
 
     name: str
+    signing: Signing | None
+    """None where packets are not signed."""
 
     def fileno(self) -> int: ...
     def read(self) -> bytes: ...
@@ -46,10 +60,12 @@ class Stream(Protocol):
 
 
 class PtyStream:
-    """A pseudo terminal; ``name`` is the path that the host opens."""
+    """A pseudo terminal, which only this user may open; ``name`` is its path."""
 
-    def __init__(self) -> None:
+    def __init__(self, signing: Signing | None = None) -> None:
+        self.signing = signing
         self._master, self._slave = pty.openpty()  # the slave is kept open: hosts may come and go
+        os.fchmod(self._slave, 0o600)  # the group tty may write to it otherwise
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
         self.name = os.ttyname(self._slave)
@@ -101,11 +117,13 @@ class TcpStream:
     """A TCP port that serves one host at a time; ``name`` is the address for pyserial.
 
     A connection that begins with anything but an Identify packet is closed at once, and one that has sent nothing is
-    closed after `introduction_s`. A host that has identified itself keeps the port until it leaves; once it has been
-    silent for `idle_s`, the next host that identifies itself takes its place.
+    closed after `introduction_s`; one whose Identify is not signed as it should be is told why, and may try again until
+    then. A host that has identified itself keeps the port until it leaves; once it has been silent for `idle_s`, the
+    next host that identifies itself takes its place.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, signing: Signing | None = None) -> None:
+        self.signing = signing
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             self._listener = socket.create_server((host, port), family=family)
@@ -156,7 +174,12 @@ class TcpStream:
         for guest in guests:
             data = guest.receive()
             guest.introduction += data or b""
-            begun = begins_with_identify(guest.introduction)
+            begun = begins_with_identify(guest.introduction, self.signing)
+            if isinstance(begun, str):
+                told = encode_message(refusal_event(begun), 0, self.signing)
+                with contextlib.suppress(OSError):
+                    guest.connection.send(told)
+                guest.introduction, begun = b"", None
             if begun is None and data is not None and time.monotonic() - guest.since_s < self.introduction_s:
                 self._guests.append(guest)
             elif begun and not (self._peer is not None and time.monotonic() - self._peer.heard_s < self.idle_s):
@@ -180,14 +203,19 @@ class TcpStream:
         self._listener.close()
 
 
-def begins_with_identify(data: bytes) -> bool | None:
-    """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while it cannot be known."""
+def begins_with_identify(data: bytes, signing: Signing | None = None) -> bool | str | None:
+    """Whether bytes begin with a whole Identify packet, or with a zero byte and one; None while it cannot be known.
+
+    Where it does, but is not signed as it should be, a text says why.
+    """
     piece, end, _ = data.removeprefix(DELIMITER).partition(DELIMITER)
     if not end:
         return False if len(data) > _MOST_INTRODUCTION else None
     packets = PacketDecoder().feed(piece + end)
-    if not packets or packets[0].version != PROTOCOL_VERSION or packets[0].type != PacketType.IDENTIFY:
+    if not packets or packets[0].type != PacketType.IDENTIFY or packets[0].version not in VERSIONS:
         return False
+    if (why := refusal(packets[0], signing)) or signing is not None:
+        return why or True
     try:
         MessageDecoder().take(packets[0])
     except DecodeError:
@@ -195,26 +223,47 @@ def begins_with_identify(data: bytes) -> bool | None:
     return True
 
 
-def open_streams(listen: str | None, *, allow_remote: bool = False) -> dict[Line, Stream]:
+def refusal_event(why: str) -> pb.Event:
+    """What a host is told whose Identify is not signed as it should be."""
+    return pb.Event(level=pb.Event.WARNING, text=f"this Identify {why}")
+
+
+def open_streams(
+    listen: str | None, *, key: bytes | None = None, allow_remote: bool = False, unsigned: bool = False
+) -> dict[Line, Stream]:
     """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any).
+
+    With ``key``, of 32 bytes, they take and send signed packets only.
 
     Raises
     ------
     PortError
-        The address cannot be listened on, or other machines could reach it and ``allow_remote`` is not given.
+        The address cannot be listened on, or other machines could reach it and ``allow_remote`` is not given, or
+        neither ``key`` nor ``unsigned`` is.
     """
+    names: tuple[Line, Line] = ("camera", "mirror")
+    camera, mirror = (Signing(key, name, to_host=True) if key else None for name in names)
     if listen is None:
-        return {"camera": PtyStream(), "mirror": PtyStream()}
+        return {"camera": PtyStream(camera), "mirror": PtyStream(mirror)}
     host, _, port = listen.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_534:
         raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")
     number, address = int(port), _address(host, listen)
-    if not (allow_remote or ipaddress.ip_address(address).is_loopback):
-        raise PortError(
-            f"--listen {listen} lets other machines move the mirror, for a rig asks nobody for a password:"
-            f" give 127.0.0.1:{port}, or add --allow-remote if that is what you want"
-        )
-    return {"camera": TcpStream(address, number), "mirror": TcpStream(address, number + 1 if number else 0)}
+    if not ipaddress.ip_address(address).is_loopback:
+        if not allow_remote:
+            raise PortError(
+                f"--listen {listen} lets other machines move the mirror: give 127.0.0.1:{port}, or add --allow-remote"
+                " and --key FILE if that is what you want"
+            )
+        if not (key or unsigned):
+            raise PortError(
+                f"--listen {listen} --allow-remote lets everybody who reaches this machine move the mirror: add --key"
+                " FILE, so that only those with the key do, or --unsigned if everybody may"
+            )
+    return {
+        "camera": TcpStream(address, number, camera),
+        "mirror": TcpStream(address, number + 1 if number else 0, mirror),
+    }
 
 
 def _address(host: str, listen: str) -> str:

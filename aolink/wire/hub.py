@@ -19,6 +19,7 @@ from aolink.errors import DeviceError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link, Received
 from aolink.wire.port import Served, Transport, is_local, wait_readable
+from aolink.wire.signing import Signing
 
 ANSWER_S = 1.0
 """How long an answer may take before a request is sent again, and how long one is waited for after a stop."""
@@ -71,9 +72,9 @@ class Hub:
         """Wait from now on as if a stop had been asked for: the session ends with an error."""
         self._hurried = True
 
-    def connect(self, name: str, transport: Transport) -> Link:
-        """Add a line."""
-        link = Link(name, transport, self.now_ns)
+    def connect(self, name: str, transport: Transport, key: bytes | None = None) -> Link:
+        """Add a line; with ``key`` its packets are signed."""
+        link = Link(name, transport, self.now_ns, Signing(key, name, to_host=False) if key else None)
         self.links.append(link)
         return link
 
@@ -142,7 +143,7 @@ class Hub:
         before = self._memory_bytes()
         sequences: list[int] = []
         for attempt in range(tries):
-            if attempt and (self._hurried or self._stop()):
+            if attempt and (self._hurried or self._stop() or link.refusal):  # what is refused once is so again
                 break
             sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)

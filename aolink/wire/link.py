@@ -11,7 +11,6 @@ from google.protobuf.message import DecodeError, Message
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import (
     DELIMITER,
-    PROTOCOL_VERSION,
     MessageDecoder,
     Packet,
     PacketDecoder,
@@ -19,6 +18,7 @@ from aolink.wire.packet import (
     encode_packets,
 )
 from aolink.wire.port import Transport
+from aolink.wire.signing import Signing, refusal
 
 _REMEMBERED = 64
 """Sequence numbers that are known for duplicates."""
@@ -55,12 +55,16 @@ class Link:
     behind one of them came at that time.
     """
 
-    def __init__(self, name: str, transport: Transport, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, name: str, transport: Transport, now_ns: Callable[[], int], signing: Signing | None = None
+    ) -> None:
         self.name = name
         self.transport = transport
         self.counts = LinkCounts()
         self.foreign_version: int | None = None
-        """Protocol version of the last packet of another version, if one came."""
+        """Version of the last packet that was refused for its version or its signature, if one came."""
+        self.refusal = ""
+        """Why it was refused, as the end of a sentence about it."""
         self.handed: pb.VirtualTime | None = None
         """The last `VirtualTime` that came."""
         self.virtual = False
@@ -76,6 +80,7 @@ class Link:
         self.before_send: Callable[[], None] = lambda: None
         """Called before anything is sent; the hub keeps the lines in step with it on virtual time."""
         self._now_ns = now_ns
+        self.signing = signing
         self._decoder = PacketDecoder()
         self._messages = MessageDecoder()
         self._next_sequence = 0
@@ -93,7 +98,7 @@ class Link:
         if isinstance(message, pb.Identify):
             self._next_sequence = self.sent_packets = self.sent_bytes = 0
             self.transport.write(DELIMITER)  # ends what a host before has left on the line
-        for data in encode_packets(message, self._next_sequence):
+        for data in encode_packets(message, self._next_sequence, self.signing):
             self.transport.write(data)
             self.sent_bytes += len(data)
             self._next_sequence = (self._next_sequence + 1) & 0xFFFF
@@ -112,10 +117,12 @@ class Link:
         received = []
         self.counts.bytes_received += len(data)
         for packet in self._decoder.feed(data):
-            if packet.version != PROTOCOL_VERSION:
-                self.foreign_version = packet.version
+            if why := refusal(packet, self.signing):
+                self.refusal, self.foreign_version = why, packet.version
                 self.counts.bad_payload += 1
                 continue
+            if self.signing is not None:
+                packet = self.signing.take(packet)
             if _begins_identity(packet):  # the device counts anew: what came before is of another session
                 self._recent.clear()
                 self._last_sequence = None

@@ -1,8 +1,9 @@
-"""Packets of protocol version 1: bytes <-> (version, type, sequence, payload).
+"""Packets: bytes <-> (version, type, sequence, payload).
 
 A packet is COBS([version u8 | type u8 | sequence u16 | payload | CRC-32 u32]) 0x00, little-endian, the
 CRC zlib's over everything before it. CRC-32 finds every burst of up to 32 bits and all but 2^-32 of
-other damage. A message that does not fit goes in parts, each in a packet of its own.
+other damage. A message that does not fit goes in parts, each in a packet of its own. Version 1 has the
+message alone as its payload; in version 2 a signature follows it (`aolink.wire.signing`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from importlib import resources
+from typing import Protocol
 
 from cobs import cobs
 from google.protobuf.message import DecodeError, Message
@@ -22,16 +24,20 @@ from google.protobuf.message import DecodeError, Message
 from aolink.wire import messages_pb2 as pb
 
 PROTOCOL_VERSION = 1
+SIGNED_VERSION = 2
+"""Of a packet whose payload ends with link, time stamp and signature."""
+TRAILER_BYTES = 13
+"""Of these three."""
 MAX_PAYLOAD = 4608
 """Bytes; 4 KiB of data and the fields around it."""
 MAX_CHUNK = 4096
 """Bytes of data in one chunk of a frame, and in one part of a message."""
 MAX_MESSAGE = 262_144
 """Bytes of a message that comes in parts: a row of inputs and the limits of 10 000 of them."""
-_HEADER = struct.Struct("<BBH")
+HEADER = struct.Struct("<BBH")
 _CRC = struct.Struct("<I")
-_MIN_DECODED = _HEADER.size + _CRC.size
-_MAX_DECODED = _MIN_DECODED + MAX_PAYLOAD
+_MIN_DECODED = HEADER.size + _CRC.size
+_MAX_DECODED = _MIN_DECODED + MAX_PAYLOAD + TRAILER_BYTES
 _MAX_ENCODED = _MAX_DECODED + _MAX_DECODED // 254 + 1
 DELIMITER = b"\0"
 
@@ -90,39 +96,50 @@ class Packet:
     payload: bytes
 
 
+def _most_payload(version: int) -> int:
+    return MAX_PAYLOAD + (TRAILER_BYTES if version == SIGNED_VERSION else 0)
+
+
 def encode_packet(packet: Packet) -> bytes:
     """The bytes of a packet, delimiter included. Raises ValueError if the payload is too long."""
-    if len(packet.payload) > MAX_PAYLOAD:
-        raise ValueError(f"a payload of {len(packet.payload)} bytes does not fit into a packet, at most {MAX_PAYLOAD}")
-    body = _HEADER.pack(packet.version, packet.type, packet.sequence) + packet.payload
+    if len(packet.payload) > (most := _most_payload(packet.version)):
+        raise ValueError(f"a payload of {len(packet.payload)} bytes does not fit into a packet, at most {most}")
+    body = HEADER.pack(packet.version, packet.type, packet.sequence) + packet.payload
     encoded: bytes = cobs.encode(body + _CRC.pack(zlib.crc32(body)))
     return encoded + DELIMITER
 
 
-def encode_packets(message: Message, sequence: int) -> list[bytes]:
-    """The packets of this protocol version that carry ``message``, one or its parts, numbered from ``sequence`` on.
+class Signer(Protocol):
+    """Signs packets; see `aolink.wire.signing`."""
+
+    def sign(self, packet: Packet) -> Packet:
+        """The packet of version 2 that carries what one of version 1 does."""
+
+
+def encode_packets(message: Message, sequence: int, signer: Signer | None = None) -> list[bytes]:
+    """The packets that carry ``message``, one or its parts, numbered from ``sequence`` on.
 
     Raises ValueError if it is longer than `MAX_MESSAGE`.
     """
     type_, payload = TYPE_OF_MESSAGE[type(message)], message.SerializeToString()
-    if len(payload) <= MAX_PAYLOAD:
-        return [encode_packet(Packet(PROTOCOL_VERSION, type_, sequence, payload))]
     total = len(payload)
     if total > MAX_MESSAGE:
         raise ValueError(f"a {type(message).__name__} of {total} bytes is too long, at most {MAX_MESSAGE}")
-    parts = [
-        pb.Part(type=type_, offset=offset, total=total, data=payload[offset : offset + MAX_CHUNK])
-        for offset in range(0, total, MAX_CHUNK)
-    ]
-    return [
-        encode_packet(Packet(PROTOCOL_VERSION, PacketType.PART, (sequence + k) & 0xFFFF, part.SerializeToString()))
-        for k, part in enumerate(parts)
-    ]
+    if total > MAX_PAYLOAD:
+        parts = (
+            pb.Part(type=type_, offset=offset, total=total, data=payload[offset : offset + MAX_CHUNK])
+            for offset in range(0, total, MAX_CHUNK)
+        )
+        type_, payloads = PacketType.PART, [part.SerializeToString() for part in parts]
+    else:
+        payloads = [payload]
+    packets = [Packet(PROTOCOL_VERSION, type_, (sequence + k) & 0xFFFF, each) for k, each in enumerate(payloads)]
+    return [encode_packet(signer.sign(packet) if signer else packet) for packet in packets]
 
 
-def encode_message(message: Message, sequence: int) -> bytes:
+def encode_message(message: Message, sequence: int, signer: Signer | None = None) -> bytes:
     """All bytes of `encode_packets`."""
-    return b"".join(encode_packets(message, sequence))
+    return b"".join(encode_packets(message, sequence, signer))
 
 
 class MessageDecoder:
@@ -203,14 +220,14 @@ class PacketDecoder:
             decoded = b"" if overlong else cobs.decode(piece)
         except cobs.DecodeError:
             decoded = b""
-        if not _MIN_DECODED <= len(decoded) <= _MAX_DECODED:
+        if len(decoded) < _MIN_DECODED or len(decoded) - _MIN_DECODED > _most_payload(decoded[0]):
             self.bad_framing += 1
             return None
         if zlib.crc32(decoded[: -_CRC.size]) != _CRC.unpack(decoded[-_CRC.size :])[0]:
             self.bad_crc += 1
             return None
-        version, type_, sequence = _HEADER.unpack_from(decoded)
-        return Packet(version, type_, sequence, decoded[_HEADER.size : -_CRC.size])
+        version, type_, sequence = HEADER.unpack_from(decoded)
+        return Packet(version, type_, sequence, decoded[HEADER.size : -_CRC.size])
 
 
 @cache

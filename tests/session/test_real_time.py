@@ -6,8 +6,11 @@ The clock runs here, so nothing is said about how fast; only that order and coun
 from __future__ import annotations
 
 import contextlib
+import os
+import secrets
 import select
 import signal
+import stat
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +21,8 @@ import numpy as np
 import pytest
 
 import aolink
+from aolink.devices.discovery import identify_port
+from aolink.errors import DeviceError
 from aolink.estimation import score
 from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
@@ -81,6 +86,17 @@ def test_a_session_has_latencies_and_accounts_for_every_step(serve: Ports, tmp_p
         assert 0 < exposure.clock_sigma_ns < 10_000_000
     recording = Recording(path)
     assert first_difference(recording.estimates("o3"), reestimate(recording, ["o3"], as_recorded=True)["o3"]) is None
+
+
+def test_a_line_is_the_users_only_and_says_that_it_knows_no_key(serve: Ports, tmp_path: Path) -> None:
+    key = tmp_path / "rig.key"
+    key.write_text(secrets.token_hex(32))
+    key.chmod(0o600)
+    with serve() as ports:
+        for port in ports:
+            assert stat.S_IMODE(os.stat(port).st_mode) == 0o600
+        with pytest.raises(DeviceError, match=r"a packet from the .* port is not signed: with --key both ends need"):
+            identify_port(ports[0], key)
 
 
 def test_the_frames_show_where_the_truth_says_the_spot_was(serve: Ports, tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
+import stat
 import time
 from collections.abc import Callable, Iterator
 
@@ -16,7 +18,9 @@ from aolink.simulation import streams
 from aolink.simulation.streams import PtyStream, TcpStream, open_streams
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import Packet, PacketDecoder, encode_message, encode_packet
+from aolink.wire.signing import Signing
 
+KEY = bytes(range(32))
 IDENTIFY = encode_message(pb.Identify(nonce=7), 0)
 COMMAND = encode_message(pb.CommandBlock(block_id=1, first_step=50, n_steps=300, u=[0.05] * 300), 1)
 POST = b"POST / HTTP/1.1\r\nHost: 127.0.0.1:5000\r\nContent-Type: text/plain\r\nContent-Length: 2500\r\n\r\n"
@@ -132,13 +136,53 @@ def test_a_silent_host_gives_way_to_one_that_identifies_itself(stream: TcpStream
 def test_other_machines_need_an_explicit_word(host: str) -> None:
     with pytest.raises(PortError, match=r"lets other machines move the mirror.* 127\.0\.0\.1:0, or add --allow-remote"):
         open_streams(f"{host}:0")
+    with pytest.raises(
+        PortError, match=r"everybody who reaches this machine move the mirror: add --key FILE.*--unsigned"
+    ):
+        open_streams(f"{host}:0", allow_remote=True)
 
 
-def test_with_the_word_they_may() -> None:
-    opened = open_streams("0.0.0.0:0", allow_remote=True)
+@pytest.mark.parametrize(("key", "unsigned"), [(KEY, False), (None, True)])
+def test_with_the_word_they_may(key: bytes | None, unsigned: bool) -> None:
+    opened = open_streams("0.0.0.0:0", key=key, allow_remote=True, unsigned=unsigned)
     assert opened["camera"].name.startswith("socket://0.0.0.0:")
     for each in opened.values():
         each.close()
+
+
+def answer(stream: TcpStream, host: socket.socket) -> Packet:
+    """The packet that a host is sent that is not admitted."""
+    packets, end = PacketDecoder(), time.monotonic() + DEADLINE_S
+    while time.monotonic() < end:
+        assert stream.read() == b""
+        with contextlib.suppress(TimeoutError):
+            for packet in packets.feed(host.recv(65_536)):
+                return packet
+    raise AssertionError("nobody answers")
+
+
+def test_a_signed_port_serves_only_who_has_the_key() -> None:
+    stream = TcpStream("127.0.0.1", 0, Signing(KEY, "mirror", to_host=True))
+    mirror = Signing(KEY, "mirror", to_host=False)
+    signed = encode_message(pb.Identify(nonce=7), 0, mirror)
+    other = encode_message(pb.Identify(nonce=7), 0, Signing(bytes(32), "mirror", to_host=False))
+    for wrong, why in ((IDENTIFY, b"is not signed"), (other, b"is signed with another key")):
+        with connect(stream) as stranger:
+            stranger.sendall(wrong + COMMAND)
+            told = answer(stream, stranger)
+            assert (told.version, mirror.refusal(told)) == (2, "")
+            assert why in told.payload
+            stranger.sendall(signed)  # who has made a mistake may try again at once
+            assert taken(stream, lambda data: data != b"") == b"\0" + signed
+    stream.close()
+
+
+def test_a_signed_identify_is_told_where_no_key_is_known(stream: TcpStream) -> None:
+    with connect(stream) as host:
+        host.sendall(encode_message(pb.Identify(nonce=7), 0, Signing(KEY, "mirror", to_host=False)))
+        told = answer(stream, host)
+    assert told.version == 1
+    assert b"this Identify is signed" in told.payload
 
 
 def test_a_host_that_is_not_there_is_refused() -> None:
@@ -157,4 +201,11 @@ def test_a_serial_line_skips_noise_as_before() -> None:
     assert [packet.type for packet in found] == [1]
     assert packets.bad_framing == 1
     os.close(port)
+    stream.close()
+
+
+def test_a_serial_line_is_the_users_only() -> None:
+    stream = PtyStream()
+    assert stat.S_IMODE(os.stat(stream.name).st_mode) == 0o600
+    assert os.stat(stream.name).st_uid == os.getuid()
     stream.close()

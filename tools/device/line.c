@@ -6,12 +6,18 @@
 
 bool line_take(struct line *line, uint8_t byte, struct packet *packet)
 {
-    if (!decoder_take(&line->decoder, byte, packet) || packet->version != PROTOCOL_VERSION)
+    if (!decoder_take(&line->decoder, byte, packet))
+        return false;
+    if (packet->version == SIGNED_VERSION && packet->type == IDENTIFY)
+        line_event(line, LEVEL_WARNING, 0, "this device knows no signed packets: use it without a key");
+    if (packet->version != PROTOCOL_VERSION)
         return false;
     /* A new host counts its packets from anew: its Identify is no duplicate of the last host's. */
     if (packet->type == IDENTIFY)
         line->window.begun = false;
-    return window_take(&line->window, packet->sequence);
+    line->parts.bytes = line->message;
+    line->parts.room = sizeof line->message;
+    return window_take(&line->window, packet->sequence) && parts_take(&line->parts, packet);
 }
 
 struct writer line_write(struct line *line)

@@ -10,9 +10,14 @@
  * the gap in the sequence numbers. */
 enum { OUT_BYTES = 3 * MAX_WIRE };
 
+/* Bytes of the longest message that may come in parts. With more than 11 inputs, make it the longest block's. */
+enum { MESSAGE_BYTES = MAX_PAYLOAD };
+
 struct line {
     struct decoder decoder;
     struct window window;
+    struct parts parts;
+    uint8_t message[MESSAGE_BYTES];
     uint8_t out[OUT_BYTES];
     size_t out_size;
     uint16_t out_sequence;
@@ -22,7 +27,8 @@ struct line {
     uint8_t payload[MAX_PAYLOAD];
 };
 
-/* True when `byte` ends a packet that is to be dealt with: whole, of this version, and no duplicate. */
+/* True when `byte` ends a packet that is to be dealt with: whole, of this version, and no duplicate; of a message in
+ * parts the last one, which is then the message. */
 bool line_take(struct line *line, uint8_t byte, struct packet *packet);
 
 /* A payload to fill, and to send. */

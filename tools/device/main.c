@@ -49,7 +49,8 @@ static struct port open_port(const char *what, const char *link)
     const char *path = line < 0 || grantpt(line) != 0 || unlockpt(line) != 0 ? NULL : ptsname(line);
     int host = path == NULL ? -1 : open(path, O_RDWR | O_NOCTTY);
     struct termios raw;
-    if (host < 0 || tcgetattr(host, &raw) != 0 || fcntl(line, F_SETFL, O_NONBLOCK) != 0) {
+    /* Only this user may open it: the group tty may write to it otherwise. */
+    if (host < 0 || fchmod(host, 0600) != 0 || tcgetattr(host, &raw) != 0 || fcntl(line, F_SETFL, O_NONBLOCK) != 0) {
         perror(what);
         exit(1);
     }

@@ -59,7 +59,8 @@ static bool packet_end(struct decoder *decoder, struct packet *packet)
 {
     const uint8_t *bytes = decoder->bytes;
     size_t body = decoder->size - CRC_BYTES;
-    if (decoder->broken || decoder->left > 0 || decoder->size < HEADER_BYTES + CRC_BYTES) {
+    size_t most = MAX_PACKET - (bytes[0] == SIGNED_VERSION ? 0 : TRAILER_BYTES);
+    if (decoder->broken || decoder->left > 0 || decoder->size < HEADER_BYTES + CRC_BYTES || decoder->size > most) {
         decoder->bad_framing++;
         return false;
     }

@@ -1,4 +1,4 @@
-/* Packets of aolink/wire, protocol version 1: COBS, CRC-32, sequence numbers, parts. Knows no message but Part. */
+/* Packets of aolink/wire, version 1: COBS, CRC-32, sequence numbers, parts. Knows no message but Part. */
 #ifndef PACKET_H
 #define PACKET_H
 
@@ -8,12 +8,14 @@
 
 enum {
     PROTOCOL_VERSION = 1,
+    SIGNED_VERSION = 2,                             /* of packets with a signature, which this device does not take */
+    TRAILER_BYTES = 13,                             /* link, time stamp and signature, after the message */
     MAX_PAYLOAD = 4608,                             /* bytes of the message in one packet */
     MAX_CHUNK = 4096,                               /* bytes of data in a FrameChunk, a TruthChunk or a Part */
     MAX_MESSAGE = 262144,                           /* bytes of a message in parts */
     HEADER_BYTES = 4,                               /* version, type, sequence */
     CRC_BYTES = 4,
-    MAX_PACKET = HEADER_BYTES + MAX_PAYLOAD + CRC_BYTES,
+    MAX_PACKET = HEADER_BYTES + MAX_PAYLOAD + TRAILER_BYTES + CRC_BYTES,
     MAX_WIRE = MAX_PACKET + MAX_PACKET / 254 + 2    /* COBS adds a byte to each 254 and one; the delimiter */
 };
 
@@ -54,7 +56,7 @@ struct window {
 /* False for a duplicate. */
 bool window_take(struct window *window, uint16_t sequence);
 
-/* Puts a message in parts together. A device needs this only if its own longest block does not fit into a packet. */
+/* Puts a message in parts together. */
 struct parts {
     uint8_t *bytes; /* the caller's buffer, of the longest message that it wants */
     size_t room, size, total;

@@ -73,6 +73,28 @@ static void test_good(void)
     CHECK("good", decoder.bad_crc == 0 && decoder.bad_framing == 0);
 }
 
+/* A device without a key reads what is signed, takes none of it, and tells who asks for it. */
+static void test_signed(void)
+{
+    static struct line line;
+    for (size_t i = 0; i < N(with_signature); i++) {
+        const struct good *vector = &with_signature[i];
+        struct packet packet;
+        bool found = false;
+        memset(&line, 0, sizeof line);
+        for (size_t j = 0; j < vector->wire.size; j++)
+            found |= line_take(&line, vector->wire.bytes[j], &packet);
+        CHECK(vector->what, found == (vector->version == PROTOCOL_VERSION));
+        CHECK(vector->what, packet.version == vector->version && packet.type == vector->type);
+        CHECK(vector->what, packet.sequence == vector->sequence);
+        if (vector->payload.size > 0)
+            CHECK(vector->what, packet.size == vector->payload.size + TRAILER_BYTES &&
+                                    memcmp(packet.payload, vector->payload.bytes, vector->payload.size) == 0);
+        CHECK(vector->what, line.decoder.bad_crc == 0 && line.decoder.bad_framing == 0);
+        CHECK(vector->what, (line.out_size > 0) == (vector->version == SIGNED_VERSION && vector->type == IDENTIFY));
+    }
+}
+
 static void test_broken(void)
 {
     static struct decoder decoder;
@@ -400,6 +422,16 @@ static void test_duplicates(void)
     CHECK(what, n_answers == 1);
 }
 
+static void test_block_in_parts(void)
+{
+    const struct in_parts *vector = &in_parts[2]; /* one step of three inputs, which this mirror has not */
+    begin();
+    for (size_t i = 0; i < vector->wire.size; i++)
+        mirror_take(&mirror, vector->wire.bytes[i], now_ns());
+    collect(&mirror.line);
+    CHECK(vector->what, n_answers == 1 && answers[0].type == COMMAND_ACK && number(0, 1) == 2 && number(0, 2) == WRONG_SHAPE);
+}
+
 static void test_camera(void)
 {
     const char *what = "camera";
@@ -442,6 +474,7 @@ int main(void)
 {
     CHECK("schema_hash", same(schema_hash, (const uint8_t *)SCHEMA_HASH, sizeof SCHEMA_HASH - 1));
     test_good();
+    test_signed();
     test_broken();
     test_parts();
     test_codec();
@@ -449,6 +482,7 @@ int main(void)
     test_watchdog();
     test_history();
     test_duplicates();
+    test_block_in_parts();
     test_camera();
     printf("%zu good, %zu broken, %zu in parts, and the devices' states: %d checks hold\n", N(good), N(broken),
            N(in_parts), checks);

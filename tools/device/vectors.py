@@ -31,4 +31,9 @@ for vector in vectors["parts"]:
     kind, payload = vector["messages"][0] if vector["messages"] else (0, "")
     head = f'"{vector["what"]}", {array(vector["wire"])}'
     print(f"    {{{head}, {kind}, {array(payload)}, {vector['refused']}}},")
+print("};\nstatic const struct good with_signature[] = {")  # this device takes none, but it reads them
+for vector in vectors["signed"]:
+    version = 1 if vector["what"] == "not signed" else 2
+    head = f'"{vector["what"]}", {version}, {vector["type"]}, {vector["sequence"]}'
+    print(f"    {{{head}, {array(vector['payload'])}, {array(vector['wire'])}}},")
 print("};\n#endif")
