@@ -29,7 +29,7 @@ def test_every_program_is_run_somewhere() -> None:
     """Whoever adds one decides here, or in .ci/run, where it is tried."""
     programs = {each.name for each in TOOLS.iterdir() if each.is_file() and each.read_bytes()[:2] == b"#!"}
     by_ci, here, by_their_own_tests = (
-        {"demo", "test", "bench"},
+        {"demo", "test", "bench", "fuzz"},
         {"protocol", "recordings", "scene"},
         {"family", "paper"},
     )
@@ -72,6 +72,20 @@ def test_the_reference_recordings_can_be_made_anew(tmp_path: Path) -> None:
         assert recording.estimators == there.estimators
 
 
+def test_bad_inputs_find_nothing() -> None:
+    done = run(TOOLS / "fuzz", "--count", "20", "--from", "1000")
+    assert done.returncode == 0, done.stdout + done.stderr
+    lines = done.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["packets", "to-host", "to-device", "files"]
+    assert all("from 1000 to 1020" in line and line.endswith("nothing found") for line in lines)
+
+
+def test_a_kind_of_inputs_that_there_is_not_is_an_error() -> None:
+    done = run(TOOLS / "fuzz", "pakets")
+    assert done.returncode == 2
+    assert "there is no kind pakets: packets, to-host, to-device, files" in done.stderr
+
+
 # The benchmark
 
 
@@ -104,7 +118,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "room", ["estimation", "optics", "wire", "recording", "batches", "restoration", "moving_scene"]
+    "room", ["estimation", "optics", "wire", "clock", "reach", "recording", "batches", "restoration", "moving_scene"]
 )
 def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
