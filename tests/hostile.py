@@ -13,7 +13,7 @@ from google.protobuf.message import Message
 from aolink.rig import Rig
 from aolink.simulation.devices import Line
 from aolink.simulation.server import RigServer
-from aolink.simulation.streams import PtyStream, Stream
+from aolink.simulation.streams import PtyStream, Stream, TcpStream
 from aolink.wire.packet import MessageDecoder, PacketDecoder, encode_message
 from aolink.wire.signing import Signing
 
@@ -22,28 +22,28 @@ Lie = Callable[[Message], Message | Iterator[Message] | None]
 
 
 class LyingStream:
-    """The device's end of a pseudo terminal. Whatever the rig writes is decoded, changed and encoded again.
+    """The device's end of a pseudo terminal or a TCP port. What the rig writes is decoded, changed and encoded again.
 
     A thread of its own sends it, so that the rig goes on reading while the host does not.
     """
 
     signing: Signing | None = None
 
-    def __init__(self, lie: Lie) -> None:
-        self._pty: Stream = PtyStream()
+    def __init__(self, lie: Lie, *, tcp: bool = False) -> None:
+        self._port: Stream = TcpStream("127.0.0.1", 0) if tcp else PtyStream()
         self._lie = lie
         self._packets, self._messages = PacketDecoder(), MessageDecoder()
         self._queue: queue.SimpleQueue[Message | Iterator[Message] | None] = queue.SimpleQueue()
         self._closing = threading.Event()
         self._sender = threading.Thread(target=self._send_all)
         self._sender.start()
-        self.name = self._pty.name
+        self.name = self._port.name
 
     def fileno(self) -> int:
-        return self._pty.fileno()
+        return self._port.fileno()
 
     def read(self) -> bytes:
-        return self._pty.read()
+        return self._port.read()
 
     def write(self, data: bytes) -> int:
         for packet in self._packets.feed(data):
@@ -63,16 +63,19 @@ class LyingStream:
                 data = encode_message(message, sequence)
                 sequence = (sequence + 1) & 0xFFFF
                 while data and not self._closing.is_set():
-                    data = data[self._pty.write(data) :]
-                    if data:
-                        select.select([], [self._pty.fileno()], [], 0.05)
+                    try:
+                        data = data[self._port.write(data) :]
+                        if data:
+                            select.select([], [self._port.fileno()], [], 0.05)
+                    except (AttributeError, OSError, ValueError):  # the rig's thread has just hung up
+                        data = b""
                 if self._closing.is_set():
                     return
 
     def close(self) -> None:
         self._closing.set()
         self._sender.join()
-        self._pty.close()
+        self._port.close()
 
 
 @contextlib.contextmanager
@@ -82,9 +85,13 @@ def lying_rig(
     camera: Lie = lambda message: message,
     mirror: Lie = lambda message: message,
     real_time: bool = False,
+    tcp: bool = False,
 ) -> Iterator[tuple[str, str]]:
     """A simulated rig in a thread whose camera and mirror change what they say; gives the paths of their ports."""
-    streams: dict[Line, LyingStream] = {"camera": LyingStream(camera), "mirror": LyingStream(mirror)}
+    streams: dict[Line, LyingStream] = {
+        "camera": LyingStream(camera, tcp=tcp),
+        "mirror": LyingStream(mirror, tcp=tcp),
+    }
     done = threading.Event()
     server = RigServer(rig, dict(streams), real_time=real_time)
     thread = threading.Thread(target=server.run, args=(done.is_set,))

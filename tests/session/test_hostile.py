@@ -18,7 +18,7 @@ from aolink.devices.discovery import identify_port
 from aolink.errors import DeviceError
 from aolink.recording import topics
 from aolink.recording.reader import Recording
-from aolink.rig import load_rig
+from aolink.rig import Rig, load_rig
 from aolink.session import record
 from aolink.wire import messages_pb2 as pb
 from tests.hostile import Lie, changed, lying_rig
@@ -44,10 +44,22 @@ def says(field: str, value: object) -> Callable[[Any], None]:
     return change
 
 
-def assert_caught(tmp_path: Path, lies: dict[str, Lie], pattern: str, *, real_time: bool = False) -> None:
+def assert_caught(
+    tmp_path: Path,
+    lies: dict[str, Lie],
+    pattern: str,
+    *,
+    rig: Rig = RIG,
+    exposures: int = 6,
+    real_time: bool = False,
+    tcp: bool = False,
+) -> None:
     path = tmp_path / "a.mcap"
-    with lying_rig(RIG, **lies, real_time=real_time) as ports, pytest.raises(DeviceError, match=pattern) as caught:
-        record(RIG, *ports, path, exposures=6)
+    with (
+        lying_rig(rig, **lies, real_time=real_time, tcp=tcp) as ports,
+        pytest.raises(DeviceError, match=pattern) as caught,
+    ):
+        record(rig, *ports, path, exposures=exposures)
     assert "\n" not in str(caught.value)
     if path.exists():
         recording = Recording(path)
@@ -61,9 +73,9 @@ MIRROR = [
     (pb.Applied, "n_steps", 2**32 - 1),
     (pb.Applied, "n_steps", 0),
     (pb.Applied, "n_steps", 49),
-    (pb.Applied, "u", [50.0] * 50),
-    (pb.Applied, "u", [0.0] * 49 + [float("nan")]),
-    (pb.Applied, "u", [float("inf")] * 50),
+    (pb.Applied, "u", lambda applied: [50.0] * len(applied.u)),
+    (pb.Applied, "u", lambda applied: [*applied.u[1:], float("nan")]),
+    (pb.Applied, "u", lambda applied: [float("inf")] * len(applied.u)),
     (pb.Applied, "first_step", HUGE),
     (pb.Applied, "first_step", lambda applied: applied.first_step + 1),
     (pb.Applied, "block_id", HUGE),

@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 from aolink.rig import load_rig
 from aolink.simulation.devices import Line
 from aolink.simulation.server import RigServer
-from aolink.simulation.streams import PtyStream, Stream
+from aolink.simulation.streams import PtyStream, Stream, TcpStream
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.link import Link
 from aolink.wire.port import SerialPort
@@ -31,8 +31,8 @@ DEADLINE_S = 20.0
 class Served:
     """A rig and the host's ends of its two lines, in one thread."""
 
-    def __init__(self, *, real_time: bool) -> None:
-        self._streams: dict[Line, Stream] = {line: PtyStream() for line in LINES}
+    def __init__(self, *, real_time: bool, tcp: bool) -> None:
+        self._streams: dict[Line, Stream] = {line: TcpStream("127.0.0.1", 0) if tcp else PtyStream() for line in LINES}
         self.server = RigServer(RIG, self._streams, real_time=real_time)
         self.links = {
             line: Link(line, SerialPort(stream.name), time.monotonic_ns) for line, stream in self._streams.items()
@@ -55,9 +55,11 @@ class Served:
             self._streams[line].close()
 
 
-@pytest.fixture(params=[False, True], ids=["virtual", "real"])
+@pytest.fixture(params=["virtual, pty", "real, pty", "real, TCP"])
 def served(request: pytest.FixtureRequest) -> Iterator[Served]:
-    served = Served(real_time=request.param)
+    served = Served(real_time="real" in request.param, tcp="TCP" in request.param)
+    for line in LINES:  # over TCP nothing is taken before
+        served.identity(line, 1)
     yield served
     served.close()
 
