@@ -121,10 +121,10 @@ def test_a_device_that_is_not_ours(aolink: Run) -> None:
 
 
 def test_another_protocol_version_is_refused(aolink: Run) -> None:
-    with fake_device(lambda packet: encode_packet(Packet(2, 2, packet.sequence, b"\x08\x01"))) as port:
+    with fake_device(lambda packet: encode_packet(Packet(3, 2, packet.sequence, b"\x08\x01"))) as port:
         result = aolink("devices", port)
     assert result.returncode == 4
-    assert "speaks protocol version 2, this aolink speaks 1: update the host" in result.stderr
+    assert "speaks protocol version 3, this aolink speaks 1: update the host" in result.stderr
 
 
 def test_another_schema_is_refused(aolink: Run) -> None:
