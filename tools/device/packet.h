@@ -8,7 +8,7 @@
 
 enum {
     PROTOCOL_VERSION = 1,
-    SIGNED_VERSION = 2,                             /* of packets with a signature, which this device does not take */
+    SIGNED_VERSION = 2,                             /* of packets with a signature */
     TRAILER_BYTES = 13,                             /* link, time stamp and signature, after the message */
     MAX_PAYLOAD = 4608,                             /* bytes of the message in one packet */
     MAX_CHUNK = 4096,                               /* bytes of data in a FrameChunk, a TruthChunk or a Part */
@@ -32,6 +32,10 @@ uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t size);
 /* Writes one packet and its delimiter; `wire` has room for MAX_WIRE bytes, `size` is at most MAX_PAYLOAD. Returns the
  * number of bytes. */
 size_t packet_encode(uint8_t *wire, uint8_t type, uint16_t sequence, const uint8_t *payload, size_t size);
+
+/* The same of any version, with what follows the message in its payload. */
+size_t packet_encode_version(uint8_t *wire, uint8_t version, uint8_t type, uint16_t sequence, const uint8_t *payload,
+                             size_t size, const uint8_t *trailer, size_t trailer_size);
 
 /* Takes COBS apart while the bytes come, so that it needs one buffer only. */
 struct decoder {

@@ -30,6 +30,17 @@ struct in_parts {
     uint32_t refused;
 };
 
+struct with_signature {
+    const char *what;
+    struct bytes key;
+    uint8_t link;
+    uint64_t heard;
+    uint8_t type;
+    uint16_t sequence;
+    struct bytes payload, wire;
+    const char *refused;
+};
+
 #include "vectors.h"
 
 #define N(array) (sizeof(array) / sizeof(array)[0])
@@ -73,25 +84,69 @@ static void test_good(void)
     CHECK("good", decoder.bad_crc == 0 && decoder.bad_framing == 0);
 }
 
-/* A device without a key reads what is signed, takes none of it, and tells who asks for it. */
+/* The words of vectors.json for what is wrong, and this device's. */
+static bool is_said(const char *refused, const char *why)
+{
+    static const char *const words[][2] = {{"signature", "another key"}, {"link", "another line"},
+                                           {"time stamp", "sent again"}, {"version", "not signed"},
+                                           {"version", "no signature"}};
+    for (size_t i = 0; i < N(words); i++)
+        if (strcmp(refused, words[i][0]) == 0 && strstr(why, words[i][1]) != NULL)
+            return true;
+    return false;
+}
+
 static void test_signed(void)
 {
-    static struct line line;
     for (size_t i = 0; i < N(with_signature); i++) {
-        const struct good *vector = &with_signature[i];
+        const struct with_signature *vector = &with_signature[i];
+        struct signing signing = {vector->key.bytes, vector->link, 0, vector->heard};
+        static struct decoder decoder;
         struct packet packet;
+        uint8_t wire[MAX_WIRE];
         bool found = false;
-        memset(&line, 0, sizeof line);
         for (size_t j = 0; j < vector->wire.size; j++)
-            found |= line_take(&line, vector->wire.bytes[j], &packet);
-        CHECK(vector->what, found == (vector->version == PROTOCOL_VERSION));
-        CHECK(vector->what, packet.version == vector->version && packet.type == vector->type);
-        CHECK(vector->what, packet.sequence == vector->sequence);
-        if (vector->payload.size > 0)
-            CHECK(vector->what, packet.size == vector->payload.size + TRAILER_BYTES &&
-                                    memcmp(packet.payload, vector->payload.bytes, vector->payload.size) == 0);
-        CHECK(vector->what, line.decoder.bad_crc == 0 && line.decoder.bad_framing == 0);
-        CHECK(vector->what, (line.out_size > 0) == (vector->version == SIGNED_VERSION && vector->type == IDENTIFY));
+            found |= decoder_take(&decoder, vector->wire.bytes[j], &packet);
+        CHECK(vector->what, found && packet.type == vector->type && packet.sequence == vector->sequence);
+        const char *why = signing_refusal(&signing, &packet);
+        CHECK(vector->what, (why == NULL) == (vector->refused[0] == 0));
+        if (why != NULL) {
+            CHECK(vector->what, is_said(vector->refused, why));
+            continue;
+        }
+        signing_take(&signing, &packet);
+        CHECK(vector->what, same(vector->payload, packet.payload, packet.size) && signing.heard > vector->heard);
+        /* What this device signs with the same time stamp in the other direction, that direction's host takes. */
+        struct signing back = {vector->key.bytes, vector->link ^ LINK_TO_HOST, 0, signing.heard};
+        size_t size = signing_encode(&signing, wire, packet.type, packet.sequence, packet.payload, packet.size);
+        for (size_t j = 0; j < size; j++)
+            decoder_take(&decoder, wire[j], &packet);
+        CHECK(vector->what, signing_refusal(&back, &packet) == NULL && signing.sent == signing.heard + 1);
+    }
+}
+
+/* The same line with a key, without one, and with another packet than Identify. */
+static void test_who_is_told(void)
+{
+    static struct line line;
+    struct packet packet;
+    const struct with_signature *identify = NULL;
+    for (size_t i = 0; i < N(with_signature); i++)
+        if (with_signature[i].type == IDENTIFY)
+            identify = &with_signature[i];
+    CHECK("who is told", identify != NULL);
+    for (int with_key = 0; with_key < 2; with_key++) {
+        memset(&line, 0, sizeof line);
+        if (with_key)
+            line.signing = (struct signing){identify->key.bytes, identify->link, 0, identify->heard};
+        bool taken = false;
+        for (size_t j = 0; j < identify->wire.size; j++)
+            taken |= line_take(&line, identify->wire.bytes[j], &packet);
+        CHECK("who is told", taken == with_key && (line.out_size == 0) == with_key);
+        taken = false;
+        for (size_t j = 0; j < identify->wire.size; j++) /* once more */
+            taken |= line_take(&line, identify->wire.bytes[j], &packet);
+        CHECK("who is told", !taken && line.out_size > 0);
     }
 }
 
@@ -475,6 +530,7 @@ int main(void)
     CHECK("schema_hash", same(schema_hash, (const uint8_t *)SCHEMA_HASH, sizeof SCHEMA_HASH - 1));
     test_good();
     test_signed();
+    test_who_is_told();
     test_broken();
     test_parts();
     test_codec();
