@@ -19,7 +19,9 @@ from aolink.errors import AolinkError, RecordingError
 
 VARIABLE = "AOLINK_LIMITS"
 _FREE_RECORDS = 100_000
+"""Beside those that `Limits.records_per_kilobyte` allows for."""
 _FREE_BYTES = 1 << 30
+"""Beside those that `Limits.expansion` allows for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,6 +14,7 @@ from aolink.identification import (
     IdentifiedPlant,
     ProcessSum,
     Readings,
+    Space,
     Tried,
     chosen,
     identified,
@@ -133,7 +134,7 @@ def _some(seen: Readings, which: list[int]) -> Readings:
 
 
 def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None) -> Found:
-    def space(kinds: Sequence[str]):  # type: ignore[no-untyped-def]
+    def space(kinds: Sequence[str]) -> Space:
         return space_of(
             kinds, seen, rig.sensor.kernel.variance, with_noise=wanted.noise, with_kernel=wanted.kernel,
             highest_hz=wanted.highest_hz, plant=wanted.plant,
