@@ -55,7 +55,7 @@ def test_a_signed_session(tmp_path: Path) -> None:
     assert refused.returncode == 1
     assert "a file that only its owner may read" in refused.stderr
     key.chmod(0o600)
-    command = [tmp_path / "device", "-k", key]
+    command = [str(tmp_path / "device"), "-k", str(key)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, bufsize=1) as process:
         try:
             assert process.stdout is not None
