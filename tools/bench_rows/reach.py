@@ -10,6 +10,7 @@ import select
 import subprocess
 import tempfile
 import threading
+import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,6 +33,7 @@ _SOAK_S = 600
 _MOST_LATE = 1e-3
 _LATE = {1e-5: 0.0, 1e-4: _MOST_LATE}
 """Share of steps that may be late in real time, by bit error rate."""
+_TURN_S = 0.05
 _DEVICE = Path(__file__).parents[1] / "device"
 
 
@@ -137,6 +139,8 @@ class Cable:
         self.held: dict[int, tuple[int, bytes]] = {}
         self.contradictions = 0
         """Steps about which the device said two things."""
+        self.held_up_s = 0.0
+        """The longest time for which the machine did not run this thread though it had nothing to wait for."""
         self._device = SerialPort(port)
         self._host, self._slave = pty.openpty()
         tty.setraw(self._slave)
@@ -156,10 +160,13 @@ class Cable:
     def _run(self) -> None:
         from aolink.wire.packet import PacketDecoder, PacketType
 
+        began = time.monotonic()
         while not self._ended.is_set():
             ready, _, _ = select.select(
-                [self._host, self._device.fileno()], [self._host] if self._unsent else [], [], 0.05
+                [self._host, self._device.fileno()], [self._host] if self._unsent else [], [], _TURN_S
             )
+            before, began = began, time.monotonic()
+            self.held_up_s = max(self.held_up_s, began - before - _TURN_S)
             if self._host in ready:
                 *pieces, self._rests[0] = (self._rests[0] + os.read(self._host, 65_536)).split(b"\0")
                 for piece in pieces:
@@ -246,10 +253,11 @@ def _soak(device: str, rate: float, seconds: int, seed: int, folder: Path) -> Ro
     _require("steps lost or taken twice", abs(report.steps_commanded - ends))
     late = report.steps_late / report.steps_commanded
     whole = (report.frames_received - report.frames_incomplete) / (5 * seconds)
-    goal = _LATE[rate]
+    goal, held_up_s = _LATE[rate], max(cable.held_up_s for cable in cables)
     return Row(
         f"{device}, {seconds} s in real time at {rate:g}: steps late of {report.steps_commanded};"
-        f" {100 * whole:.2f} % of frames whole, {report.blocks_retransmitted} blocks sent again, nothing wrong",
+        f" {100 * whole:.2f} % of frames whole, {report.blocks_retransmitted} blocks sent again, nothing wrong;"
+        f" held up by the machine for {1e3 * held_up_s:.0f} ms at most",
         f"{report.steps_late}, {100 * late:.3f} %", f"goal {100 * goal:g} %", 1.0 if late <= goal else goal / late, 1.0,
     )  # fmt: skip
 
