@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 
@@ -13,6 +14,8 @@ from aolink.wire.runs_pb2 import Run
 
 _LAST_NS = 1 << 62
 """Times and fast steps up to this, in ns, can be added and subtracted in 64 bits: 146 years."""
+_MOST_INPUT = 1e100
+"""No mirror takes more, whatever its unit; from here to the largest double, sums and quotients overflow."""
 _WITHOUT_INPUTS = (wire.Applied.AWAITED, wire.Applied.NOT_REPORTED)
 
 
@@ -38,7 +41,10 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
         return ""
     # Inputs as bytes have 8 of them a number. A report without the inputs of its steps would stand for all of these.
     count = len(run.u) / 8 if isinstance(run, Run) else len(run.u)
-    return "" if count == run.n_steps * rig.n_inputs else "u has not the inputs of its steps"
+    if count != run.n_steps * rig.n_inputs:
+        return "u has not the inputs of its steps"
+    u = np.frombuffer(run.u, "<f8") if isinstance(run, Run) else np.asarray(run.u)
+    return "" if (np.abs(u) <= _MOST_INPUT).all() else "u has an input that is no number, or beyond all"
 
 
 def _of_exposure(info: pb.ExposureInfo, rig: Rig) -> str:

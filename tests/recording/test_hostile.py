@@ -38,6 +38,8 @@ FIELDS: list[tuple[type[Message], dict[str, Any], str]] = [
     (wire.Applied, {"first_step": MOST, "n_steps": 1, "u": [0.0]}, "first_step is beyond all times"),
     (wire.Applied, {"n_steps": 999_999}, "u has not the inputs of its steps"),
     (wire.CommandBlock, {"n_steps": 2**32 - 1, "u": []}, "u has not the inputs of its steps"),
+    (wire.Applied, {"n_steps": 1, "u": [float("nan")]}, "u has an input that is no number, or beyond all"),
+    (wire.CommandBlock, {"n_steps": 1, "u": [1e300]}, "u has an input that is no number, or beyond all"),
     (pb.ExposureInfo, {"frame_id": MOST}, "frame_id is beyond all counts"),
     (pb.ExposureInfo, {"first_step": 2**63, "last_step": 2**63 + 199}, "first_step is beyond all times"),
     (pb.ExposureInfo, {"last_step": 999_998}, "last_step is beyond the end of an exposure"),
