@@ -243,6 +243,12 @@ def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench:
     assert all(f.last_step + 1 - f.first_step == RIG.timing.exposure_steps for f in frames)
 
 
+def test_the_session_gets_the_pixels_where_the_driver_has_them(camera: AdaptedCamera, bench: CameraBench) -> None:
+    bench.taken = [given := frame(100 * STEP_NS)]
+    (taken,) = [event for event in camera.poll() if isinstance(event, Frame)]
+    assert np.shares_memory(taken.pixels, given.pixels)
+
+
 def test_exposures_without_a_pause_do_not_overlap_by_the_clocks_error(
     camera: AdaptedCamera, bench: CameraBench
 ) -> None:

@@ -107,6 +107,14 @@ def test_a_mirror_whose_power_failed_for_a_moment_ends_the_session(session: Sess
     with_each(check, ["pi_gcs2", "playzerx"])
 
 
+def test_an_optotune_driver_whose_power_failed_for_a_moment_goes_on_with_the_next_input(session: Session) -> None:
+    """As far as is known: its manual does not say whether it wants another START."""
+    with MIRRORS["optotune"].make(faults=Faults(reset_at=4, after_moves=UNDER_WAY)) as device:
+        session("optotune", device, report := Report(), exposures=4)
+        assert MIRRORS["optotune"].is_parked(device)
+    assert report.ended == "complete"
+
+
 def test_a_unit_whose_power_failed_for_a_moment_is_seen_not_to_follow(session: Session) -> None:
     """It ignores the host then, and is read back: the recording has what it held."""
 
