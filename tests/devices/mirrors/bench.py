@@ -90,3 +90,9 @@ def check_ended(report: Report, path: Path) -> None:
     recording = Recording(path)
     assert recording.complete
     assert len(list(recording)) >= report.exposures > 0
+
+
+def steps_ended(report: Report) -> int:
+    """How many commanded steps ended in one way or another."""
+    return sum((report.steps_applied, report.steps_late, report.steps_superseded, report.steps_refused,
+                report.steps_not_reported))  # fmt: skip

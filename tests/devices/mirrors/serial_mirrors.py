@@ -27,6 +27,8 @@ needed("thorlabs_apt_protocol")
 
 PARK = (0.25, -0.5)
 """The safe input: none that a device has when it is switched on, or goes to by itself."""
+UNDER_WAY = 25
+"""Moves after which a session has recorded exposures of moving spots."""
 _UNIT_RAD, _TAN_50 = 0.5, math.tan(math.radians(50))
 _PATIENCE_S = 10.0
 

@@ -17,11 +17,9 @@ from aolink.rig import load_rig
 from aolink.session import Report, record
 from aolink.wire import messages_pb2 as pb
 from tests.devices.mirrors import bench
-from tests.devices.mirrors.serial_mirrors import MIRRORS, with_each
+from tests.devices.mirrors.serial_mirrors import MIRRORS, UNDER_WAY, with_each
 from tests.kinds import messages_of
 
-UNDER_WAY = 25
-"""Moves after which a session has recorded exposures of moving spots."""
 WATCHDOG_S, RESTS_S = 1.0, 1.5
 PATIENCE_S = 20.0
 

@@ -2,42 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from aolink.errors import AolinkError
-from aolink.extensions import installed
 from aolink.recording.reader import Recording
-from aolink.session import Report, record
+from aolink.session import Report
 from tests.devices.mirrors import bench
-from tests.devices.mirrors.serial_mirrors import MIRRORS, PARK, with_each
-from tests.devices.simulators.serial_device import Faults, SerialDevice
+from tests.devices.mirrors.serial_mirrors import MIRRORS, PARK, UNDER_WAY, with_each
+from tests.devices.simulators.serial_device import Faults
 
-UNDER_WAY = 25
-"""Moves after which a session has recorded exposures of moving spots."""
 Session = Callable[..., Path]
-
-
-@pytest.fixture
-def session(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Session]:
-    """Records exposures with a mirror; gives the file."""
-    bench.install(monkeypatch, tmp_path)
-
-    def run(name: str, device: SerialDevice, report: Report, exposures: int = 0) -> Path:
-        path = tmp_path / f"{name}.mcap"
-        record(MIRRORS[name].rig(device), None, None, path, exposures=exposures, report=report)
-        return path
-
-    yield run
-    installed.cache_clear()
-
-
-def steps_ended(report: Report) -> int:
-    return sum((report.steps_applied, report.steps_late, report.steps_superseded, report.steps_refused,
-                report.steps_not_reported))  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -53,41 +31,13 @@ def test_answers_that_are_late_or_come_in_pieces_are_borne(faults: Faults, sessi
             path = session(name, device, report := Report(), exposures=4)
             assert MIRRORS[name].is_parked(device)
         assert (report.ended, report.steps_clipped) == ("complete", 0)
-        assert steps_ended(report) == report.steps_commanded
+        assert bench.steps_ended(report) == report.steps_commanded
         recording = Recording(path)
         if faults.after_moves and "queues no inputs" in recording.metadata["mirror_lacks"]:
             assert report.steps_late > 0
         assert max(np.abs(each.inputs - PARK).max() for each in recording.exposures()) > 0.2
 
     with_each(check)
-
-
-@pytest.mark.parametrize(
-    ("faults", "what"),
-    [
-        (Faults(garbled=frozenset({0}), after_moves=UNDER_WAY), "cable good|is no message|line loses bytes"),
-        (Faults(refused=frozenset({1}), after_moves=UNDER_WAY), "with 'NO'|its error 53|an error .* code 7"),
-        (Faults(unplugged_at=5, after_moves=UNDER_WAY), r"lost /dev/pts/\d+: .*is the device still there\?"),
-        (Faults(silent_from=5, after_moves=UNDER_WAY), "does not answer .*nothing came: is it switched on"),
-        (Faults(late_s=1.3, after_moves=UNDER_WAY), "does not answer .*came: is it switched on"),
-    ],
-    ids=["garbled", "refused", "unplugged", "silent", "too late"],
-)
-def test_a_line_that_fails_ends_the_session_with_the_mirror_parked_where_it_hears(
-    faults: Faults, what: str, session: Session, tmp_path: Path
-) -> None:
-    """A line that is late by more than the driver waits is one that does not answer."""
-
-    def check(name: str) -> None:
-        with MIRRORS[name].make(faults=faults) as device:
-            with pytest.raises(AolinkError, match=what) as raised:
-                session(name, device, report := Report())
-            assert "\n" not in str(raised.value)
-            assert "lost" in what or MIRRORS[name].is_parked(device)
-        assert steps_ended(report) == report.steps_commanded > 0
-        bench.check_ended(report, tmp_path / f"{name}.mcap")
-
-    with_each(check, MIRRORS.keys() - ({"playzerx"} if faults.refused else {}))  # which acknowledges nothing
 
 
 def test_a_mirror_whose_power_failed_for_a_moment_ends_the_session(session: Session, tmp_path: Path) -> None:
