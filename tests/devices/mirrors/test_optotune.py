@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -23,7 +24,7 @@ from aolink.estimation import make_estimator
 from aolink.extensions import installed
 from aolink.jobs.calibrate import interaction, record_pokes
 from aolink.recording.reader import Recording
-from aolink.rig import Rig, load_rig
+from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 from tests.devices.mirrors import bench
 from tests.devices.simulators.optotune import OptotuneSimulator
@@ -228,6 +229,15 @@ def test_how_late_inputs_are_taken_is_recorded_and_enters_the_estimates(session:
         assert sure.alignment is None
         widened.append((doubted.path_sd / sure.path_sd).max())
     assert max(widened) > 1.01
+
+
+def test_a_session_says_once_that_its_exposures_are_hardly_aligned(rig_of: RigOf, tmp_path: Path) -> None:
+    """With a mirror that follows its inputs at some time within 30 ms, in exposures of 100 ms."""
+    with OptotuneSimulator() as simulator:
+        toml = rig_of(simulator).toml.replace('driver = "optotune"', 'driver = "optotune"\ndelay_sd_s = 0.03')
+        report = record(parse_rig(toml), None, None, tmp_path / "a.mcap", exposures=3)
+    (warning,) = [each for each in report.warnings if "of an exposure only" in each]
+    assert re.match(r"it is known to 0\.3 of an exposure only \(sd, frame 1\)", warning)
 
 
 def test_a_mirror_without_a_queue_is_poked_no_faster_than_its_rig_file_allows(rig_of: RigOf, tmp_path: Path) -> None:
