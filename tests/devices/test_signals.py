@@ -21,7 +21,7 @@ UNDER_WAY = 20
 SIGNALS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 MIRRORS_OF = {
     signal.SIGINT: ["optotune", "playzerx"],
-    signal.SIGTERM: ["pi_gcs2", "thorlabs_aligner", "playzerx"],
+    signal.SIGTERM: ["pi_gcs2", "thorlabs_aligner"],
     signal.SIGHUP: ["pi_gcs2", "thorlabs_piezo"],
 }
 
