@@ -20,6 +20,7 @@ from aolink.rig import Rig
 
 # A pixel counts if its density exceeds this many sd of noise: pixels far from the spot only add noise.
 _THRESHOLD_SD = 4.0
+_ROUNDING = 1e-9
 _LONGEST_RAMP_S = 60.0
 """A poke that takes longer to reach is not meant so: drift would count as the mirror's."""
 
@@ -50,6 +51,12 @@ class Interaction:
     def control_matrix(self, weakest: float = 0.0) -> FloatArray:
         """Inputs that make given slopes, (n_inputs, n_outputs), without modes below ``weakest`` times the strongest."""
         return np.asarray(np.linalg.pinv(self.matrix, rcond=weakest))
+
+
+def rest_exposures(rig: Rig, hold_s: float) -> int:
+    """Frame periods that a poke is to rest before it is seen, so that it has rested for ``hold_s``: one at least."""
+    period_s = rig.timing.frame_period_steps * rig.timing.fast_step_s
+    return max(1, math.ceil(hold_s / period_s - _ROUNDING))
 
 
 def poke_inputs(rig: Rig, amplitude: FloatArray | float, rest_exposures: int = 1) -> FloatArray:
@@ -92,12 +99,17 @@ def _ramp(rig: Rig, begin: FloatArray, end: FloatArray) -> FloatArray:
 
 
 def measure_interaction(
-    rig: Rig, exposures: Iterable[Exposure], slopes_of: Callable[[Exposure], FloatArray] | None = None
+    rig: Rig,
+    exposures: Iterable[Exposure],
+    slopes_of: Callable[[Exposure], FloatArray] | None = None,
+    rest_exposures: int = 1,
 ) -> Interaction:
-    """Least squares of slopes on inputs, over the exposures whose input had rested since the exposure before began.
+    """Least squares of slopes on inputs, over the exposures whose input had rested since an exposure before began.
 
     Parameters
     ----------
+    rest_exposures:
+        How many exposures before that was, as `poke_inputs` has it.
     slopes_of:
         Slopes of an exposure in the place of its spots' centroids, (n_outputs,), such as those of the rig file's plant.
         It is called for every exposure, in order.
@@ -109,17 +121,19 @@ def measure_interaction(
     """
     if not isinstance(rig.sensor, SpotSensor):
         raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
-    inputs, slopes, before = [], [], None
+    inputs, slopes, value, rested = [], [], np.full(rig.n_inputs, np.nan), 0
     for exposure in exposures:
         seen = slopes_of(exposure) if slopes_of else None
-        u = np.concatenate([exposure.lead_inputs, exposure.inputs])
-        still = before is not None and (u == before[0]).all() and (before == before[0]).all()
-        if still and exposure.complete:
-            inputs.append(u[0])
+        still = bool((exposure.inputs == exposure.inputs[0]).all())
+        goes_on = still and (exposure.inputs[0] == value).all() and (exposure.lead_inputs == value).all()
+        value, rested = exposure.inputs[0], rested + 1 if goes_on else int(still)
+        if rested > rest_exposures and exposure.complete:
+            inputs.append(value)
             slopes.append(spot_slopes(rig.sensor, exposure.pixels) if seen is None else seen)
-        before = exposure.inputs
     if not inputs:
-        raise CalibrationError("in no exposure had the input rested since the one before: hold each poke longer")
+        raise CalibrationError(
+            f"in no exposure had the input rested since {rest_exposures} exposure(s) before it: hold each poke longer"
+        )
     u, y = np.array(inputs), np.array(slopes)
     if np.isnan(y).any():
         raise CalibrationError(f"{int(np.isnan(y).any(axis=0).sum() // 2)} spots are missing in some exposure")

@@ -53,6 +53,15 @@ def calibrate(
         float, typer.Option(min=1e-6, max=1.0, help="How far to poke, as a share of each input's range.")
     ] = 0.1,
     repeats: Annotated[int, typer.Option(min=1, max=1000, help="How often each input is pushed and pulled.")] = 2,
+    hold: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=60.0,
+            metavar="S",
+            help="How long each poke rests before it is measured, s; one frame period at least.",
+        ),
+    ] = 0.0,
     keep: Annotated[Path | None, typer.Option(metavar="DIR", help="Keep the recordings in this folder.")] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
@@ -85,7 +94,7 @@ def calibrate(
             with stop_after() as stop, progress("exposures", None) as tell:
                 calibrate.record_pokes(
                     loaded, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
-                    progress=tell,
+                    progress=tell, hold_s=hold,
                 )  # fmt: skip
         else:
             paths = calibrate.record_frames(
@@ -93,7 +102,7 @@ def calibrate(
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
             )  # fmt: skip
         if interaction:
-            _write_interaction(loaded, paths, output, overwrite=overwrite, as_json=as_json)
+            _write_interaction(loaded, paths, output, hold_s=hold, overwrite=overwrite, as_json=as_json)
         else:
             _write_calibrated(loaded, rig, paths, output, overwrite=overwrite, as_json=as_json)
     except AolinkError as error:
@@ -126,14 +135,16 @@ def _write_calibrated(
         stdout.print(f"note: {escape(note)}")
 
 
-def _write_interaction(loaded: Rig, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool) -> None:
+def _write_interaction(
+    loaded: Rig, paths: Sequence[Path], output: Path, *, hold_s: float, overwrite: bool, as_json: bool
+) -> None:  # fmt: skip
     import numpy as np
 
     from aolink.jobs.calibrate import interaction
 
     if len(paths) != 1:
         raise typer.BadParameter(f"an interaction matrix is of one recording, not of {len(paths)}")
-    found = interaction(loaded, paths[0])
+    found = interaction(loaded, paths[0], hold_s)
     measured = found.measured
     with writing(output, overwrite=overwrite, sources=paths) as unfinished, unfinished.open("wb") as file:
         np.savez(

@@ -146,7 +146,7 @@ class AdaptedCamera(Adapted):
         return [ClockSampled.add(self.clock, exchange) for exchange in exchanges]
 
     def _take(self, raw: SimpleFrame, now_ns: int) -> list[Event]:
-        timing, pixels = self._rig.timing, np.asarray(raw.pixels)
+        pixels = np.asarray(raw.pixels)
         self._check(raw, pixels)
         frame_id = self._frame_id(raw)
         start_ns, jitter_ns = self._start_of(raw, frame_id)
@@ -158,16 +158,13 @@ class AdaptedCamera(Adapted):
             )
         lost = frame_id - self._last[0] - 1 if self._last else 0
         self._last = frame_id, start_ns
-        # To the nearest part of a step, so that a camera in step with the mirror is not now before it, now after it.
-        parts = round(self._mirror.since_zero_ns(host_start_ns) * _OFFSETS / self._step_ns)
-        if parts == self._end_step * _OFFSETS - 1:  # exposures do not overlap: that is the clocks' error
-            parts += 1
-        first_step, part = divmod(parts, _OFFSETS)
+        sigma_ns = math.hypot(sigma_ns, jitter_ns, self._mirror.step_sigma_ns(host_start_ns))
+        start, n_steps = self._place(self._mirror.since_zero_ns(host_start_ns), sigma_ns)
+        first_step, part = divmod(start, _OFFSETS)
         if first_step < self._first_step:  # what the camera had still kept from before
             self._last = None
             return []
-        self._end_step = first_step + timing.exposure_steps
-        own_sigma_ns = math.hypot(sigma_ns, jitter_ns)
+        self._end_step = first_step + n_steps
         frame = Frame(
             frame_id=frame_id,
             first_step=first_step,
@@ -180,10 +177,28 @@ class AdaptedCamera(Adapted):
             device_end_ns=start_ns + raw.exposure_ns,
             host_first_byte_ns=now_ns,
             host_receive_ns=now_ns,
-            alignment_sigma_ns=math.hypot(own_sigma_ns, self._mirror.step_sigma_ns(host_start_ns)),
+            alignment_sigma_ns=sigma_ns,
             exposure_offset_ns=part * self._step_ns // _OFFSETS,
         )
-        return [frame] if raw.truth is None else [frame, truth_message(frame_id, raw.truth)]
+        if raw.truth is None or n_steps < self._rig.timing.exposure_steps:  # the truth is of all steps
+            return [frame]
+        return [frame, truth_message(frame_id, raw.truth)]
+
+    def _place(self, since_zero_ns: int, sigma_ns: float) -> tuple[int, int]:
+        """Where an exposure starts, in parts of a fast step, and how many steps it has.
+
+        The start is rounded, so that a camera in step with the mirror is not now before a step, now after it. Exposures
+        do not overlap: one that seems to, by the clocks' uncertainty and half a step at most, begins with the end of
+        the one before. Those of a camera without a pause that is faster than the mirror overlap by more in the end:
+        then one has a step less, about the same middle.
+        """
+        start, n_steps = round(since_zero_ns * _OFFSETS / self._step_ns), self._rig.timing.exposure_steps
+        overlap = self._end_step * _OFFSETS - start
+        if 0 < overlap <= max(1, min(round(sigma_ns * _OFFSETS / self._step_ns), _OFFSETS // 2)):
+            return start + overlap, n_steps
+        if 0 < overlap <= _OFFSETS and n_steps > 1:
+            return start + max(overlap, _OFFSETS // 2), n_steps - 1
+        return start, n_steps
 
     def _check(self, raw: SimpleFrame, pixels: NDArray[np.uint16]) -> None:
         """Refuse a frame that is not one of the rig file's camera. Raises DeviceError."""

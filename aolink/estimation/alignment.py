@@ -6,6 +6,8 @@ of it. Nor can frames tell it from the plant's own motion, so it is not estimate
 Advances in Control Systems 3 (1966); P. S. Maybeck, Stochastic Models, Estimation, and Control 2 (1982), section 13):
 two copies of the filter are given the same frames with the inputs of some steps earlier and later, and half the
 difference of their estimates is what such an error does to the estimate, with all that earlier exposures contributed.
+Where it is many steps, the estimate does not follow it along a straight line: the second order, from the sum of the
+two, widens the covariances.
 
 The clocks are known better the longer they are compared, and worse after a pause. The error is taken to be the same
 number of standard deviations in all exposures, so each is shifted by its own: what an exposure of badly known alignment
@@ -17,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,6 +93,10 @@ def considered(
             coefficients=scale * (late.coefficients - early.coefficients),
             end_state=scale * (late.end_state - early.end_state),
         )
+        coefficient_covariance = estimate.coefficient_covariance + _bent(share, estimate, late, early, "coefficients")
+        n = estimate.end_state.shape[1]
+        start_covariance = coefficient_covariance[:, :n, :n]
+        end_covariance = estimate.end_covariance + _bent(share, estimate, late, early, "end_state")
         innovation_covariance, nis = estimate.innovation_covariance, estimate.nis
         if innovation_covariance.ndim == 3:
             change = scale * (late.innovation - early.innovation)
@@ -97,12 +104,26 @@ def considered(
             nis = _nis(estimate, change)
         yield replace(
             estimate,
-            start_covariance=alignment.added_to(estimate.start_covariance, "coefficients"),
-            end_covariance=alignment.added_to(estimate.end_covariance, "end_state"),
+            coefficient_covariance=coefficient_covariance,
+            start_covariance=alignment.added_to(start_covariance, "coefficients"),
+            end_covariance=alignment.added_to(end_covariance, "end_state"),
             innovation_covariance=innovation_covariance,
             nis=nis,
             alignment=alignment,
         )
+
+
+def _bent(
+    share: float, estimate: Estimate, late: Estimate, early: Estimate, name: Literal["coefficients", "end_state"]
+) -> FloatArray:
+    """What a badly known alignment does beyond the straight line: the error's second order, (axes, n, n).
+
+    With shifts of root 3 standard deviations both are the points of Gauss and Hermite's quadrature, and the first
+    order, c c', and this one are together the mean square of the estimate's change.
+    """
+    bend = getattr(late, name) + getattr(early, name) - 2 * getattr(estimate, name)
+    bend *= math.sqrt(0.75) * share**2
+    return np.asarray(bend[:, :, None] * bend[:, None, :])
 
 
 def _nis(estimate: Estimate, change: FloatArray) -> FloatArray:

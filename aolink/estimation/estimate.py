@@ -82,7 +82,7 @@ class Estimate:
     """Coefficients of the exposure basis; the first n_states are the start state, (axes, n_coefficients)."""
     coefficient_covariance: FloatArray
     """(axes, n_coefficients, n_coefficients); without the error of the exposure's alignment, which is in the other two
-    and in the path's."""
+    and in the path's, but for its second order."""
     inputs: FloatArray
     """Inputs during the exposure; their response is part of the path, (n_steps, n_inputs)."""
     model: ExposureModel = field(compare=False, repr=False)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
-from aolink.calibration.interaction import Interaction, measure_interaction, poke_inputs
+from aolink.calibration.interaction import Interaction, measure_interaction, poke_inputs, rest_exposures
 from aolink.calibration.measure import LEAST_FRAMES, line_sensor
 from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, CalibrationError, RigError
@@ -181,9 +181,11 @@ class Poked:
 
 def record_pokes(
     rig: Rig, camera: str | None, mirror: str | None, path: Path, *, share: float, repeats: int, overwrite: bool,
-    stop: Callable[[], bool], progress: Callable[[int], None],
+    stop: Callable[[], bool], progress: Callable[[int], None], hold_s: float = 0.0,
 ) -> None:  # fmt: skip
     """Record a session in which each input is pushed and pulled by ``share`` of its range, ``repeats`` times.
+
+    Each poke rests for ``hold_s``, one frame period at least, before it is measured.
 
     Raises
     ------
@@ -194,7 +196,8 @@ def record_pokes(
     """
     if not isinstance(rig.sensor, SpotSensor):
         raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
-    pokes = np.tile(poke_inputs(rig, share * (rig.mirror.input_max - rig.mirror.input_min)), (repeats, 1))
+    size = share * (rig.mirror.input_max - rig.mirror.input_min)
+    pokes = np.tile(poke_inputs(rig, size, rest_exposures(rig, hold_s)), (repeats, 1))
 
     def inputs(first_step: int, n_steps: int) -> NDArray[np.float64]:
         rows = pokes[first_step : first_step + n_steps]
@@ -206,17 +209,18 @@ def record_pokes(
     )  # fmt: skip
 
 
-def interaction(rig: Rig, path: Path) -> Poked:
+def interaction(rig: Rig, path: Path, hold_s: float = 0.0) -> Poked:
     """The interaction matrix of a recording with pokes, and what the rig file's plant makes of the same inputs.
 
-    Raises RecordingError and CalibrationError.
+    What is measured are pokes that have rested for ``hold_s``, one frame period at least. Raises RecordingError and
+    CalibrationError.
     """
-    recording = Recording(path)
+    recording, rest = Recording(path), rest_exposures(rig, hold_s)
     plant = make_estimator(rig, "open-loop")
     return Poked(
-        measured=measure_interaction(rig, recording.exposures()),
+        measured=measure_interaction(rig, recording.exposures(), rest_exposures=rest),
         modelled=measure_interaction(
-            rig, recording.exposures(), lambda exposure: plant.step(exposure).path.mean(axis=1)
+            rig, recording.exposures(), lambda exposure: plant.step(exposure).path.mean(axis=1), rest
         ),
     )  # fmt: skip
 

@@ -189,7 +189,7 @@ def record(
             loop.close_account()
             with contextlib.suppress(AolinkError):
                 loop.finish_estimates(ESTIMATES_S if isinstance(error, PortError | DeviceError) else 0.0)
-            if not (stop() and isinstance(error, PortError | DeviceError)):
+            if not (isinstance(error, PortError | DeviceError) and stop()):
                 with contextlib.suppress(AolinkError):
                     writer.close(report.counts())
                 if isinstance(error, PortError | DeviceError):

@@ -49,6 +49,8 @@ _OUTAGE_WATCHDOGS = 2.0
 """A mirror that was out of reach for more than this many times its watchdog is not re-armed."""
 ESTIMATES_S = 5.0
 """Real time: how long the session's end waits for estimates that are under way."""
+_ALIGNED = 0.2
+"""Part of an exposure to which its alignment is to be known (sd): intervals of estimates hold up to there."""
 _NOT_YET = 1 << 63
 """The first fast step of a session that has not begun."""
 
@@ -108,6 +110,8 @@ class SessionLoop:
         self._queued_until = 0
         """First fast step for which no command was sent."""
         self._newest_frame = 0
+        self._aligned = True
+        """Whether all exposures were aligned well enough so far."""
         self._devices: list[Camera | Mirror] = [camera, mirror] if mirror.commanded else [camera]
         """In the order in which their clocks are queried; the next one first."""
         self._last_query_ns = self._next_statistics_ns = 0
@@ -369,6 +373,7 @@ class SessionLoop:
         report.frames_incomplete += frame.chunks_lost > 0
         report.frames_lost += frame.frames_lost_before
         self._last_frame_ns = receive_ns
+        self._check_alignment(frame)
         if not self._time.virtual:
             host_end_ns, _ = self._camera.clock.host_ns(frame.device_end_ns)
             self._latencies.frame(
@@ -380,6 +385,17 @@ class SessionLoop:
                 )
             )
         self._estimate(self._assembler.add_frame(frame), receive_ns)
+
+    def _check_alignment(self, frame: Frame) -> None:
+        """Warn once where nobody knows well enough which of the mirror's steps an exposure is of."""
+        exposure_ns = self._rig.timing.exposure_steps * self._step_ns
+        if self._aligned and self._mirror.commanded and frame.alignment_sigma_ns > _ALIGNED * exposure_ns:
+            self._aligned = False
+            self.report.warnings.append(
+                f"it is known to {frame.alignment_sigma_ns / exposure_ns:.2g} of an exposure only (sd, frame"
+                f" {frame.frame_id}) which of the mirror's fast steps an exposure is of: intervals of estimates hold up"
+                f" to {_ALIGNED:g}; give delay_s and delay_sd_s of the devices as well as they are known"
+            )
 
     def _take_scene(self, frame: Frame, receive_ns: int) -> None:
         self._record_picture(frame, topics.SCENE_EXPOSURE, topics.SCENE, receive_ns)

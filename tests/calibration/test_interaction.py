@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aolink.calibration.interaction import measure_interaction, poke_inputs, spot_slopes
+from aolink.calibration.interaction import measure_interaction, poke_inputs, rest_exposures, spot_slopes
 from aolink.devices.gate import CommandLimits
 from aolink.errors import CalibrationError
-from aolink.rig import load_rig
+from aolink.rig import load_rig, parse_rig
 from aolink.rig.disturbance import Disturbance
 from aolink.simulation.model import simulate
 from tests.kinds import must_be, truth_of
@@ -57,6 +57,25 @@ def test_pokes_go_no_faster_than_the_rig_file_allows_and_measure_the_same():
         CalibrationError, match=r"mirror\.slew_max_per_s = 0\.1 makes .* 80 s long, .* smaller amplitude"
     ):
         poke_inputs(dataclasses.replace(rig, mirror=dataclasses.replace(rig.mirror, slew_max_per_s=0.1)), 8.0)
+
+
+def test_a_slow_mirror_is_measured_where_its_pokes_have_been_held_for_long_enough():
+    """One that rings for sixteen frame periods: what is measured sooner is not its matrix at rest."""
+    text, _ = load_rig("tip-tilt").toml.split("[disturbance]")
+    for old, new in (("resonance_hz = 150.0", "resonance_hz = 6.0"), ("process_noise = 3e-4", "process_noise = 1e-8")):
+        assert old in text
+        text = text.replace(old, new)
+    rig = parse_rig(text)
+    plant = rig.plant
+    at_rest = plant.C @ np.linalg.solve(np.eye(plant.n_states) - plant.A, plant.B)
+    apart = {}
+    for hold_s in (0.0, 0.8):
+        rest = rest_exposures(rig, hold_s)
+        found = measure_interaction(rig, poked(rig, 0.2, rest_exposures=rest), rest_exposures=rest)
+        assert found.exposures == 4
+        apart[rest] = np.linalg.norm(found.matrix - at_rest) / np.linalg.norm(at_rest)
+    assert apart[1] > 0.1
+    assert apart[16] < 0.02
 
 
 def test_the_control_matrix_undoes_slopes_that_the_mirror_can_make():

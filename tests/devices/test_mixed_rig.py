@@ -36,7 +36,6 @@ def rig_with(devices: str = "") -> Rig:
         ("dac_bits = 16", "dac_bits = 12\nqueue_steps = 150"),
         ("exposure_steps = 10 ", "frame_period_steps = 15\nexposure_steps = 10 "),
         ("period_s = 4.0", "period_s = 1.0"),
-        ("watchdog_s = 30.0", "watchdog_s = 2.0"),
     ):
         assert old in toml
         toml = toml.replace(old, new)

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -242,6 +243,12 @@ def test_a_frame_gets_the_fast_steps_of_the_mirror(camera: AdaptedCamera, bench:
     assert all(f.last_step + 1 - f.first_step == RIG.timing.exposure_steps for f in frames)
 
 
+def test_the_session_gets_the_pixels_where_the_driver_has_them(camera: AdaptedCamera, bench: CameraBench) -> None:
+    bench.taken = [given := frame(100 * STEP_NS)]
+    (taken,) = [event for event in camera.poll() if isinstance(event, Frame)]
+    assert np.shares_memory(taken.pixels, given.pixels)
+
+
 def test_exposures_without_a_pause_do_not_overlap_by_the_clocks_error(
     camera: AdaptedCamera, bench: CameraBench
 ) -> None:
@@ -249,6 +256,29 @@ def test_exposures_without_a_pause_do_not_overlap_by_the_clocks_error(
     bench.taken = [frame((100 + 200 * k) * STEP_NS - k % 3 * STEP_NS // 40) for k in range(9)]
     frames = [event for event in camera.poll() if isinstance(event, Frame)]
     assert [(f.first_step, f.exposure_offset_ns) for f in frames] == [(100 + 200 * k, 0) for k in range(9)]
+
+
+@pytest.mark.parametrize("faster", [0.0013, 60e-6, -0.0013])
+def test_a_camera_without_a_pause_loses_no_step_to_the_mirrors_clock(faster: float) -> None:
+    """Where its clock is the faster one, an exposure has a step less now and then; the middle of each is as it was."""
+    mirror, bench = mirror_of(of_mirror := Bench()), CameraBench()
+    camera = AdaptedCamera(RIG, bench, mirror, Delay(), bench.now_ns)
+    starts, frames = [400 * STEP_NS + round(200 * k * STEP_NS * (1 - faster)) for k in range(200)], []
+    for start in [0, *starts]:
+        bench.host_ns = of_mirror.host_ns = EPOCH_NS + start + PERIOD_NS
+        for device in (mirror, camera):  # their clocks agree, and both are compared with the host's all the time
+            device.query_clock(bench.host_ns)
+        bench.taken = [frame(start)] if start else []
+        frames += [event for event in camera.poll() if isinstance(event, Frame)]
+        assert start or camera.start(400, 0)
+    steps = np.array([f.last_step + 1 - f.first_step for f in frames])
+    gaps = np.array([after.first_step - before.last_step - 1 for before, after in pairwise(frames)])
+    assert (len(frames), {*steps.tolist()} <= {199, 200}, {*gaps.tolist()} <= {0, 1}) == (200, True, True)
+    # Each step that one clock has gained on the other shows once: as a shorter exposure, or between two.
+    assert abs(np.count_nonzero(steps == 199) - np.count_nonzero(gaps) - 199 * 200 * faster) <= 1
+    assert gaps.any() == (faster < 0)
+    middles = [f.first_step + f.exposure_offset_ns / STEP_NS + n / 2 for f, n in zip(frames, steps, strict=True)]
+    assert np.abs(np.array(middles) - (np.array(starts) / STEP_NS + 100)).max() < 1.6 / 16
 
 
 def test_arrivals_before_a_session_are_apart_from_its_own() -> None:

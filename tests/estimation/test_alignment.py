@@ -87,8 +87,22 @@ def test_intervals_hold_where_the_alignment_is_considered_and_only_there(
     assert held < held_without
     assert nees > nees_without
     held, nees = coverage(rig, name, SIGMA_STEPS)
-    assert 0.9 < held < 0.99
+    assert 0.9 < held < 0.995
     assert 0.5 < nees < 1.5  # of 12 clocks: their own scatter is in it
+
+
+@pytest.mark.parametrize("name", ["moments", "o3"])
+@pytest.mark.parametrize("sigma", [20.0, 40.0])
+def test_intervals_hold_where_an_alignment_is_hardly_known(rig: Rig, name: str, sigma: float) -> None:
+    """By up to a fifth of an exposure, a tenth of the drive's period: what it does is no straight line any more."""
+
+    def session(seed: int) -> list[Exposure]:
+        wrong = np.random.default_rng(3000 + seed).normal(0.0, sigma)
+        return list(misaligned(rig, seed, 7, sigma, np.full(7, np.clip(wrong, -190, 190))))
+
+    held, nees = scored(rig, name, map(session, range(8)))
+    assert 0.85 < held < 0.998
+    assert nees < 1.7
 
 
 def test_one_badly_known_alignment_at_the_beginning_does_not_spoil_the_later_ones(rig: Rig) -> None:
@@ -182,7 +196,7 @@ def test_the_smoother_and_the_blur_carry_it_on(rig: Rig) -> None:
         smoothed = smooth(rig.plant, exposures, [estimator.step(exposure) for exposure in exposures])
         for exposure, estimate in zip(exposures[1:], smoothed[1:], strict=True):
             inside.append((np.abs(estimate.path - truth_of(exposure).path) < 1.96 * estimate.path_sd).mean())
-    assert 0.88 < float(np.mean(inside)) < 0.99
+    assert 0.88 < float(np.mean(inside)) < 0.999
     covariance = estimate.path_covariance()
     assert np.allclose(np.diag(covariance), estimate.path_sd.ravel() ** 2)
     change = estimate.alignment_path().ravel()

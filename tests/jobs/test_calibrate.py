@@ -534,9 +534,12 @@ def test_a_mirror_is_poked_no_faster_than_its_rig_file_allows(aolink: Run, tmp_p
     (tmp_path / "slow.toml").write_text(toml)
     arguments = ("calibrate", "--interaction", "--rig", "slow.toml", "--repeats", "2", "-o", "matrix.npz", "--json")
     with simulated_rig(tmp_path / "slow.toml") as (camera, mirror):
-        done = aolink(*arguments, "--camera", camera, "--mirror", mirror, "--poke", "0.25", "--keep", "pokes")
+        done = aolink(
+            *arguments, "--camera", camera, "--mirror", mirror, "--poke", "0.25", "--hold", "0.1", "--keep", "pokes"
+        )
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
+    assert facts["exposures"] == 8  # of two that each of eight pokes has rested for, the second
     assert facts["difference_from_plant"] < 0.08
     rig = load_rig(tmp_path / "slow.toml")
     held = np.concatenate([each.inputs for each in Recording(tmp_path / "pokes" / "pokes.mcap").exposures()])

@@ -12,6 +12,7 @@ ROWS = {
     "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz", "slow_estimator"),
     "clock": ("host_times",),
     "reach": ("bit_errors", "large_frames", "soak"),
+    "devices": ("late_steps", "clock_sd"),
     "recording": (
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes",

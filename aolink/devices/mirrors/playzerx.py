@@ -159,8 +159,6 @@ class PlayzerX:
             """The step that the mirror was in at the latest count."""
             self._batch = 0
             """The first step of what was handed over last."""
-            self._doubtful = False
-            """Whether the latest answer took too long to say what was held up: then it is asked again first."""
             self._changed = threading.Lock()
             self._closing = threading.Event()
             self._failed: Exception | None = None
@@ -226,7 +224,7 @@ class PlayzerX:
             self._line.close()
 
     def _leave_safe(self) -> None:
-        self._line.tell(CLEAR + samples(self._park, [0] * len(self._laser)))
+        self._line.tell(USB_INPUT + CLEAR + samples(self._park, [0] * len(self._laser)))  # it may have been reset
         self._count()
 
     def _identify(self) -> tuple[str, str]:
@@ -275,15 +273,14 @@ class PlayzerX:
         asked_ns = time.monotonic_ns()
         left = self._count()
         answered_ns = time.monotonic_ns()
-        self._doubtful = not self._doubtful and answered_ns - asked_ns > _SLOW_NS
-        if self._doubtful:
-            return
+        if answered_ns - asked_ns > _SLOW_NS and left > self._ahead // 2:
+            return  # there is time to ask again
         with self._changed:
             if left:
                 self._take_count(self._handed - left, asked_ns, answered_ns)
             else:  # until now, the last sample was held
                 self._delay(self._next, self._step_at(answered_ns) + 1 - self._next)
-                self._clock.doubt(self._step_ns + answered_ns - asked_ns)
+                self._clock.doubt(self._step_ns)
         self._hand_over(self._step_at(time.monotonic_ns()) + 1 + self._ahead - self._next)
 
     def _count(self) -> int:

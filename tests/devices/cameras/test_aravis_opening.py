@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,12 @@ from tests.devices.cameras.gige import fast_rig, need_aravis, noise, opened, pac
 from tests.devices.simulators.gige import FAKE, gige_camera
 
 need_aravis()
+
+
+def brief_rig(exposure_steps: int) -> Rig:
+    """Exposures of steps of half a microsecond: the fake camera takes whole microseconds, from 10 on."""
+    timing = fast_rig(period_steps=2000).timing
+    return replace(fast_rig(), timing=replace(timing, fast_step_s=5e-7, exposure_steps=exposure_steps))
 
 
 def test_what_cannot_be_opened_is_said_in_one_line(tmp_path: Path) -> None:
@@ -33,6 +40,13 @@ def test_what_cannot_be_opened_is_said_in_one_line(tmp_path: Path) -> None:
         (rig, {"features": {"GainRav": 3}}, DeviceError, "has no feature GainRav: correct devices.camera.features"),
         (rig, {"features": {"GainRaw": 300}}, DeviceError, "cannot set GainRaw to 300"),
         (rig, {"trigger": "Line7"}, DeviceError, "cannot be triggered by Line7"),
+        (
+            brief_rig(21),
+            {},
+            DeviceError,
+            "can expose for 1e-05 s, the rig file asks for 1.05e-05 s: correct timing.exp",
+        ),
+        (brief_rig(10), {}, DeviceError, "cannot expose for 5e-06 s"),
         (rig, {"stamp_at": "middle"}, RigError, "stamp_at is 'middle', expected 'start' or 'end'"),
         (rig, {"corner": [3]}, DeviceError, r"corner is \[3\], expected the row and the column"),
         (rig, {"address": 7}, RigError, "address is 7, expected a text"),

@@ -24,18 +24,26 @@ need_aravis()
 
 
 @pytest.mark.parametrize(
-    ("address", "lacks"), [(RELAY, Lacks.TRIGGER), (FAKE, f"{Lacks.TIME}; {Lacks.TRIGGER}")], ids=["clock", "no clock"]
+    ("address", "keys", "lacks"),
+    [
+        (RELAY, {}, Lacks.TRIGGER),
+        (RELAY, {"trigger": '"Line1"'}, ""),
+        (FAKE, {}, f"{Lacks.TIME}; {Lacks.TRIGGER}"),
+    ],
+    ids=["clock", "trigger", "no clock"],
 )
-def test_a_session_is_recorded_estimated_and_replayed(tmp_path: Path, address: str, lacks: str) -> None:
+def test_a_session_is_recorded_estimated_and_replayed(
+    tmp_path: Path, address: str, keys: dict[str, str], lacks: str
+) -> None:
     """The pictures are the simulated plant's, rendered ahead; the relay drops packets, so that some frames have holes.
 
     The camera's clock is latched, or the arrival of its frames stands for their time.
     """
-    rig = lenslet(address, packet_size=136, resend="false")
+    rig = lenslet(address, packet_size=136, resend="false", **keys)
     rig = replace(rig, mirror=replace(rig.mirror, watchdog_s=10.0))  # a busy machine may hold a session up for long
     truth = simulate(rig, PICTURES, seed=4)
     frames = packed(np.array([each.pixels for each in truth]), PIXEL_FORMATS["Mono12p"])
-    with gige_camera(tmp_path, frames, codes("Mono12p"), Faults(loss=0.05, seed=1)):
+    with gige_camera(tmp_path, frames, codes("Mono12p"), Faults(loss=0.05, seed=1, edges_hz=10.0)):
         report = record(rig, None, None, tmp_path / "a.mcap", estimators=["o3"], exposures=12)
     assert (report.ended, report.steps_commanded, report.estimation["o3"].failed) == ("complete", 0, "")
     recording = Recording(tmp_path / "a.mcap")

@@ -56,12 +56,19 @@ def watch(
     held: list[tuple[int, tuple[float, ...]]], inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> None:
     """Let the camera see a simulated mirror by its list of what it held since when."""
+    spot_camera.mirror.held = seen(held, inputs)
+
+
+def seen(
+    held: list[tuple[int, tuple[float, ...]]], inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> spot_camera.Held:
+    """What the camera sees of it."""
 
     def at(time_ns: int) -> NDArray[np.float64]:
         now = bisect.bisect_right(held, time_ns, key=lambda each: each[0])
         return inputs(np.array(held[max(now - 1, 0)][1]))
 
-    spot_camera.mirror.held = at
+    return at
 
 
 def check_session(report: Report, path: Path, mirror: str) -> None:
@@ -83,3 +90,9 @@ def check_ended(report: Report, path: Path) -> None:
     recording = Recording(path)
     assert recording.complete
     assert len(list(recording)) >= report.exposures > 0
+
+
+def steps_ended(report: Report) -> int:
+    """How many commanded steps ended in one way or another."""
+    return sum((report.steps_applied, report.steps_late, report.steps_superseded, report.steps_refused,
+                report.steps_not_reported))  # fmt: skip

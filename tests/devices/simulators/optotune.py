@@ -10,6 +10,8 @@ import math
 
 from tests.devices.simulators.serial_device import NO_FAULTS, Faults, SerialDevice
 
+_START = 0.2, -0.1
+"""Where its mirror is as it is switched on."""
 _TO_SIMPLE_MODE = bytes.fromhex("7e000602000000007e")
 
 
@@ -32,7 +34,7 @@ class OptotuneSimulator(SerialDevice):
     ) -> None:
         self.status = 0
         self._others, self._pro_mode = answers or {}, pro_mode
-        super().__init__(faults, 0.2, -0.1)
+        super().__init__(faults, *_START)
 
     def requests_in(self, waiting: bytes) -> tuple[list[bytes], bytes]:
         if not self._pro_mode:
@@ -70,7 +72,12 @@ class OptotuneSimulator(SerialDevice):
                 return self._move(coordinates)
         return "ERROR"
 
+    def reset(self) -> None:
+        self.hold(*_START)
+
     def _move(self, coordinates: str) -> str:
+        if self.refuses():
+            return "NO"
         try:
             x, y = (float(each) for each in coordinates.split(";"))
         except ValueError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 from tests.devices.simulators.serial_device import NO_FAULTS, Faults, SerialDevice
@@ -22,8 +23,8 @@ class PiSimulator(SerialDevice):
         Error numbers of requests, by their beginning.
     servo:
         State of the servos when it is switched on.
-    stuck:
-        Whether the stage never arrives.
+    travel_s:
+        How long the stage takes to a new target; infinity for one that never arrives.
     """
 
     def __init__(
@@ -33,13 +34,29 @@ class PiSimulator(SerialDevice):
         answers: dict[str, str] | None = None,
         refused: dict[str, int] | None = None,
         servo: bool = False,
-        stuck: bool = False,
+        travel_s: float = 0.0,
     ) -> None:
-        self.servo = dict.fromkeys(RANGES, servo)
-        self.target = dict.fromkeys(RANGES, _START)
+        self._servo, self._travel_s = servo, travel_s
+        self._switch_on()
         self.refused = refused or {}
-        self._others, self._stuck, self._error = answers or {}, stuck, 0
+        self._others = answers or {}
         super().__init__(faults, *self.target.values())
+
+    def reset(self) -> None:
+        self._switch_on()
+        self.hold(*self.target.values())
+
+    def positions(self) -> dict[str, float]:
+        """Where its axes are: on their way, at constant speed, until the travel time has passed."""
+        if (passed_s := time.monotonic() - self._moved_s) >= self._travel_s:
+            return self.target
+        part = passed_s / self._travel_s
+        return {axis: begin + part * (self.target[axis] - begin) for axis, begin in self._begin.items()}
+
+    def _switch_on(self) -> None:
+        self.servo = dict.fromkeys(RANGES, self._servo)
+        self.target = dict.fromkeys(RANGES, _START)
+        self._begin, self._moved_s, self._error = self.target, 0.0, 0
 
     def answer(self, request: bytes) -> bytes:
         text = request.decode("cp1252")
@@ -71,9 +88,9 @@ class PiSimulator(SerialDevice):
             case "SVO?":
                 return self._each(words, lambda axis: f"{self.servo[axis]:d}")
             case "ONT?":
-                return self._each(words, lambda axis: f"{not self._stuck:d}")
+                return self._each(words, lambda axis: f"{self.positions()[axis] == self.target[axis]:d}")
             case "POS?":
-                return self._each(words, lambda axis: f"{_START if self._stuck else self.target[axis]:.9f}")
+                return self._each(words, lambda axis: f"{self.positions()[axis]:.9f}")
             case "MOV?":
                 return self._each(words, lambda axis: f"{self.target[axis]:.9f}")
             case "TMN?":
@@ -85,6 +102,7 @@ class PiSimulator(SerialDevice):
             case "MOV":
                 self._move(self._pairs(words))
             case "STP":
+                self.target = self._begin = self.positions()
                 self._error = 10
             case _:
                 self._error = 2
@@ -114,6 +132,9 @@ class PiSimulator(SerialDevice):
             self._error = 5
         elif not all(RANGES[axis][0] <= value <= RANGES[axis][1] for axis, value in targets.items()):
             self._error = 7
+        elif targets and self.refuses():
+            self._error = 53
         elif targets:
-            self.target.update(targets)
+            self._begin, self._moved_s = self.positions(), time.monotonic()
+            self.target = self.target | targets
             self.hold(*self.target.values())

@@ -116,6 +116,12 @@ class PlayzerX(SerialDevice):
             self._pass_time()
             return self._remaining()
 
+    def reset(self) -> None:
+        with self.lock:
+            self._analog, self.output, self._before = True, None, Sample(*ORIGIN, ())
+            self._queue, self.put_out, self.zero_ns = [], [], 0
+            self._set_rate(POWER_ON_RATE)
+
     def at_rest(self) -> Sample | None:
         """What it goes on putting out when its queue has run dry; None where its analog input decides."""
         with self.lock:
@@ -136,7 +142,8 @@ class PlayzerX(SerialDevice):
         now_ns = time.monotonic_ns()
         while self._tick_ns <= now_ns:
             if self._queue and not self._analog:
-                self.output = self._queue.pop(0)
+                before, self.output = self.output, self._queue.pop(0)
+                self.moves += self.output != before
                 self.zero_ns = self.zero_ns or int(self._tick_ns)
             if self.zero_ns and self.output:
                 self.put_out.append(self.output)

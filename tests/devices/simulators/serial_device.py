@@ -19,18 +19,23 @@ _TCGETS2 = 0x802C542A
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """What goes wrong on the line; answers and requests are counted from zero."""
+    """What goes wrong from the move ``after_moves`` on, from which answers, requests and moves are counted."""
 
+    after_moves: int = 0
     late_s: float = 0.0
     """Time that the device takes for each answer."""
     split: bool = False
     """Answers come byte by byte."""
     garbled: frozenset[int] = frozenset()
     """Answers with the highest bit of each byte set, up to the end."""
+    refused: frozenset[int] = frozenset()
+    """Moves that it refuses, in the words of its protocol."""
     silent_from: float = float("inf")
     """First request that is not answered any more."""
     unplugged_at: float = float("inf")
     """Request with which the device vanishes."""
+    reset_at: int = -1
+    """Request before which its power fails for a moment: it is then as it is switched on."""
 
 
 NO_FAULTS = Faults()
@@ -50,10 +55,14 @@ class SerialDevice:
 
     def __init__(self, faults: Faults, *start: float) -> None:
         self.requests: list[bytes] = []
+        self.moves = -1
+        """How often it has held something else since it was switched on."""
         self.held: list[tuple[int, tuple[float, ...]]] = []
         """Since when, by `time.monotonic_ns`, it has held what."""
         self.hold(*start)
-        self._faults, self._answers = faults, 0
+        self._faults = faults
+        self._answers = self._asked = self._told_to_move = 0
+        """Counted from the move on with which the faults begin."""
         self._device, self._host = pty.openpty()
         tty.setraw(self._host)
         self.port = os.ttyname(self._host)
@@ -69,8 +78,18 @@ class SerialDevice:
         """What the device sends without a request."""
         raise NotImplementedError
 
+    def reset(self) -> None:
+        """Be as it is switched on."""
+        raise NotImplementedError
+
+    def refuses(self) -> bool:
+        """Whether it refuses the move that it is told now."""
+        self._told_to_move += self._misbehaves()
+        return self._told_to_move - 1 in self._faults.refused
+
     def hold(self, *values: float) -> None:
         """Hold something else from now on."""
+        self.moves += 1
         self.held.append((time.monotonic_ns(), values))
 
     def now(self) -> tuple[float, ...]:
@@ -105,24 +124,33 @@ class SerialDevice:
                     continue
                 requests, waiting = self.requests_in(waiting + data)
                 for request in requests:
-                    if len(self.requests) >= self._faults.unplugged_at:
+                    now = self._asked if self._misbehaves() else -1
+                    if now >= self._faults.unplugged_at:
                         return
+                    if now == self._faults.reset_at >= 0:
+                        self.reset()
+                    self._asked += now >= 0
                     self.requests.append(request)
                     answer = self.answer(request)
-                    if answer and len(self.requests) <= self._faults.silent_from:
+                    if answer and now < self._faults.silent_from:
                         self._send(answer)
         finally:
             for descriptor in (self._device, self._host, self._woken):
                 os.close(descriptor)
 
+    def _misbehaves(self) -> bool:
+        return self.moves >= self._faults.after_moves
+
     def _send(self, answer: bytes) -> None:
-        if self._faults.late_s:
+        pieces = [answer]
+        if self._misbehaves():
             time.sleep(self._faults.late_s)
-        if self._answers in self._faults.garbled:
-            text = answer.removesuffix(self.end)
-            answer = bytes(byte | 0x80 for byte in text) + answer[len(text) :]
-        self._answers += 1
-        for piece in [answer[k : k + 1] for k in range(len(answer))] if self._faults.split else [answer]:
+            if self._answers in self._faults.garbled:
+                text = answer.removesuffix(self.end)
+                answer = bytes(byte | 0x80 for byte in text) + answer[len(text) :]
+            self._answers += 1
+            pieces = [answer[k : k + 1] for k in range(len(answer))] if self._faults.split else [answer]
+        for piece in pieces:
             os.write(self._device, piece)
 
     def _speed(self) -> int:

@@ -19,17 +19,23 @@ Held = Callable[[int], NDArray[np.float64]]
 """The rig's inputs that a mirror holds at a time of `time.monotonic_ns`, (n_inputs,)."""
 mirror = SimpleNamespace(held=None)
 """What it looks at."""
+mirrors: dict[str, Held] = {}
+"""What it looks at where its key ``sees`` says so, for several sessions at once."""
 
 
 class SpotCamera:
-    """A simple driver of itself. Its exposures begin with a fast step of the mirror, as if they were triggered."""
+    """A simple driver of itself. Its exposures begin with a fast step of the mirror, as if they were triggered.
+
+    Where its clock is ``faster`` than the mirror's, by that part, they do so at first only.
+    """
 
     description = "camera of the tests"
 
-    def __init__(self, rig: Rig) -> None:
-        self._rig, self._held = rig, mirror.held
+    def __init__(self, rig: Rig, *, sees: str = "", faster: float = 0.0) -> None:
+        self._rig, self._held = rig, mirrors.pop(sees, mirror.held)
         self._state = rig.plant.initial_mean
         self._start_ns = self._followed_ns = 0
+        self._step_ns = round(rig.timing.fast_step_ns * (1 - faster))
 
     def time_ns(self) -> int:
         return time.monotonic_ns()
@@ -39,7 +45,7 @@ class SpotCamera:
 
     def frames(self) -> Iterable[SimpleFrame]:
         timing = self._rig.timing
-        exposure_ns, period_ns = (n * timing.fast_step_ns for n in (timing.exposure_steps, timing.frame_period_steps))
+        exposure_ns, period_ns = (n * self._step_ns for n in (timing.exposure_steps, timing.frame_period_steps))
         while self._start_ns and self.time_ns() > self._start_ns + exposure_ns:
             truth = self._follow(self._start_ns, timing.exposure_steps)
             pixels = to_counts(self._rig.sensor, frame_density(self._rig.sensor, truth.path))
@@ -53,7 +59,7 @@ class SpotCamera:
 
     def _follow(self, start_ns: int, n_steps: int) -> Truth:
         """The spot follows what the mirror held in the middle of each fast step, to the end of an exposure."""
-        plant, step_ns, passed = self._rig.plant, self._rig.timing.fast_step_ns, []
+        plant, step_ns, passed = self._rig.plant, self._step_ns, []
         end_ns = start_ns + n_steps * step_ns
         for begin_ns in range(self._followed_ns, end_ns, step_ns):
             passed.append(self._state)

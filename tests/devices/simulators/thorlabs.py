@@ -49,8 +49,7 @@ class AptDevice(SerialDevice):
         if address not in self._addresses:
             return b""
         if len(self.requests) - 1 == self._complains_at:
-            notes = b"Actuator not connected".ljust(64, b"\0")
-            return self._message(0x0081, address, struct.pack("<HH", 0, 7) + notes)
+            return self._complaint(address)
         number = request[0] | request[1] << 8
         if number == 0x0005:
             info = struct.pack("<l8sH4B60sHHH", 29501986, self._model.encode(), 16, 0, 1, 2, 0, b"", 1, 3, 1)
@@ -60,6 +59,10 @@ class AptDevice(SerialDevice):
 
     def _do(self, number: int, address: int, request: bytes) -> bytes:
         raise NotImplementedError
+
+    def _complaint(self, address: int) -> bytes:
+        notes = b"Actuator not connected".ljust(64, b"\0")
+        return self._message(0x0081, address, struct.pack("<HH", 0, 7) + notes)
 
     def _message(self, number: int, address: int, data: bytes) -> bytes:
         return struct.pack("<HHBB", number, len(data), 0x01 | _LONG, address) + data
@@ -81,14 +84,23 @@ class Piezo(AptDevice):
         addresses = tuple(0x21 + k for k in range(bays)) or (0x50,)
         self._volts, self._travel_um, self._has_gauge = volts, travel_um, has_gauge
         self._interlocked = interlocked
+        self._switch_on(addresses)
+        super().__init__(
+            model, addresses, *self._start(), reports=reports, complains_at=complains_at, faults=faults
+        )  # fmt: skip
+
+    def reset(self) -> None:
+        self._switch_on(self._addresses)
+        self.hold(*self._start())
+
+    def _switch_on(self, addresses: tuple[int, ...]) -> None:
         self.modes = dict.fromkeys(addresses, 1)
-        self.sources = dict.fromkeys(addresses, 3)  # the knob, as it is switched on
+        self.sources = dict.fromkeys(addresses, 3)  # the knob
         self.enabled = dict.fromkeys(addresses, False)
         self._codes = dict.fromkeys(addresses, 5000)
-        super().__init__(
-            model, addresses, *(5000 / 32767 * volts for _ in addresses), reports=reports, complains_at=complains_at,
-            faults=faults,
-        )  # fmt: skip
+
+    def _start(self) -> list[float]:
+        return [code / 32767 * self._volts for code in self._codes.values()]
 
     def _do(self, number: int, address: int, request: bytes) -> bytes:
         match number:
@@ -97,6 +109,8 @@ class Piezo(AptDevice):
             case 0x0641:
                 return struct.pack("<HBBBB", 0x0642, 1, self.modes[address], 0x01, address)
             case 0x0643 | 0x0646:
+                if self.refuses():
+                    return self._complaint(address)
                 closed = self.modes[address] == 2
                 if closed == (number == 0x0646) and self.sources[address] == 0:
                     self._codes[address] = _words(request)[1]
@@ -126,15 +140,24 @@ class Aligner(AptDevice):
     """A KPA101; it holds the volts of its two outputs."""
 
     def __init__(self, *, reports: bytes = b"", complains_at: int = -1, faults: Faults = NO_FAULTS) -> None:
+        self._switch_on()
+        super().__init__("KPA101", (0x50,), 0.0, 0.0, reports=reports, complains_at=complains_at, faults=faults)
+
+    def reset(self) -> None:
+        self._switch_on()
+        self.hold(0.0, 0.0)
+
+    def _switch_on(self) -> None:
         self.mode = 1
         self._outputs = (0, 0)
-        super().__init__("KPA101", (0x50,), 0.0, 0.0, reports=reports, complains_at=complains_at, faults=faults)
 
     def _do(self, number: int, address: int, request: bytes) -> bytes:
         if number == 0x0870:
             part, *values = _words(request)
             if part == 0x07:
                 self.mode = values[0]
+            elif part == 0x0D and self.refuses():
+                return self._complaint(address)
             elif part == 0x0D and self.mode == 2:
                 self._outputs = values[0], values[1]
                 self.hold(*(value / 32767 * 10 for value in values))

@@ -1,0 +1,79 @@
+"""What goes wrong on the line of any serial mirror in the middle of a session."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.errors import AolinkError
+from aolink.recording.reader import Recording
+from aolink.session import Report
+from tests.devices.mirrors import bench
+from tests.devices.mirrors.serial_mirrors import MIRRORS, PARK, UNDER_WAY, with_each
+from tests.devices.simulators.serial_device import Faults
+
+Session = Callable[..., Path]
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [Faults(late_s=0.002, split=True), Faults(late_s=2.5 * bench.FAST_STEP_S, after_moves=10)],
+    ids=["late and split", "later than fast steps"],
+)
+def test_answers_that_are_late_or_come_in_pieces_are_borne(faults: Faults, session: Session) -> None:
+    """Where each input takes the line longer than a fast step, steps are late and the recording says which."""
+
+    def check(name: str) -> None:
+        with MIRRORS[name].make(faults=faults) as device:
+            path = session(name, device, report := Report(), exposures=4)
+            assert MIRRORS[name].is_parked(device)
+        assert (report.ended, report.steps_clipped) == ("complete", 0)
+        assert bench.steps_ended(report) == report.steps_commanded
+        recording = Recording(path)
+        if faults.after_moves and "queues no inputs" in recording.metadata["mirror_lacks"]:
+            assert report.steps_late > 0
+        assert max(np.abs(each.inputs - PARK).max() for each in recording.exposures()) > 0.2
+
+    with_each(check)
+
+
+def test_a_mirror_whose_power_failed_for_a_moment_ends_the_session(session: Session, tmp_path: Path) -> None:
+    """It is as it was switched on: PI's axes without servos, the PlayzerX with its analog input."""
+
+    def check(name: str) -> None:
+        what = r"its error 5 \(an axis has its servo off|off by .*samples a second as it was told to"
+        with MIRRORS[name].make(faults=Faults(reset_at=4, after_moves=UNDER_WAY)) as device:
+            with pytest.raises(AolinkError, match=what):
+                session(name, device, report := Report())
+            if name == "playzerx":
+                assert MIRRORS[name].is_parked(device)
+            else:  # without servos nothing moves
+                assert not MIRRORS[name].holds_the_safe_input(device)
+        bench.check_ended(report, tmp_path / f"{name}.mcap")
+
+    with_each(check, ["pi_gcs2", "playzerx"])
+
+
+def test_an_optotune_driver_whose_power_failed_for_a_moment_goes_on_with_the_next_input(session: Session) -> None:
+    """As far as is known: its manual does not say whether it wants another START."""
+    with MIRRORS["optotune"].make(faults=Faults(reset_at=4, after_moves=UNDER_WAY)) as device:
+        session("optotune", device, report := Report(), exposures=4)
+        assert MIRRORS["optotune"].is_parked(device)
+    assert report.ended == "complete"
+
+
+def test_a_unit_whose_power_failed_for_a_moment_is_seen_not_to_follow(session: Session) -> None:
+    """It ignores the host then, and is read back: the recording has what it held."""
+
+    def check(name: str) -> None:
+        with MIRRORS[name].make(faults=Faults(reset_at=4, after_moves=UNDER_WAY)) as device:
+            path = session(name, device, report := Report(), exposures=8)
+            rest = MIRRORS[name].inputs(np.array(device.now()))
+        assert (report.ended, report.steps_clipped > 10) == ("complete", True)
+        last = list(Recording(path).exposures())[-1]
+        np.testing.assert_allclose(last.inputs, np.tile(rest, (len(last.inputs), 1)), atol=1e-3)
+
+    with_each(check, ["thorlabs_aligner", "thorlabs_piezo"])
