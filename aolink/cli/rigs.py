@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -136,8 +137,11 @@ def rig(
     from aolink.simulation.server import RigServer
     from aolink.simulation.streams import open_streams
 
-    streams = open_streams(listen, allow_remote=allow_remote)
-    with StopRequest().installed() as stop:
+    with StopRequest().installed() as stop, ExitStack() as stack:
+        links = None
+        if loaded.simulation.faults.vanish_rate:
+            links = Path(stack.enter_context(TemporaryDirectory(prefix="aolink-rig-")))
+        streams = open_streams(listen, allow_remote=allow_remote, links=links)
         server = RigServer(loaded, streams, seed=seed, real_time=real_time)
         ports = {line: stream.name for line, stream in streams.items()}
         if as_json:
@@ -283,6 +287,12 @@ def record(
     view: Annotated[
         bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
     ] = False,
+    reconnect: Annotated[
+        float,
+        typer.Option(
+            min=0, metavar="S", help="Wait so long for a native device's port that vanishes, and go on with it."
+        ),
+    ] = 0.0,
     split_mib: Annotated[
         float, typer.Option(min=0, max=2**30, metavar="MIB", help="Begin another file at this size; 0 for one file.")
     ] = 0.0,
@@ -334,7 +344,7 @@ def record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
                 calibration=calibration or "", control=control or "", force=force,
                 watch=live.show if live else None, overwrite=overwrite,
-                options=options, stop=stop, progress=told, report=report,
+                options=options, reconnect_s=reconnect, stop=stop, progress=told, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
     stop.raise_if_asked()

@@ -75,6 +75,7 @@ def record(
     watch: Watch | None = None,
     overwrite: bool = False,
     options: WriteOptions | None = None,
+    reconnect_s: float = 0.0,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
     report: Report | None = None,
@@ -117,6 +118,10 @@ def record(
         exposures that come meanwhile are left out and counted, and what it raises becomes a warning.
     options:
         How the recording is cut into chunks and files.
+    reconnect_s:
+        How long to wait for the port of a native device that vanishes, s. The session goes on with the device that
+        returns if it is the same one and has not been restarted; exposures and inputs that are missing are counted.
+        With 0 a port that vanishes ends the session.
     stop, progress:
         Called at least ten times a second: ``stop()`` says whether the session is to end, ``progress(exposures)`` is
         given the number of exposures so far. In real time the latter is called on a thread of its own.
@@ -143,7 +148,7 @@ def record(
         rig = replace(rig, drive=rest)
     report = report or Report()
     with (
-        open_devices(rig, camera_port, mirror_port, stop) as (clock, camera, mirror, warnings),
+        open_devices(rig, camera_port, mirror_port, stop, reconnect_s) as (clock, camera, mirror, warnings),
         contextlib.ExitStack() as aside,
     ):
         if control and not mirror.commanded:

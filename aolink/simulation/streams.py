@@ -16,7 +16,8 @@ import pty
 import socket
 import time
 import tty
-from typing import Protocol
+from pathlib import Path
+from typing import Protocol, get_args
 
 from google.protobuf.message import DecodeError
 
@@ -43,16 +44,27 @@ class Stream(Protocol):
     def read(self) -> bytes: ...
     def write(self, data: bytes) -> int: ...
     def close(self) -> None: ...
+    def reopen(self) -> None: ...
 
 
 class PtyStream:
-    """A pseudo terminal; ``name`` is the path that the host opens."""
+    """A pseudo terminal; ``name`` is the path that the host opens.
 
-    def __init__(self) -> None:
+    Each time it is opened again it has another path, as a USB device may have. ``link`` is a symbolic link that always
+    leads to it, as udev makes them, and is its name then.
+    """
+
+    def __init__(self, link: Path | None = None) -> None:
+        self._link = link
+        self.reopen()
+        self.name = str(link or os.ttyname(self._slave))
+
+    def reopen(self) -> None:
         self._master, self._slave = pty.openpty()  # the slave is kept open: hosts may come and go
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
-        self.name = os.ttyname(self._slave)
+        if self._link is not None:
+            self._link.symlink_to(os.ttyname(self._slave))
 
     def fileno(self) -> int:
         return self._master
@@ -68,6 +80,8 @@ class PtyStream:
         return 0
 
     def close(self) -> None:
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
         os.close(self._master)
         os.close(self._slave)
 
@@ -106,18 +120,24 @@ class TcpStream:
     """
 
     def __init__(self, host: str, port: int) -> None:
+        self._host, self._port = host, port
+        self.reopen()
+        self.introduction_s, self.idle_s = INTRODUCTION_S, IDLE_S
+        self._peer: _Peer | None = None
+        self._guests: list[_Peer] = []
+        """Connections that have not identified themselves yet, oldest first."""
+        shown = f"[{host}]" if ":" in host else host
+        self.name = f"socket://{shown}:{self._port}"
+
+    def reopen(self) -> None:
+        host, port = self._host, self._port
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             self._listener = socket.create_server((host, port), family=family)
         except OSError as error:
             raise PortError(f"cannot listen on {host}:{port}: {error.strerror}; give another --listen") from None
         self._listener.setblocking(False)
-        self.introduction_s, self.idle_s = INTRODUCTION_S, IDLE_S
-        self._peer: _Peer | None = None
-        self._guests: list[_Peer] = []
-        """Connections that have not identified themselves yet, oldest first."""
-        shown = f"[{host}]" if family == socket.AF_INET6 else host
-        self.name = f"socket://{shown}:{self._listener.getsockname()[1]}"
+        self._port = self._listener.getsockname()[1]
 
     def fileno(self) -> int:
         waiting = [self._peer] if self._peer else self._guests[-1:]
@@ -177,6 +197,7 @@ class TcpStream:
         self._hang_up()
         for guest in self._guests:
             guest.connection.close()
+        self._guests.clear()
         self._listener.close()
 
 
@@ -195,8 +216,10 @@ def begins_with_identify(data: bytes) -> bool | None:
     return True
 
 
-def open_streams(listen: str | None, *, allow_remote: bool = False) -> dict[Line, Stream]:
+def open_streams(listen: str | None, *, allow_remote: bool = False, links: Path | None = None) -> dict[Line, Stream]:
     """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any).
+
+    ``links`` is a folder for links to the terminals, which stay the same where these vanish and return.
 
     Raises
     ------
@@ -204,7 +227,7 @@ def open_streams(listen: str | None, *, allow_remote: bool = False) -> dict[Line
         The address cannot be listened on, or other machines could reach it and ``allow_remote`` is not given.
     """
     if listen is None:
-        return {"camera": PtyStream(), "mirror": PtyStream()}
+        return {line: PtyStream(links and links / line) for line in get_args(Line)}
     host, _, port = listen.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_534:
         raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")
