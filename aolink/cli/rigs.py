@@ -287,6 +287,16 @@ def record(
     view: Annotated[
         bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
     ] = False,
+    inputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--input",
+            metavar="KIND:NAME=VALUE,...|FILE",
+            help="Play this, not the rig's drive: sine:amplitude=0.2,frequency=5; chirp:amplitude=0.2,from=1,to=40;"
+            " prbs:amplitude=0.2,to=40,seed=3; step:amplitude=0.2,at=1; column=0 for one input only;"
+            " or inputs from a .csv, .npy, .npz or .mcap file.",
+        ),
+    ] = None,
     reconnect: Annotated[
         float,
         typer.Option(
@@ -330,6 +340,14 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
+    played = None
+    if inputs:
+        from aolink.session.excitation import excitation
+
+        if control or calibration:
+            raise typer.BadParameter("--input is not for --control or --calibration, which give the inputs themselves")
+        played = excitation(inputs, loaded)
+        exposures = exposures or played.exposures or None
     get_ready(loaded, estimator or [])
     report = session.Report()
 
@@ -342,7 +360,7 @@ def record(
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
-                calibration=calibration or "", control=control or "", force=force,
+                calibration=calibration or "", inputs=played, control=control or "", force=force,
                 watch=live.show if live else None, overwrite=overwrite,
                 options=options, reconnect_s=reconnect, stop=stop, progress=told, report=report,
             )  # fmt: skip

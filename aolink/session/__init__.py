@@ -26,6 +26,7 @@ from aolink.rig import Drive, Rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session.controlling import Controlling, facts
 from aolink.session.estimating import BesideTheLoop, Outcome
+from aolink.session.excitation import Excitation
 from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside, most_waiting
@@ -105,7 +106,8 @@ def record(
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
         Function that gives the inputs to command, instead of the rig's drive. The loop calls it, and sends the next
-        commands when it returns.
+        commands when it returns. The recording's metadata (``input``) have the text of an
+        `aolink.session.excitation.Excitation`.
     control:
         Name of the controller that closes the loop, one of `aolink.control.controller_names`: it gives the inputs,
         instead of the rig's drive. The first of the estimators serves it. On virtual time an exposure changes the
@@ -167,6 +169,8 @@ def record(
             "estimators": " ".join(estimators),
             "note": note,
         } | of_control
+        if isinstance(inputs, Excitation):
+            session_facts["input"] = inputs.text
         if calibration:
             session_facts[topics.CALIBRATION] = calibration
         attachments = _true_scene(rig, camera)
