@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
     from aolink.rig import Rig
     from aolink.session import Report
+    from aolink.session.dry_run import DryRun
     from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
@@ -315,6 +316,9 @@ def record(
         float, typer.Option(metavar="S", help="Write a chunk to the file at this age; a kill loses at most twice this.")
     ] = 0.1,
     fsync_s: Annotated[float, typer.Option(metavar="S", help="How often the file is synchronised to the disk.")] = 1.0,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, with the devices, but send the mirror no input.")
+    ] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -349,6 +353,18 @@ def record(
         played = excitation(inputs, loaded)
         exposures = exposures or played.exposures or None
     get_ready(loaded, estimator or [])
+    if dry_run:
+        from aolink.session.dry_run import dry_run as checked
+
+        with StopRequest().installed() as stop:
+            found = checked(
+                loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0,
+                calibration=calibration or "", inputs=played, control=control or "", force=force,
+                overwrite=overwrite, stop=stop,
+            )  # fmt: skip
+        stop.raise_if_asked()
+        _print_dry_run(found, as_json)
+        return
     report = session.Report()
 
     def told(done: int) -> None:
@@ -368,6 +384,19 @@ def record(
     stop.raise_if_asked()
     if any(each.failed for each in report.estimation.values()):
         raise typer.Exit(EstimatorError.exit_code)
+
+
+def _print_dry_run(found: DryRun, as_json: bool) -> None:
+    for warning in found.warnings:
+        warn(warning)
+    if as_json:
+        print(json.dumps(found.facts | {"warnings": found.warnings}))
+        return
+    for name, text in found.facts.items():
+        stdout.print(f"{name:<12}{text}", markup=False)
+    stdout.print(
+        "dry run: all of this is good; no input was sent to the mirror, and nothing was recorded", markup=False
+    )
 
 
 def _print_session(report: Report, output: Path, as_json: bool) -> None:

@@ -52,6 +52,20 @@ class CommandLimits:
                 )
         self._sent.append((first_step, u))
 
+    def begin_anew(self) -> None:
+        """What was sent is forgotten, and the mirror holds its safe input."""
+        self._sent.clear()
+
+    def approach(self, first_step: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Inputs (n_steps, n_inputs), or what comes as near to them as the limit of their change allows."""
+        if not self._slew:
+            return u
+        near, before, most = np.array(u), self._sent_before(first_step), self._most_change / (1 + 1e-9)
+        for row in near:
+            row[:] = before + np.clip(row - before, -most, most)
+            before = row
+        return near
+
     def _sent_before(self, step: int) -> NDArray[np.float64]:
         """The input that was sent last for the newest step before this one."""
         best, row = -1, self._park

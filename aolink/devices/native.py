@@ -230,6 +230,8 @@ class NativeMirror(_NativeDevice):
         self.queue_end_step = 0
         self.latched = identity.mirror.latched
         self.outage_s = 0.0
+        self._approaching = False
+        """Whether the mirror is on its way from the safe input, where it had returned, to what is commanded."""
         self._watchdog_s = identity.mirror.watchdog_s
         self._full_s = (
             identity.mirror.queue_steps * identity.fast_step_ns / 1e9 + _PATIENCE_WATCHDOGS * self._watchdog_s
@@ -274,6 +276,9 @@ class NativeMirror(_NativeDevice):
         return len(self._flights)
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
+        if self._approaching:
+            wanted, u = u, self._gate.limits.approach(first_step, u)
+            self._approaching = not np.array_equal(u[-1], wanted[-1])
         self._gate.limits.check(first_step, u)
         block = pb.CommandBlock(
             block_id=next(self._block_ids),
@@ -363,6 +368,8 @@ class NativeMirror(_NativeDevice):
 
     def _begin_anew(self, now_ns: int) -> None:
         self.withdraw(0)
+        self._gate.limits.begin_anew()
+        self._approaching = True
         self._reports.ask_anew(now_ns)
         self.latched, self.outage_s, self._answered_ns = self.identity.mirror.latched, 0.0, None
 

@@ -42,6 +42,19 @@ _ASIDE_S = 2.0
 """In real time: how long the end of a session waits for the function that watches it."""
 
 
+def controller(rig: Rig, control: str, estimators: Sequence[str], *, force: bool) -> tuple[Controlling, dict[str, str]]:
+    """The controller of a session, and what its recording says of it. Raises ControlError, as `record`."""
+    controlling = Controlling(rig, control, estimators)
+    found = stability(rig, control) if force else check_stable(rig, control)
+    return controlling, facts(rig, controlling, found.text())
+
+
+def at_rest(rig: Rig) -> Rig:
+    """A rig whose drive holds the safe input."""
+    rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
+    return replace(rig, drive=rest)
+
+
 def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
     """The scene at rest as an attachment, if the camera is simulated from this rig file and shows it."""
     if rig.scene is None or not rig.scene.picture or camera.rig_digest != rig.digest:
@@ -138,16 +151,13 @@ def record(
     """
     estimators = list(dict.fromkeys(estimators))
     driver = Driver(rig, estimators)
-    controlling, of_control = None, {}
+    controlling, of_control = None, dict[str, str]()
     if control:
         if calibration or inputs is not None:
             raise ControlError("a controller gives the inputs itself: leave out the calibration, or the inputs")
-        controlling = Controlling(rig, control, estimators)
-        found = stability(rig, control) if force else check_stable(rig, control)
-        of_control = facts(rig, controlling, found.text())
+        controlling, of_control = controller(rig, control, estimators, force=force)
     if calibration:
-        rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
-        rig = replace(rig, drive=rest)
+        rig = at_rest(rig)
     report = report or Report()
     with (
         open_devices(rig, camera_port, mirror_port, stop, reconnect_s) as (clock, camera, mirror, warnings),

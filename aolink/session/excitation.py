@@ -80,10 +80,22 @@ def excitation(texts: Sequence[str], rig: Rig) -> Excitation:
     RecordingError
         The file is a recording that cannot be read.
     """
-    tried, limits = _made(texts, rig), CommandLimits(rig)
-    for first in range(0, min(tried.repeat_steps, _MOST_CHECKED), _CHECKED):
-        limits.check(first, tried(first, _CHECKED))
+    tried = _made(texts, rig)
+    check_inputs(rig, tried, tried.repeat_steps)
     return _made(texts, rig)  # a recording's commands can be read once
+
+
+def check_inputs(rig: Rig, inputs: Callable[[int, int], FloatArray], n_steps: int) -> None:
+    """Compare the first ``n_steps`` steps of a session with the mirror's limits, a million of them at most.
+
+    Raises
+    ------
+    DeviceError
+        An input is beyond the mirror's limits, or changes faster than ``mirror.slew_max_per_s``.
+    """
+    limits = CommandLimits(rig)
+    for first in range(0, min(n_steps, _MOST_CHECKED), _CHECKED):
+        limits.check(first, inputs(first, min(_CHECKED, n_steps - first)))
 
 
 def _made(texts: Sequence[str], rig: Rig) -> Excitation:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from google.protobuf.message import Message
 
@@ -125,3 +126,35 @@ def test_both_ports_vanish_and_return_on_tcp(tmp_path: Path) -> None:
     check_whole(path, report, 12)
     assert (report.ports_vanished, report.rearmed) == (2, 1)
     assert report.frames_lost > 2
+
+
+def test_with_a_slew_limit_the_mirror_goes_slowly_from_the_safe_input_to_what_is_commanded(tmp_path: Path) -> None:
+    path, slew = tmp_path / "a.mcap", 0.05
+    (tmp_path / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {slew}"))
+    rig = load_rig(tmp_path / "rig.toml")
+
+    def inputs(first_step: int, n_steps: int) -> np.ndarray:
+        """A ramp to 0.01, and there it stays."""
+        return np.asarray(np.minimum(np.arange(first_step, first_step + n_steps) * 4e-5, 0.01)[:, None])
+
+    with (
+        simulated_rig(tmp_path / "rig.toml", "--real-time") as (camera, mirror),
+        pulled_line(mirror, tmp_path / "mirror", once_latched) as line,
+    ):
+        report = record(
+            rig, camera, line.port, path, estimators=["o3"], exposures=11, inputs=inputs, reconnect_s=20,
+            progress=pulling(line, after=3),
+        )  # fmt: skip
+        closed = record(
+            rig, camera, line.port, tmp_path / "b.mcap", exposures=9, control="integrator", reconnect_s=20,
+            progress=pulling(line, after=3),
+        )  # fmt: skip
+    check_whole(path, report, 11)
+    assert (report.ports_vanished, closed.ports_vanished, closed.ended) == (1, 1, "complete")
+    sent = messages_of(pb.CommandBlock, Recording(path), topics.COMMAND)
+    steps = np.array([(each.first_step + k, u) for each in sent for k, u in enumerate(each.u)])
+    jump = int(np.argmax(np.diff(steps[:, 0])))
+    after = steps[jump + 1 :, 1]
+    assert 0 < after[0] <= 1.001 * slew * rig.timing.fast_step_s
+    assert np.abs(np.diff(after)).max() <= 1.001 * slew * rig.timing.fast_step_s
+    assert after[-1] == 0.01

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import pty
+import re
 import socket
 import subprocess
+import threading
+import tty
 from collections.abc import Callable
 
-from aolink.errors import PortError
+from aolink.errors import DeviceError, PortError
 from aolink.jobs.demo import simulated_rig
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import encode_message
@@ -35,6 +40,28 @@ def test_other_machines_are_served_on_request_only(aolink: Run) -> None:
     assert result.returncode == 3
     assert "--listen 0.0.0.0:0 lets other machines move the mirror" in result.stderr
     assert "--allow-remote" in result.stderr
+
+
+def test_a_device_that_trickles_is_given_up(aolink: Run) -> None:
+    """It sends a byte now and then, never a packet; the host asks three times."""
+    over = threading.Event()
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+
+    def trickle() -> None:
+        while not over.wait(0.02):
+            os.write(master, b"a")
+
+    thread = threading.Thread(target=trickle)
+    thread.start()
+    found = aolink("devices", os.ttyname(slave))
+    over.set()
+    thread.join()
+    os.close(master)
+    os.close(slave)
+    assert found.returncode == DeviceError.exit_code
+    assert re.search(r"no device answers on the .* port \(\d+ bytes came that are not aolink packets\)", found.stderr)
+    assert found.stderr.count("\n") == 1
 
 
 def test_the_second_host_of_a_port_is_told_so(aolink: Run) -> None:

@@ -104,7 +104,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(
-    "room", ["estimation", "optics", "wire", "recording", "batches", "restoration", "moving_scene"]
+    "room", ["estimation", "optics", "wire", "parking", "recording", "batches", "restoration", "moving_scene"]
 )
 def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))

@@ -10,6 +10,7 @@ ROWS = {
         "turbulence", "zonal_wavefront",
     ),
     "wire": ("link_throughput", "frame_to_command", "commands_at_1_khz", "slow_estimator"),
+    "parking": ("time_to_park",),
     "recording": (
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes",
