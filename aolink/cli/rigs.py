@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
     from aolink.recording.reader import Recording
     from aolink.rig import Rig
     from aolink.session import Report
+    from aolink.session.dry_run import DryRun
     from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
@@ -147,13 +149,18 @@ def rig(
 
     if key and unsigned:
         raise typer.BadParameter("give --key or --unsigned, not both")
-    streams = open_streams(listen, key=read_key(key) if key else None, allow_remote=allow_remote, unsigned=unsigned)
-    if allow_remote:
-        warn(
-            "other machines can reach this rig: it obeys those that have the key, and what it sends can be read by all"
-            if key else "other machines can reach this rig, and everybody there can move the mirror"
-        )  # fmt: skip
-    with StopRequest().installed() as stop:
+    with StopRequest().installed() as stop, ExitStack() as stack:
+        links = None
+        if loaded.simulation.faults.vanish_rate:
+            links = Path(stack.enter_context(TemporaryDirectory(prefix="aolink-rig-")))
+        streams = open_streams(
+            listen, key=read_key(key) if key else None, allow_remote=allow_remote, unsigned=unsigned, links=links
+        )
+        if allow_remote:
+            warn(
+                "other machines can reach this rig: it obeys those that have the key, and what it sends can be read by"
+                " all" if key else "other machines can reach this rig, and everybody there can move the mirror"
+            )  # fmt: skip
         server = RigServer(loaded, streams, seed=seed, real_time=real_time)
         ports = {line: stream.name for line, stream in streams.items()}
         if as_json:
@@ -301,6 +308,22 @@ def record(
     view: Annotated[
         bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
     ] = False,
+    inputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--input",
+            metavar="KIND:NAME=VALUE,...|FILE",
+            help="Play this, not the rig's drive: sine:amplitude=0.2,frequency=5; chirp:amplitude=0.2,from=1,to=40;"
+            " prbs:amplitude=0.2,to=40,seed=3; step:amplitude=0.2,at=1; column=0 for one input only;"
+            " or inputs from a .csv, .npy, .npz or .mcap file.",
+        ),
+    ] = None,
+    reconnect: Annotated[
+        float,
+        typer.Option(
+            min=0, metavar="S", help="Wait so long for a native device's port that vanishes, and go on with it."
+        ),
+    ] = 0.0,
     split_mib: Annotated[
         float, typer.Option(min=0, max=2**30, metavar="MIB", help="Begin another file at this size; 0 for one file.")
     ] = 0.0,
@@ -313,6 +336,9 @@ def record(
         float, typer.Option(metavar="S", help="Write a chunk to the file at this age; a kill loses at most twice this.")
     ] = 0.1,
     fsync_s: Annotated[float, typer.Option(metavar="S", help="How often the file is synchronised to the disk.")] = 1.0,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, with the devices, but send the mirror no input.")
+    ] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -342,7 +368,27 @@ def record(
     if key:
         loaded = signed(loaded, camera, mirror, key)
         camera = mirror = None  # they are in its table now
+    played = None
+    if inputs:
+        from aolink.session.excitation import excitation
+
+        if control or calibration:
+            raise typer.BadParameter("--input is not for --control or --calibration, which give the inputs themselves")
+        played = excitation(inputs, loaded)
+        exposures = exposures or played.exposures or None
     get_ready(loaded, estimator or [])
+    if dry_run:
+        from aolink.session.dry_run import dry_run as checked
+
+        with StopRequest().installed() as stop:
+            found = checked(
+                loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0,
+                calibration=calibration or "", inputs=played, control=control or "", force=force,
+                overwrite=overwrite, stop=stop,
+            )  # fmt: skip
+        stop.raise_if_asked()
+        _print_dry_run(found, as_json)
+        return
     report = session.Report()
 
     def told(done: int) -> None:
@@ -354,14 +400,27 @@ def record(
         with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
             session.record(
                 loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
-                calibration=calibration or "", control=control or "", force=force,
+                calibration=calibration or "", inputs=played, control=control or "", force=force,
                 watch=live.show if live else None, overwrite=overwrite,
-                options=options, stop=stop, progress=told, report=report,
+                options=options, reconnect_s=reconnect, stop=stop, progress=told, report=report,
             )  # fmt: skip
         _print_session(report, output, as_json)
     stop.raise_if_asked()
     if any(each.failed for each in report.estimation.values()):
         raise typer.Exit(EstimatorError.exit_code)
+
+
+def _print_dry_run(found: DryRun, as_json: bool) -> None:
+    for warning in found.warnings:
+        warn(warning)
+    if as_json:
+        print(json.dumps(found.facts | {"warnings": found.warnings}))
+        return
+    for name, text in found.facts.items():
+        stdout.print(f"{name:<12}{text}", markup=False)
+    stdout.print(
+        "dry run: all of this is good; no input was sent to the mirror, and nothing was recorded", markup=False
+    )
 
 
 def _print_session(report: Report, output: Path, as_json: bool) -> None:

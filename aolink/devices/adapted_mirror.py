@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from aolink.devices.adapted import Adapted
 from aolink.devices.drivers import calling
-from aolink.devices.gate import CommandLimits, converter_margin, printable
+from aolink.devices.gate import converter_margin, printable
 from aolink.devices.interfaces import CommandAnswered, Event, Lacks
+from aolink.devices.limits import CommandLimits
 from aolink.devices.simple import Held, SimpleMirror
 from aolink.errors import AolinkError, DeviceError
 from aolink.rig import Rig

@@ -10,7 +10,6 @@ reports from before the session: these are no error, but dropped or counted.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
@@ -18,6 +17,7 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame
+from aolink.devices.limits import CommandLimits
 from aolink.errors import DeviceError
 from aolink.rig import MirrorDriver, Rig
 from aolink.wire import messages_pb2 as pb
@@ -36,8 +36,6 @@ _DELAY_S = 1.0
 """On virtual time, how long a packet may take beyond four times the rig file's latency: a rig may inject stalls."""
 _LONGEST_TEXT = 1000
 _REMEMBERED_BLOCKS = 65_536
-_REMEMBERED_INPUTS = 64
-"""Blocks among which the one is found that a later block, sent anew, goes on from."""
 _KINDS: dict[str, tuple[type[Message], ...]] = {
     "camera": (pb.FrameChunk, pb.TruthChunk, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
     "mirror": (pb.Applied, pb.CommandAck, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
@@ -63,56 +61,6 @@ def converter_margin(mirror: MirrorDriver) -> NDArray[np.float64]:
     low, high = mirror.voltage.input_range if mirror.voltage else (mirror.input_min, mirror.input_max)
     converter = (np.asarray(high) - low) / ((1 << mirror.dac_bits) - 1) if mirror.dac_bits else 0.0
     return converter + 1e-6 * (mirror.input_max - mirror.input_min)  # single precision will do
-
-
-class CommandLimits:
-    """The limits of a mirror's inputs and of their change from step to step; what is beyond them is not sent."""
-
-    def __init__(self, rig: Rig) -> None:
-        self._min, self._max, self._slew = rig.mirror.input_min, rig.mirror.input_max, rig.mirror.slew_max_per_s
-        self._most_change = self._slew * rig.timing.fast_step_s * (1 + 1e-9)
-        self._sent: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=_REMEMBERED_INPUTS)
-        """First fast steps and inputs of the newest blocks that were sent."""
-        self._park = rig.mirror.park
-
-    def check(self, first_step: int, u: NDArray[np.float64]) -> None:
-        """Check inputs (n_steps, n_inputs) for the fast steps from ``first_step``, then take them as sent.
-
-        The change to their first step counts from the input that was sent last for a step before it, at first from the
-        safe input. Raises DeviceError.
-        """
-        if u.ndim != 2 or u.shape[1] != len(self._min):
-            raise DeviceError(
-                f"a command of shape {u.shape} for a mirror of {len(self._min)} inputs: give (steps, inputs)"
-            )
-        inside = (u >= self._min) & (u <= self._max)
-        if not inside.all():  # NaN fails as well
-            step, channel = np.argwhere(~inside)[0]
-            raise DeviceError(
-                f"input {channel} at fast step {first_step + step} is {u[step, channel]:g}, beyond the mirror's limits"
-                f" {self._min[channel]:g} .. {self._max[channel]:g}: it was not sent"
-            )
-        if self._slew:
-            change = np.abs(np.diff(u, axis=0, prepend=self._sent_before(first_step)[None]))
-            if (change > self._most_change).any():
-                step, channel = np.argwhere(change > self._most_change)[0]
-                raise DeviceError(
-                    f"input {channel} changes by {change[step, channel]:g} to fast step {first_step + step}, more than"
-                    f" mirror.slew_max_per_s = {self._slew:g} allows in a fast step ({self._most_change:g}): it was"
-                    " not sent"
-                )
-        self._sent.append((first_step, u))
-
-    def _sent_before(self, step: int) -> NDArray[np.float64]:
-        """The input that was sent last for the newest step before this one."""
-        best, row = -1, self._park
-        for first, u in reversed(self._sent):
-            newest = min(step, first + len(u)) - 1
-            if newest > best and first <= newest:
-                best, row = newest, u[newest - first]
-            if best == step - 1:
-                break
-        return row
 
 
 class Gate:

@@ -25,11 +25,20 @@ class Host(Hub):
         self.polled: list[AdaptedCamera | AdaptedMirror | NoMirror] = []
         """The devices of simple drivers."""
 
+    def close(self) -> None:
+        for device in self.native:
+            device.port.give_up()
+        super().close()
+
     def events(self, timeout_s: float) -> Iterator[Happened]:
         behind = {device.link: device for device in self.native}
-        for link, received in self.wait(min(timeout_s, _POLL_S) if self.polled else timeout_s):
+        often = self.polled or any(device.port.away for device in self.native)
+        for link, received in self.wait(min(timeout_s, _POLL_S) if often else timeout_s):
             device = behind[link]
             yield Happened(device, device.handle(received), received.receive_ns)
+        for device in self.native:
+            if came := device.watch_port(now_ns := self.now_ns()):
+                yield Happened(device, came, now_ns)
         for polled in self.polled:
             events = polled.poll()
             yield Happened(polled, events, self.now_ns())

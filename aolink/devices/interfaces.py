@@ -44,7 +44,22 @@ class CommandAnswered:
     block: pb.CommandBlock
 
 
-Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswered
+@dataclass(frozen=True, slots=True)
+class Vanished:
+    """The port of a device is gone, and may return: until then the device is sent nothing, and nothing comes."""
+
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Returned:
+    """The same device is there again. It has stopped or parked, and its clock is to be asked before it goes on."""
+
+    away_s: float
+    """From when the port was found gone to the device's answer."""
+
+
+Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswered | Vanished | Returned
 """What a device may report. Texts in it can be printed."""
 
 

@@ -9,15 +9,16 @@ from itertools import count
 from typing import Any
 
 import numpy as np
-from google.protobuf.message import DecodeError
+from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
 from aolink.assembly import Frame, PlanesReassembly, TruthReassembly
 from aolink.devices.clock import ClockExchange, ClockRegression, StepClock
-from aolink.devices.gate import Gate, lie, printable
+from aolink.devices.gate import MOST_RATE_ERROR, Gate, lie, printable
 from aolink.devices.interfaces import ClockSampled, CommandAnswered, Event, Lacks
+from aolink.devices.port_watch import PortWatch
 from aolink.devices.reports import AppliedReports
-from aolink.errors import DeviceError
+from aolink.errors import DeviceError, PortError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.hub import ANSWER_S, TRIES, Hub
 from aolink.wire.link import Link, Received
@@ -47,6 +48,7 @@ class _NativeDevice:
         self.lacks: tuple[Lacks, ...] = ()
         self.name = link.name
         self.description = f"{identity.model} {identity.serial_number} ({identity.firmware})"
+        self.port = PortWatch(link, identity)
         self._gate = gate
         self.clock = ClockRegression()
         self.steps = StepClock(self.clock, identity.step_zero_ns, identity.fast_step_ns)
@@ -70,6 +72,33 @@ class _NativeDevice:
         while len(self._queries) > _MAX_QUERIES:  # answers that never came
             del self._queries[next(iter(self._queries))]
         self.link.send(pb.ClockQuery(query_id=query_id, host_send_ns=now_ns))
+
+    def watch_port(self, now_ns: int) -> list[Event]:
+        """Open the port again where it has vanished, and ask who is there. Raises PortError once that took too long."""
+        events = self.port.poll(now_ns)
+        return [*self._broken_off(), *events] if events else []
+
+    def _broken_off(self) -> list[Frame]:
+        """What of a frame had come when the port vanished."""
+        return []
+
+    def _come_back(self, message: Message, now_ns: int) -> list[Event]:
+        """Go on with the device that answers on a port that was gone. Raises DeviceError for another one."""
+        if not isinstance(message, pb.Identity):  # of the session before the port vanished
+            return []
+        now_step = self.since_zero_ns(now_ns) // self.identity.fast_step_ns if self.clock.ready else 0
+        returned = self.port.take(message, now_step, now_ns)
+        if returned is None:
+            return []
+        self.identity = message
+        self._queries.clear()
+        self.steps = StepClock(self.clock, message.step_zero_ns, message.fast_step_ns)
+        self.clock.suspect(MOST_RATE_ERROR * (ANSWER_S + returned.away_s) * 1e9, now_ns)  # until it has been asked
+        self._begin_anew(now_ns)
+        return [returned]
+
+    def _begin_anew(self, now_ns: int) -> None:
+        """The device has forgotten what it was sent."""
 
     def _sample_clock(self, reply: pb.ClockReply, receive_ns: int, *, usable: bool = True) -> list[Event]:
         sent_ns = self._queries.pop(reply.query_id, None)
@@ -131,8 +160,13 @@ class NativeCamera(_NativeDevice):
     def chunks_refused(self) -> int:
         return self._frames.refused
 
+    def _broken_off(self) -> list[Frame]:
+        return self._frames.flush()
+
     def handle(self, received: Received) -> list[Event]:
         message = received.message
+        if self.port.away:
+            return self._come_back(message, received.receive_ns)
         if not self._gate.passes(self.link, message, received.receive_ns):
             return []
         if isinstance(message, pb.FrameChunk):
@@ -196,6 +230,8 @@ class NativeMirror(_NativeDevice):
         self.queue_end_step = 0
         self.latched = identity.mirror.latched
         self.outage_s = 0.0
+        self._approaching = False
+        """Whether the mirror is on its way from the safe input, where it had returned, to what is commanded."""
         self._watchdog_s = identity.mirror.watchdog_s
         self._full_s = (
             identity.mirror.queue_steps * identity.fast_step_ns / 1e9 + _PATIENCE_WATCHDOGS * self._watchdog_s
@@ -240,6 +276,9 @@ class NativeMirror(_NativeDevice):
         return len(self._flights)
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
+        if self._approaching:
+            wanted, u = u, self._gate.limits.approach(first_step, u)
+            self._approaching = not np.array_equal(u[-1], wanted[-1])
         self._gate.limits.check(first_step, u)
         block = pb.CommandBlock(
             block_id=next(self._block_ids),
@@ -290,11 +329,15 @@ class NativeMirror(_NativeDevice):
                 continue
             silent_s = (now_ns - flight.heard_ns) / 1e9
             if silent_s > _PATIENCE_WATCHDOGS * self._watchdog_s and flight.timeouts >= _LEAST_TRIES:
-                raise DeviceError(
+                gone = (
                     f"the mirror has not acknowledged a command for {silent_s:.1f} s, more than twice its watchdog,"
                     f" though it was sent {len(flight.tries)} times: is it still connected?"
                     " (a mirror that hears nothing parks itself)"
                 )
+                if self.link.reopen is None:
+                    raise DeviceError(gone)
+                self.link.lose(PortError(gone))
+                return []
             flight.timeouts += 1
             if self.link.transport.unsent():  # on a slow line the try before has not even left
                 flight.last_ns = now_ns
@@ -323,8 +366,17 @@ class NativeMirror(_NativeDevice):
         """How long to wait for an answer, s: the tries together take the watchdog's time. Then it parks by itself."""
         return min(ANSWER_S, max(self._watchdog_s / TRIES, self._timeout_ns() / 1e9))
 
+    def _begin_anew(self, now_ns: int) -> None:
+        self.withdraw(0)
+        self._gate.limits.begin_anew()
+        self._approaching = True
+        self._reports.ask_anew(now_ns)
+        self.latched, self.outage_s, self._answered_ns = self.identity.mirror.latched, 0.0, None
+
     def handle(self, received: Received) -> list[Event]:
         message = received.message
+        if self.port.away:
+            return self._come_back(message, received.receive_ns)
         if not self._gate.passes(self.link, message, received.receive_ns):
             return []
         if isinstance(message, pb.CommandAck):

@@ -7,6 +7,7 @@ import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,11 @@ from aolink.wire.signing import read_key
 
 @contextmanager
 def open_devices(
-    rig: Rig, camera_port: str | None = None, mirror_port: str | None = None, stop: Callable[[], bool] = lambda: False
+    rig: Rig,
+    camera_port: str | None = None,
+    mirror_port: str | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    reconnect_s: float = 0.0,
 ) -> Iterator[Opened]:
     """Open both devices, ask who they are, and check that against the rig file.
 
@@ -42,6 +47,8 @@ def open_devices(
         Where that names no mirror, the camera is opened alone.
     stop:
         Once it gives True, no device is waited for longer than for one answer.
+    reconnect_s:
+        How long to wait for the port of a native device that has vanished, s; with 0 that is an error at once.
 
     Raises
     ------
@@ -74,6 +81,8 @@ def open_devices(
             {kind: _port_and_key(kind, table, rig) for kind, table in tables.items() if table.driver == NATIVE},
             stop,
         )
+        if reconnect_s:
+            _allow_return(host, stop, reconnect_s)
         mirror: Mirror
         if native_mirror is not None:
             mirror = native_mirror
@@ -206,6 +215,19 @@ def _open_native(
     for link in host.links:
         link.reset_counts()
     return camera, mirror, warnings
+
+
+def _allow_return(host: Host, stop: Callable[[], bool], within_s: float) -> None:
+    """Wait for native devices whose port vanishes. Raises DeviceError where there is none that can return."""
+    if host.virtual or not host.native:
+        why = "this rig runs on virtual time" if host.virtual else "the devices here have drivers of their own"
+        raise DeviceError(
+            f"only a port of aolink's own packets is opened again, in real time ({why}): do not reconnect"
+        )
+    for device in host.native:
+        transport = device.link.transport
+        assert isinstance(transport, SerialPort)
+        device.port.allow(partial(SerialPort, transport.url, stop=stop), within_s)
 
 
 def _check_whole(kind: Kind, table: DeviceTable, driver: Any, protocol: type) -> None:

@@ -86,6 +86,10 @@ class AppliedReports:
         self._next = end
         return [pb.Applied(first_step=gap.first, n_steps=end - gap.first, source=pb.Applied.AWAITED)]
 
+    def ask_anew(self, now_ns: int) -> None:
+        """Ask for all that is missing as if it were missing since now: the device could not be asked before."""
+        self._gaps = [_Gap(gap.first, gap.end, now_ns) for gap in self._gaps]
+
     def next_due_ns(self, interval_ns: int) -> int | None:
         """Host time at which `ask` has something to do, with ``interval_ns`` between two tries; None if never."""
         return min((_due_ns(gap, interval_ns) for gap in self._gaps), default=None)

@@ -327,5 +327,8 @@ def _shifted_gamma(e: FloatArray, variance: FloatArray, third: FloatArray, read:
     density = (mass * bell / width).sum(axis=-1) / math.sqrt(2 * math.pi)
     # Far outside it falls off as a Gaussian of the whole variance does, not to nothing.
     whole = 1 + read / variance
-    rare = _RARE * np.exp(-0.5 * (e / sd) ** 2 / (_WIDE**2 * whole)) / np.sqrt(2 * math.pi * _WIDE**2 * whole)
-    return np.asarray(np.log((1 - _RARE) * density + rare) - np.log(sd))
+    apart, size = -0.5 * (e / sd) ** 2 / (_WIDE**2 * whole), np.sqrt(2 * math.pi * _WIDE**2 * whole)
+    both = (1 - _RARE) * density + _RARE * np.exp(apart) / size
+    # What is smaller than any double has a logarithm all the same.
+    logarithm = np.where(both > 0, np.log(np.where(both > 0, both, 1.0)), np.log(_RARE / size) + apart)
+    return np.asarray(logarithm - np.log(sd))

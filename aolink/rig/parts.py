@@ -220,6 +220,10 @@ class Faults:
     """By how much the device's clock is set forward, s; negative: back. Its fast steps go on."""
     clock_step_at_s: float = 1.0
     """When, s after the rig has begun."""
+    vanish_rate: float = 0.0
+    """The port vanishes with a packet, one way or the other, and returns after ``vanish_s``; in real time only."""
+    vanish_s: float = 1.0
+    """How long it is gone, s."""
     late_rate: float = 0.0
     """A command block is taken only when half of its steps have gone by."""
     chunk_loss_rate: float = 0.0
@@ -237,6 +241,7 @@ FAULT_NAMES = {
     "inserted": "byte_insert_rate",
     "burst": "burst_rate",
     "stall": "stall_rate",
+    "vanish": "vanish_rate",
     "late": "late_rate",
     "missing": "chunk_loss_rate",
     "saturated": "saturation_rate",

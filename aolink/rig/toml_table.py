@@ -33,7 +33,7 @@ watchdog_s wavelength_m when_lost wind_m_s window zernike_m
 _FAULTS = """
 bit_error_rate bit_flip_rate burst_rate byte_insert_rate byte_loss_rate byte_repeat_rate chunk_loss_rate
 clock_step_at_s clock_step_s command_loss_rate dark_rate delay_to_device_s delay_to_host_s duplicate_rate jitter_s
-late_rate packet_loss_rate saturation_rate stall_rate stall_s
+late_rate packet_loss_rate saturation_rate stall_rate stall_s vanish_rate vanish_s
 """
 KEYS = frozenset(_KEYS.split() + _FAULTS.split())
 """Every key of every table of a rig file, kept by hand; a test compares it with the keys that the readers ask for.

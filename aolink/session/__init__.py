@@ -26,6 +26,7 @@ from aolink.rig import Drive, Rig
 from aolink.rig.scene_table import read_scene_picture
 from aolink.session.controlling import Controlling, facts
 from aolink.session.estimating import BesideTheLoop, Outcome
+from aolink.session.excitation import Excitation
 from aolink.session.loop import ESTIMATES_S, Inputs, SessionLoop, Show
 from aolink.session.report import EstimatorReport, Report
 from aolink.session.waiting import Aside, most_waiting
@@ -39,6 +40,19 @@ _PROGRESS_S = 0.1
 """In real time: how often the progress is reported."""
 _ASIDE_S = 2.0
 """In real time: how long the end of a session waits for the function that watches it."""
+
+
+def controller(rig: Rig, control: str, estimators: Sequence[str], *, force: bool) -> tuple[Controlling, dict[str, str]]:
+    """The controller of a session, and what its recording says of it. Raises ControlError, as `record`."""
+    controlling = Controlling(rig, control, estimators)
+    found = stability(rig, control) if force else check_stable(rig, control)
+    return controlling, facts(rig, controlling, found.text())
+
+
+def at_rest(rig: Rig) -> Rig:
+    """A rig whose drive holds the safe input."""
+    rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
+    return replace(rig, drive=rest)
 
 
 def _true_scene(rig: Rig, camera: Camera) -> dict[str, bytes]:
@@ -75,6 +89,7 @@ def record(
     watch: Watch | None = None,
     overwrite: bool = False,
     options: WriteOptions | None = None,
+    reconnect_s: float = 0.0,
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
     report: Report | None = None,
@@ -104,7 +119,8 @@ def record(
         mirror then holds its parked input, whatever the rig's drive.
     inputs:
         Function that gives the inputs to command, instead of the rig's drive. The loop calls it, and sends the next
-        commands when it returns.
+        commands when it returns. The recording's metadata (``input``) have the text of an
+        `aolink.session.excitation.Excitation`.
     control:
         Name of the controller that closes the loop, one of `aolink.control.controller_names`: it gives the inputs,
         instead of the rig's drive. The first of the estimators serves it. On virtual time an exposure changes the
@@ -117,6 +133,10 @@ def record(
         exposures that come meanwhile are left out and counted, and what it raises becomes a warning.
     options:
         How the recording is cut into chunks and files.
+    reconnect_s:
+        How long to wait for the port of a native device that vanishes, s. The session goes on with the device that
+        returns if it is the same one and has not been restarted; exposures and inputs that are missing are counted.
+        With 0 a port that vanishes ends the session.
     stop, progress:
         Called at least ten times a second: ``stop()`` says whether the session is to end, ``progress(exposures)`` is
         given the number of exposures so far. In real time the latter is called on a thread of its own.
@@ -131,19 +151,16 @@ def record(
     """
     estimators = list(dict.fromkeys(estimators))
     driver = Driver(rig, estimators)
-    controlling, of_control = None, {}
+    controlling, of_control = None, dict[str, str]()
     if control:
         if calibration or inputs is not None:
             raise ControlError("a controller gives the inputs itself: leave out the calibration, or the inputs")
-        controlling = Controlling(rig, control, estimators)
-        found = stability(rig, control) if force else check_stable(rig, control)
-        of_control = facts(rig, controlling, found.text())
+        controlling, of_control = controller(rig, control, estimators, force=force)
     if calibration:
-        rest = Drive(kind="none", amplitude=np.zeros(rig.n_inputs), period_s=1.0, offset=rig.mirror.park)
-        rig = replace(rig, drive=rest)
+        rig = at_rest(rig)
     report = report or Report()
     with (
-        open_devices(rig, camera_port, mirror_port, stop) as (clock, camera, mirror, warnings),
+        open_devices(rig, camera_port, mirror_port, stop, reconnect_s) as (clock, camera, mirror, warnings),
         contextlib.ExitStack() as aside,
     ):
         if control and not mirror.commanded:
@@ -162,6 +179,8 @@ def record(
             "estimators": " ".join(estimators),
             "note": note,
         } | of_control
+        if isinstance(inputs, Excitation):
+            session_facts["input"] = inputs.text
         if calibration:
             session_facts[topics.CALIBRATION] = calibration
         attachments = _true_scene(rig, camera)

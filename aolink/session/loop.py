@@ -18,8 +18,18 @@ from numpy.typing import NDArray
 
 from aolink.assembly import Assembler, Frame
 from aolink.devices.clock import QUERY_PERIOD_S, SUSPICION_PERIOD_S, WARM_UP_QUERIES
-from aolink.devices.interfaces import Camera, ClockSampled, CommandAnswered, Device, Event, Mirror, Time
-from aolink.errors import DeviceError
+from aolink.devices.interfaces import (
+    Camera,
+    ClockSampled,
+    CommandAnswered,
+    Device,
+    Event,
+    Mirror,
+    Returned,
+    Time,
+    Vanished,
+)
+from aolink.errors import DeviceError, PortError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure, Picture
 from aolink.recording import convert, topics
@@ -121,6 +131,14 @@ class SessionLoop:
         self._is_safe = False
         self._parked_from: int | None = None
         """First fast step of the safe state that `make_safe` asked for."""
+        self._absent: list[Device] = []
+        """Devices whose port has vanished, until the session goes on with them."""
+        self._returned: list[Device] = []
+        """Those of them that have been identified again; their clocks are being asked."""
+        self._newest_steps: dict[int, int] = {}
+        """First fast step of the newest frame, by its plane."""
+        self._restarted: set[int] = set()
+        """Planes of which no frame has come since the camera was started again."""
         self._account = Account(self.report)
         self._latencies = LatencyBook(self.report, partial(self._record, topics.LATENCY))
 
@@ -134,7 +152,7 @@ class SessionLoop:
         timing, time = self._rig.timing, self._time
         if self._mirror.latched:
             self._rearm("in a session before")
-        self._first_step = self._queued_until = self._start_camera(exposures)
+        self._first_step = self._queued_until = self._start_camera(self._soon, lambda first_step: exposures)
         if self._controlling is not None:
             self._controlling.begin(self._first_step)
         if exposures:
@@ -211,13 +229,16 @@ class SessionLoop:
         suspected = self._camera.clock.suspected or self._mirror.clock.suspected
         return self._last_query_ns + round((SUSPICION_PERIOD_S if suspected else QUERY_PERIOD_S) / 2 * 1e9)
 
-    def _start_camera(self, exposures: int) -> int:
-        """Start the camera; gives the first fast step of the session."""
+    def _soon(self) -> int:
+        """The first fast step of a session that is about to begin."""
+        step = self._mirror.start_step(self._time.now_ns())
+        return step if self._time.virtual else step + round(_START_DELAY_S * 1e9) // self._step_ns
+
+    def _start_camera(self, begin: Callable[[], int], exposures: Callable[[int], int]) -> int:
+        """Start the camera at the fast step ``begin()``, for ``exposures`` from that step on; gives the step."""
         for _ in range(_START_TRIES):
-            first_step = self._mirror.start_step(self._time.now_ns())
-            if not self._time.virtual:
-                first_step += round(_START_DELAY_S * 1e9) // self._step_ns
-            if self._camera.start(first_step, exposures):
+            first_step = begin()
+            if self._camera.start(first_step, exposures(first_step)):
                 return first_step
         raise DeviceError(
             f"the camera was asked {_START_TRIES} times to start {_START_DELAY_S:g} s later, and each time the request"
@@ -233,9 +254,12 @@ class SessionLoop:
     def _send_due(self) -> float:
         """Send what is due; gives the time until something is due again, s."""
         time = self._time
-        if self._mirror.latched:
+        for device in [each for each in self._returned if not each.clock.suspected]:
+            self._go_on_with(device)
+        is_there = self._mirror not in self._absent
+        if self._mirror.latched and is_there:
             self._rearm("in this session")
-        now, due_ns = time.now_ns(), self._mirror.next_due_ns()
+        now, due_ns = time.now_ns(), self._mirror.next_due_ns() if is_there else None
         if due_ns is not None and time.virtual:  # the rig has dealt with everything, so this one was lost
             time.elapse_until(due_ns)
             now = time.now_ns()
@@ -248,15 +272,15 @@ class SessionLoop:
         if now >= self._next_statistics_ns:
             self._record_statistics(now)
             self._next_statistics_ns = now + round(_STATISTICS_PERIOD_S * 1e9)
-        if not (time.virtual and self._mirror.in_flight):
+        if is_there and not (time.virtual and self._mirror.in_flight):
             self._send_commands(self._device_step())
         if time.virtual:
             return 0.0
         due = [self._next_query_ns() - now, self._keep_alive_ns() - now]
-        if self._mirror.commanded and (self._end_step is None or self._queued_until < self._end_step):
+        if is_there and self._mirror.commanded and (self._end_step is None or self._queued_until < self._end_step):
             ahead = self._queued_until - self._device_step() - lead_steps(self._rig.mirror)
             due.append((max(ahead, 0) + 1) * self._step_ns)
-        if (due_ns := self._mirror.next_due_ns()) is not None:
+        if is_there and (due_ns := self._mirror.next_due_ns()) is not None:
             due.append(due_ns - now)
         return max(0, min(due)) / 1e9
 
@@ -277,6 +301,52 @@ class SessionLoop:
         out = f", {outage_s:.2f} s after its last command" if outage_s else ""
         self._log(Log.WARNING, f"the mirror was parked by its watchdog {when}: re-armed at fast step {step}{out}")
         self._queued_until = min(self._queued_until, step)  # what was queued is dropped
+
+    def _vanished(self, device: Device, why: str) -> None:
+        if device not in self._absent:
+            self._absent.append(device)
+        if device in self._returned:
+            self._returned.remove(device)
+        self.report.ports_vanished += 1
+        self._log(Log.WARNING, f"the port of the {device.name} has vanished, and is waited for: {why}")
+
+    def _has_returned(self, device: Device, away_s: float) -> None:
+        self._returned.append(device)
+        self.report.away_s += away_s
+        self._log(Log.WARNING, f"the {device.name} has returned {away_s:.2f} s after its port had vanished")
+
+    def _go_on_with(self, device: Device) -> None:
+        """Go on with a device that has returned: it was stopped or parked when it was asked who it is."""
+        self._returned.remove(device)
+        self._absent.remove(device)
+        try:
+            if device is self._camera:
+                self._go_on_with_camera()
+            else:
+                if self._mirror.latched:
+                    self._rearm("while its port was gone")
+                self._queued_until = max(self._first_step, self._device_step() + self._rig.mirror.block_steps)
+                self._log(Log.INFO, f"commands to the mirror go on from fast step {self._queued_until}")
+        except PortError:
+            self._absent.append(device)  # it has vanished again, and is waited for as before
+
+    def _go_on_with_camera(self) -> None:
+        """Start the camera again with an exposure of those that it would have taken."""
+        timing, first, end = self._rig.timing, self._first_step, self._end_step
+        period = timing.frame_period_steps
+
+        def begin() -> int:
+            soon = self._device_step() + round(_START_DELAY_S * 1e9) // self._step_ns
+            return first + max(0, -(-(soon - first) // period)) * period
+
+        def left(first_step: int) -> int:
+            return 0 if end is None else max(0, (end - timing.exposure_steps - first_step) // period + 1)
+
+        if end is None or left(begin()):
+            step = self._start_camera(begin, left)
+            self._log(Log.INFO, f"the camera goes on with the exposure from fast step {step}")
+        self._restarted = set(self._newest_steps)
+        self._last_frame_ns = self._time.now_ns()
 
     def _send_commands(self, device_step: int) -> None:
         if not self._mirror.commanded:
@@ -305,6 +375,9 @@ class SessionLoop:
         if self._time.virtual:
             return self._end_step is not None and self._queued_until >= self._end_step and not self._mirror.in_flight
         now, timing = self._time.now_ns(), self._rig.timing
+        if self._absent:
+            self._last_frame_ns = now
+            return False
         if self._end_step is not None:
             late_step = self._end_step + _GRACE_S * 1e9 / self._step_ns
             if self.report.exposures >= exposures or self._device_step() > late_step:
@@ -352,6 +425,7 @@ class SessionLoop:
         for event in events:
             if isinstance(event, Frame):
                 if event.first_step >= self._first_step:  # not one of a session before
+                    event = self._count_lost(event)
                     take = self._take_scene if event.plane else self._take_frame
                     take(event, receive_ns)
             elif isinstance(event, wire.Applied):
@@ -362,9 +436,23 @@ class SessionLoop:
                 self._take_clock(device, event)
             elif isinstance(event, CommandAnswered):
                 self._take_answer(event, receive_ns)
+            elif isinstance(event, Vanished):
+                self._vanished(device, event.why)
+            elif isinstance(event, Returned):
+                self._has_returned(device, event.away_s)
             else:
                 level = {wire.Event.INFO: Log.INFO, wire.Event.WARNING: Log.WARNING}.get(event.level, Log.ERROR)
                 self._log(level, f"{device.name}: {event.text}")
+
+    def _count_lost(self, frame: Frame) -> Frame:
+        """Count what a camera that was started again has not taken: it does not number those exposures."""
+        before = self._newest_steps.get(frame.plane)
+        self._newest_steps[frame.plane] = frame.first_step
+        if before is None or frame.plane not in self._restarted:
+            return frame
+        self._restarted.remove(frame.plane)
+        lost = (frame.first_step - before) // self._rig.timing.frame_period_steps - 1
+        return replace(frame, frames_lost_before=max(frame.frames_lost_before, lost))
 
     def _take_frame(self, frame: Frame, receive_ns: int) -> None:
         frame = self._record_picture(frame, topics.EXPOSURE, topics.IMAGE, receive_ns)

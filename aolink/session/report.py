@@ -133,6 +133,10 @@ class Report:
     """How often missing reports of the mirror were asked for again."""
     rearmed: int = 0
     """How often the mirror was parked by its watchdog and re-armed."""
+    ports_vanished: int = 0
+    """How often the port of a device vanished and was waited for."""
+    away_s: float = 0.0
+    """How long ports were gone until their devices had returned, all together, s."""
     clock_offset_ns: float = float("nan")
     clock_frequency_ppm: float = float("nan")
     clock_sigma_ns: float = float("nan")

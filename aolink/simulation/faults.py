@@ -42,6 +42,10 @@ class Way:
             delay_s += self._faults.stall_s
         return round(delay_s * 1e9)
 
+    def vanishes(self) -> bool:
+        """Whether the port vanishes with a packet."""
+        return self.hits(self._faults.vanish_rate)
+
     def hits(self, rate: float) -> bool:
         return rate > 0 and float(self._rng.random()) < rate
 

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from google.protobuf.message import DecodeError, Message
 
+from aolink.errors import RigError
 from aolink.rig import Faults, Rig
 from aolink.simulation.devices import Line, Outgoing, SimulatedDevices
 from aolink.simulation.faults import Way
@@ -61,7 +62,10 @@ class LineEnd:
         # One for each direction: how packets in and packets out take turns is a matter of speed.
         incoming, outgoing = (np.random.default_rng(each) for each in seed.spawn(2))
         self.to_device, self.to_host = Way(faults, incoming, to_host=False), Way(faults, outgoing, to_host=True)
-        self._faulty = faults != Faults()
+        self._faulty, self._vanish_ns = faults != Faults(), round(faults.vanish_s * 1e9)
+        self._vanishes = False
+        self.returns_ns: int | None = None
+        """When a port that has vanished returns; None while it is there."""
         self._decoder = PacketDecoder()
         self._messages = MessageDecoder()
         self._rest = b""
@@ -73,6 +77,8 @@ class LineEnd:
 
     def read(self, now_ns: int, *, real_time: bool) -> None:
         """Take what has come at the port; with the line's delay if time is real."""
+        if self.returns_ns is not None:
+            return
         *whole, self._rest = (self._rest + self.stream.read()).split(DELIMITER)
         pieces = [piece + DELIMITER for piece in whole]
         if len(self._rest) > _MOST_REST:
@@ -98,6 +104,7 @@ class LineEnd:
         """(message, sequence) of what the line makes of the bytes of a packet."""
         if self._faulty and piece != DELIMITER:
             identify = any(packet.type == PacketType.IDENTIFY for packet in PacketDecoder().feed(piece))
+            self._vanishes |= not identify and self.to_device.vanishes()
             piece = DELIMITER + piece if identify else self.to_device.damage(piece)
         packets = self._decoder.feed(piece)
         return [(m, packet.sequence) for packet in packets if (m := self._parse(packet)) is not None]
@@ -115,8 +122,22 @@ class LineEnd:
             if isinstance(message, pb.VirtualTime):
                 packet = DELIMITER + packet  # ends whatever damage is before it
             elif not isinstance(message, pb.Identity) and self._faulty:
+                self._vanishes |= self.to_host.vanishes()
                 packet = self.to_host.damage(packet)
             self._put_off(self._outgoing, due_ns, packet)
+
+    def vanish_and_return(self, now_ns: int) -> None:
+        """Let the port vanish, with all that is on the line, if a packet was hit by that; let it return in time."""
+        if self._vanishes and self.returns_ns is None:
+            self.stream.close()
+            self.returns_ns = now_ns + self._vanish_ns
+        if self.returns_ns is not None:
+            self._rest = b""
+            for held in (self._incoming, self._outgoing, self.unsent):
+                held.clear()
+            if now_ns >= self.returns_ns:
+                self.stream.reopen()
+                self._vanishes, self.returns_ns = False, None
 
     def flush(self, now_ns: int) -> None:
         """Send what the port takes now."""
@@ -134,6 +155,8 @@ class LineEnd:
 
     def due_ns(self) -> float:
         """When the next bytes come out of a slow line, one way or the other."""
+        if self.returns_ns is not None:
+            return self.returns_ns
         return min((way[0][0] for way in (self._incoming, self._outgoing) if way), default=math.inf)
 
     def _put_off(self, way: deque[tuple[int, bytes]], due_ns: int, data: bytes) -> None:
@@ -167,6 +190,8 @@ class RigServer:
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         simulation = rig.simulation
+        if simulation.faults.vanish_rate and not real_time:
+            raise RigError("simulation.faults.vanish_rate: ports vanish in real time only: add --real-time")
         seeds = np.random.SeedSequence(simulation.seed if seed is None else seed).spawn(8)[5:]
         self._lines: dict[Line, LineEnd] = {
             line: LineEnd(line, stream, simulation.faults, seeds[i]) for i, (line, stream) in enumerate(streams.items())
@@ -207,6 +232,7 @@ class RigServer:
             self._watch()
             self._post(self.devices.outbox)
         for line in self._lines.values():
+            line.vanish_and_return(self._host_ns())
             line.flush(self._host_ns())
 
     def idle_s(self) -> float:
@@ -222,7 +248,7 @@ class RigServer:
     def _wait(self) -> None:
         timeout = self.idle_s()
         with selectors.DefaultSelector() as selector:
-            for line in self._lines.values():
+            for line in [each for each in self._lines.values() if each.returns_ns is None]:
                 events = selectors.EVENT_READ | (selectors.EVENT_WRITE if line.unsent else 0)
                 selector.register(line.stream.fileno(), events)
             idle = not selector.select(timeout)

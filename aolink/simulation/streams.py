@@ -16,6 +16,7 @@ import pty
 import socket
 import time
 import tty
+from pathlib import Path
 from typing import Protocol
 
 from google.protobuf.message import DecodeError
@@ -57,18 +58,29 @@ class Stream(Protocol):
     def read(self) -> bytes: ...
     def write(self, data: bytes) -> int: ...
     def close(self) -> None: ...
+    def reopen(self) -> None: ...
 
 
 class PtyStream:
-    """A pseudo terminal, which only this user may open; ``name`` is its path."""
+    """A pseudo terminal, which only this user may open; ``name`` is the path that the host opens.
 
-    def __init__(self, signing: Signing | None = None) -> None:
+    Each time it is opened again it has another path, as a USB device may have. ``link`` is a symbolic link that always
+    leads to it, as udev makes them, and is its name then.
+    """
+
+    def __init__(self, link: Path | None = None, signing: Signing | None = None) -> None:
         self.signing = signing
+        self._link = link
+        self.reopen()
+        self.name = str(link or os.ttyname(self._slave))
+
+    def reopen(self) -> None:
         self._master, self._slave = pty.openpty()  # the slave is kept open: hosts may come and go
         os.fchmod(self._slave, 0o600)  # the group tty may write to it otherwise
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
-        self.name = os.ttyname(self._slave)
+        if self._link is not None:
+            self._link.symlink_to(os.ttyname(self._slave))
 
     def fileno(self) -> int:
         return self._master
@@ -84,6 +96,8 @@ class PtyStream:
         return 0
 
     def close(self) -> None:
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
         os.close(self._master)
         os.close(self._slave)
 
@@ -124,18 +138,24 @@ class TcpStream:
 
     def __init__(self, host: str, port: int, signing: Signing | None = None) -> None:
         self.signing = signing
+        self._host, self._port = host, port
+        self.reopen()
+        self.introduction_s, self.idle_s = INTRODUCTION_S, IDLE_S
+        self._peer: _Peer | None = None
+        self._guests: list[_Peer] = []
+        """Connections that have not identified themselves yet, oldest first."""
+        shown = f"[{host}]" if ":" in host else host
+        self.name = f"socket://{shown}:{self._port}"
+
+    def reopen(self) -> None:
+        host, port = self._host, self._port
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             self._listener = socket.create_server((host, port), family=family)
         except OSError as error:
             raise PortError(f"cannot listen on {host}:{port}: {error.strerror}; give another --listen") from None
         self._listener.setblocking(False)
-        self.introduction_s, self.idle_s = INTRODUCTION_S, IDLE_S
-        self._peer: _Peer | None = None
-        self._guests: list[_Peer] = []
-        """Connections that have not identified themselves yet, oldest first."""
-        shown = f"[{host}]" if family == socket.AF_INET6 else host
-        self.name = f"socket://{shown}:{self._listener.getsockname()[1]}"
+        self._port = self._listener.getsockname()[1]
 
     def fileno(self) -> int:
         waiting = [self._peer] if self._peer else self._guests[-1:]
@@ -200,6 +220,7 @@ class TcpStream:
         self._hang_up()
         for guest in self._guests:
             guest.connection.close()
+        self._guests.clear()
         self._listener.close()
 
 
@@ -229,11 +250,13 @@ def refusal_event(why: str) -> pb.Event:
 
 
 def open_streams(
-    listen: str | None, *, key: bytes | None = None, allow_remote: bool = False, unsigned: bool = False
-) -> dict[Line, Stream]:
+    listen: str | None, *, key: bytes | None = None, allow_remote: bool = False, unsigned: bool = False,
+    links: Path | None = None,
+) -> dict[Line, Stream]:  # fmt: skip
     """Two pseudo terminals, or two TCP ports on ``listen`` = HOST:PORT (the mirror's is the next one; 0: any).
 
-    With ``key``, of 32 bytes, they take and send signed packets only.
+    With ``key``, of 32 bytes, they take and send signed packets only. ``links`` is a folder for links to the terminals,
+    which stay the same where these vanish and return.
 
     Raises
     ------
@@ -244,7 +267,10 @@ def open_streams(
     names: tuple[Line, Line] = ("camera", "mirror")
     camera, mirror = (Signing(key, name, to_host=True) if key else None for name in names)
     if listen is None:
-        return {"camera": PtyStream(camera), "mirror": PtyStream(mirror)}
+        return {
+            "camera": PtyStream(links and links / "camera", camera),
+            "mirror": PtyStream(links and links / "mirror", mirror),
+        }
     host, _, port = listen.rpartition(":")
     if not host or not port.isdigit() or int(port) > 65_534:
         raise PortError(f"--listen {listen}: expected HOST:PORT, for example 127.0.0.1:5000")

@@ -117,7 +117,7 @@ class Hub:
             self._virtual_ns = max(self._virtual_ns, *(link.handed.host_ns for link in self.links if link.handed))
         elif not pending:
             beside = [each for each in self.beside if each.alive]
-            lines = [link.transport for link in self.links]
+            lines = [link.transport for link in self.links if link.lost is None]
             wait_readable([*lines, *beside], min(timeout_s, _SLICE_S), [each for each in beside if each.has_to_send])
             pending = [(link, r) for link in self.links for r in link.receive()]
             for each in beside:
@@ -148,6 +148,8 @@ class Hub:
             sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)
             while True:
+                if link.lost is not None:
+                    raise link.lost
                 kept = self._pending
                 self._pending = []
                 answer = None

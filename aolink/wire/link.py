@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from google.protobuf.message import DecodeError, Message
 
+from aolink.errors import PortError
 from aolink.wire import messages_pb2 as pb
 from aolink.wire.packet import (
     DELIMITER,
@@ -77,6 +78,12 @@ class Link:
         """Bytes since then, those of the Identify included: the rig on virtual time says how many it has taken."""
         self.last_sent_ns = 0
         """Host time at which something was sent last."""
+        self.last_heard_ns = now_ns()
+        """Host time at which something came last."""
+        self.reopen: Callable[[], Transport] | None = None
+        """Opens the port again. Where it is None, losing the port is an error."""
+        self.lost: PortError | None = None
+        """Why there is no port at present: what is sent is dropped then, and nothing comes."""
         self.before_send: Callable[[], None] = lambda: None
         """Called before anything is sent; the hub keeps the lines in step with it on virtual time."""
         self._now_ns = now_ns
@@ -97,9 +104,9 @@ class Link:
         self.before_send()
         if isinstance(message, pb.Identify):
             self._next_sequence = self.sent_packets = self.sent_bytes = 0
-            self.transport.write(DELIMITER)  # ends what a host before has left on the line
+            self._write(DELIMITER)  # ends what a host before has left on the line
         for data in encode_packets(message, self._next_sequence, self.signing):
-            self.transport.write(data)
+            self._write(data)
             self.sent_bytes += len(data)
             self._next_sequence = (self._next_sequence + 1) & 0xFFFF
             self.sent_packets += 1
@@ -110,10 +117,10 @@ class Link:
 
     def receive(self) -> list[Received]:
         """The messages that have come, without waiting, in order. Raises PortError."""
-        data = self.transport.read_some()
+        data = self._read()
         if not data:
             return []
-        now = self._now_ns()
+        self.last_heard_ns = now = self._now_ns()
         received = []
         self.counts.bytes_received += len(data)
         for packet in self._decoder.feed(data):
@@ -145,6 +152,32 @@ class Link:
         self.counts.bad_crc = self._decoder.bad_crc
         self.counts.bad_framing = self._decoder.bad_framing
         return received
+
+    def lose(self, why: PortError) -> None:
+        """Go on without the port until `found`. Raises ``why`` where the port is not to be opened again."""
+        if self.reopen is None:
+            raise why
+        self.lost = why
+        self.transport.close()
+
+    def found(self, transport: Transport) -> None:
+        """The port has been opened again."""
+        self.transport, self.lost = transport, None
+
+    def _read(self) -> bytes:
+        if self.lost is None:
+            try:
+                return self.transport.read_some()
+            except PortError as error:
+                self.lose(error)
+        return b""
+
+    def _write(self, data: bytes) -> None:
+        if self.lost is None:
+            try:
+                self.transport.write(data)
+            except PortError as error:
+                self.lose(error)
 
     def _is_duplicate(self, sequence: int) -> bool:
         """Whether a packet came before; counts those that should have come between."""

@@ -9,6 +9,7 @@ import os
 import select
 import socket
 import stat
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -25,6 +26,8 @@ _STOPPED_TIMEOUT_S = 1.0
 """The same once a stop is asked for."""
 _SLICE_S = 0.1
 _SOCKET_READ = 65_536
+_REOPEN_S = 0.05
+"""Between two tries to open a port that has vanished."""
 
 
 class Transport(Protocol):
@@ -115,6 +118,41 @@ class SerialPort:
     def close(self) -> None:
         with contextlib.suppress(OSError):
             self._serial.close()
+
+
+class Reopening:
+    """Opens a port again and again until it is there, on a thread of its own, because connecting may take seconds."""
+
+    def __init__(self, reopen: Callable[[], Transport]) -> None:
+        self.opened: Transport | None = None
+        self.failed: PortError | None = None
+        """Why the newest try did not succeed."""
+        self._reopen = reopen
+        self._given_up = threading.Event()
+        self._lock = threading.Lock()
+        threading.Thread(target=self._run, name="aolink-reopening", daemon=True).start()
+
+    def give_up(self) -> None:
+        """Try no more, and close the port if it was opened."""
+        with self._lock:
+            self._given_up.set()
+            if self.opened is not None:
+                self.opened.close()
+
+    def _run(self) -> None:
+        while not self._given_up.is_set():
+            try:
+                opened = self._reopen()
+            except PortError as error:
+                self.failed = error
+                self._given_up.wait(_REOPEN_S)
+                continue
+            with self._lock:
+                if self._given_up.is_set():
+                    opened.close()
+                else:
+                    self.opened = opened
+            return
 
 
 class HasFileno(Protocol):

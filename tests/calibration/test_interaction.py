@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aolink.calibration.interaction import measure_interaction, poke_inputs, rest_exposures, spot_slopes
-from aolink.devices.gate import CommandLimits
+from aolink.devices.limits import CommandLimits
 from aolink.errors import CalibrationError
 from aolink.rig import load_rig, parse_rig
 from aolink.rig.disturbance import Disturbance

@@ -6,6 +6,10 @@ import pytest
 import aolink
 from aolink.errors import IdentificationError
 from aolink.identification import chosen, identified, maxima, readings, space_of, tried
+from aolink.jobs.demo import simulated_rig
+from aolink.recording.reader import Recording
+from aolink.session import record
+from aolink.session.excitation import excitation
 
 
 def space(kinds, seen, rig, **more):
@@ -78,3 +82,15 @@ def test_a_plant_that_is_driven_is_identified():
     assert best["gain"] == pytest.approx(0.8, rel=0.05)
     assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)
     assert best["sd"] == pytest.approx(np.sqrt(1e-6 / (1 - 0.995**2)), rel=0.5)
+
+
+def test_a_plant_is_identified_from_a_session_that_plays_a_pseudo_random_sequence(tmp_path):
+    (tmp_path / "slow.toml").write_text(SLOW)
+    rig, path = aolink.load_rig(tmp_path / "slow.toml"), tmp_path / "a.mcap"
+    with simulated_rig(tmp_path / "slow.toml") as ports:
+        record(rig, *ports, path, exposures=48, inputs=excitation(["prbs:amplitude=0.5,to=2,seed=3"], rig))
+    seen = [readings(rig, list(Recording(path).exposures()), plant_known=False)]
+    of = space([], seen, rig, plant="first-order")
+    best = of.fitted_plant(maxima(of, seen)[0].x)
+    assert best["gain"] == pytest.approx(0.8, rel=0.05)
+    assert best["correlation_s"] == pytest.approx(-1e-3 / np.log(0.995), rel=0.05)

@@ -95,6 +95,9 @@ class End:
     def fileno(self) -> int:
         raise AssertionError("nobody waits on a simulated line")
 
+    def reopen(self) -> None:
+        raise AssertionError("this port does not vanish")
+
     def close(self) -> None:
         pass
 

@@ -5,16 +5,10 @@ The clock runs here, so nothing is said about how fast; only that order and coun
 
 from __future__ import annotations
 
-import contextlib
 import os
 import secrets
-import select
-import signal
 import stat
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -23,49 +17,14 @@ import pytest
 import aolink
 from aolink.devices.discovery import identify_port
 from aolink.errors import DeviceError
-from aolink.jobs.demo import simulated_rig
 from aolink.recording.reader import Recording
 from aolink.recording.reestimate import first_difference, reestimate
 from aolink.rig import load_rig
 from aolink.session import Report, record
-from tests.needs import missing
+from tests.session.conftest import Ports
 from tests.session.native import open_native
 
-Ports = Callable[[], AbstractContextManager[tuple[str, str]]]
 RIG = load_rig("section-vi")
-DEVICE = Path(__file__).parents[2] / "tools" / "device"
-SANITISED = "-std=c99 -O1 -g -Wall -Wextra -Werror -pedantic -fsanitize=address,undefined -fno-sanitize-recover=all"
-
-
-@contextlib.contextmanager
-def reference_device(program: Path) -> Iterator[tuple[str, str]]:
-    """The C program behind two pseudo terminals; it must end without a word from a sanitiser."""
-    process = subprocess.Popen([program], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1)
-    assert process.stdout is not None
-    try:
-        select.select([process.stdout], [], [], 20)
-        ports = dict(process.stdout.readline().split() for _ in range(2))
-        yield ports["camera"], ports["mirror"]
-    finally:
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=20)
-    assert "runtime error" not in said
-    assert "Sanitizer" not in said
-
-
-@pytest.fixture(scope="module", params=["simulated rig", "reference device"])
-def serve(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ports:
-    if request.param == "simulated rig":
-        return lambda: simulated_rig("section-vi", "--real-time")
-    build = tmp_path_factory.mktemp("device")
-    command = ["make", "-s", "-C", str(DEVICE), f"BUILD={build}", f"CFLAGS={SANITISED}"]
-    try:
-        made = subprocess.run(command, capture_output=True, text=True)
-    except FileNotFoundError as error:
-        missing("make", error)
-    if made.returncode:
-        missing("a C compiler with sanitisers", RuntimeError(made.stderr))
-    return lambda: reference_device(build / "device")
 
 
 def test_a_session_has_latencies_and_accounts_for_every_step(serve: Ports, tmp_path: Path) -> None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import pty
 import re
 import secrets
 import select
 import socket
 import subprocess
 import threading
+import tty
 from collections.abc import Callable
 from pathlib import Path
 
@@ -132,6 +135,28 @@ def test_a_serial_line_may_be_signed(aolink: Run, keys: tuple[Path, Path]) -> No
     with simulated_rig("section-vi", "--key", str(keys[0])) as (_, mirror):
         found = aolink("devices", mirror, "--key", keys[0])
     assert found.returncode == 0, found.stderr
+
+
+def test_a_device_that_trickles_is_given_up(aolink: Run) -> None:
+    """It sends a byte now and then, never a packet; the host asks three times."""
+    over = threading.Event()
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+
+    def trickle() -> None:
+        while not over.wait(0.02):
+            os.write(master, b"a")
+
+    thread = threading.Thread(target=trickle)
+    thread.start()
+    found = aolink("devices", os.ttyname(slave))
+    over.set()
+    thread.join()
+    os.close(master)
+    os.close(slave)
+    assert found.returncode == DeviceError.exit_code
+    assert re.search(r"no device answers on the .* port \(\d+ bytes came that are not aolink packets\)", found.stderr)
+    assert found.stderr.count("\n") == 1
 
 
 def test_the_second_host_of_a_port_is_told_so(aolink: Run) -> None:

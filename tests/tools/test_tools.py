@@ -125,6 +125,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
         "wire",
         "clock",
         "reach",
+        "parking",
         "devices",
         "recording",
         "batches",

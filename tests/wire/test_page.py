@@ -28,4 +28,4 @@ def test_limits_and_time_outs_are_those_of_the_code(value: str, module: str, nam
 
 
 def test_the_tables_of_numbers_are_read() -> None:
-    assert len(NUMBERS) == 14
+    assert len(NUMBERS) == 16

@@ -13,6 +13,7 @@ ROWS = {
     "clock": ("host_times",),
     "reach": ("bit_errors", "large_frames", "soak"),
     "devices": ("late_steps", "clock_sd"),
+    "parking": ("time_to_park",),
     "recording": (
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes",

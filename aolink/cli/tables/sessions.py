@@ -72,6 +72,10 @@ def session(report: Report) -> Table:
         f" parked it; {report.blocks_retransmitted} blocks sent again; missing reports requested"
         f" {report.reports_asked} times",
     )
+    if report.ports_vanished:
+        table.add_row(
+            "ports", f"vanished {report.ports_vanished} times, and {report.away_s:.2f} s until all had returned"
+        )
     table.add_row(
         "clock",
         f"device minus host {report.clock_offset_ns / 1e9:.6f} s, {report.clock_frequency_ppm:+.2f} ppm,"
