@@ -118,7 +118,9 @@ class ImportanceUpdater:
             some, fit, missed = view.part(few), wide.part(few), self._missed(reduced)
             if missed < 1:
                 points, best = tempered(some, before.part(few), self.points, number)
-                fit = joined(points.weighted(1 - missed), _by_share_of(points, fit).weighted(missed))
+                in_doubt = np.flatnonzero(np.isin(few, doubted))
+                fit = fit.replaced(in_doubt, _by_share_of(points.part(in_doubt), fit.part(in_doubt)))
+                fit = joined(points.weighted(1 - missed), fit.weighted(missed))
                 # The search may have missed the mode that fits.
                 starts = whitened(own.part(few), best)
                 modes = without_repeats(with_more(modes, few, find_modes(some, own.part(few), starts)))
@@ -168,7 +170,7 @@ def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMix
 def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
     """The wide Gaussians, each with the share of the points' mixture that lies nearest to it.
 
-    What they were before the frame says nothing of it: one of them may be about a reading that the frame rules out.
+    For axes whose prior is doubted: some of the wide Gaussians are about that prior, which the frame may rule out.
     """
     there = np.isfinite(wide.log_weight)
     covariance = np.where(there[..., None, None], wide.covariance, np.eye(wide.mean.shape[2]))
