@@ -68,8 +68,7 @@ class MixtureUpdate:
 class MixtureUpdater(Protocol):
     """A way to update a mixture with the pixels of an exposure."""
 
-    @property
-    def when_poor(self) -> str:
+    def when_poor(self, reduced: Reduction) -> str:
         """What it does on axes of which an update says `MixtureUpdate.poor`, for the estimate's reason."""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
@@ -192,13 +191,13 @@ class MixtureFilter(Filter):
         self._number += 1
         return Posterior(
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
-            innovation_covariance=new.covariance, nis=new.nis, several=several, remark=self._remark(poor),
+            innovation_covariance=new.covariance, nis=new.nis, several=several, remark=self._remark(poor, reduced),
         )  # fmt: skip
 
-    def _remark(self, poor: BoolArray) -> str:
+    def _remark(self, poor: BoolArray, reduced: Reduction) -> str:
         if not poor.any():
             return ""
-        return ("" if len(poor) == 1 else f"{int(poor.sum())} of {len(poor)} axes: ") + self._updater.when_poor
+        return ("" if len(poor) == 1 else f"{int(poor.sum())} of {len(poor)} axes: ") + self._updater.when_poor(reduced)
 
 
 def _arrays(done: MixtureUpdate, components: int) -> tuple[NDArray[Any], ...]:

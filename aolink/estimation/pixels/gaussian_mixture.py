@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,6 +35,10 @@ class GaussianMixture:
     def copy(self) -> GaussianMixture:
         """A copy, each of whose arrays is contiguous in memory."""
         return GaussianMixture(*(np.array(each, order="C") for each in (self.log_weight, self.mean, self.covariance)))
+
+    def weighted(self, share: float) -> GaussianMixture:
+        """The same as that share of a mixture."""
+        return replace(self, log_weight=self.log_weight + math.log(share))
 
     @property
     def gaussian(self) -> Gaussian:

@@ -107,13 +107,14 @@ def tempered(view: PixelView, prior: GaussianMixture, count: int, number: int) -
     return fit, points[np.arange(len(points)), best][:, None]
 
 
-def scattered(view: PixelView, weight: FloatArray, wide: Gaussian) -> BoolArray:
-    """Where a search about the windowed moments' Gaussians (axes, components, ...) finds too few of the modes, (axes,).
+def scattered(view: PixelView, wide: GaussianMixture) -> BoolArray:
+    """Where a search about the windowed moments' Gaussians finds too few of the modes, (axes,).
 
-    ``weight`` are the logarithms of their weights; light ones do not count.
+    Light ones do not count.
     """
     variance = np.einsum("ij,acij->ac", view.gram, wide.covariance) / view.outputs
-    return np.asarray(((weight > math.log(_HEAVY)) & (variance > _SCATTERED * view.kernel_variance)).any(axis=1))
+    heavy = wide.log_weight > math.log(_HEAVY)
+    return np.asarray((heavy & (variance > _SCATTERED * view.kernel_variance)).any(axis=1))
 
 
 def importance_corrected(

@@ -33,7 +33,9 @@ class TemperedUpdater:
     particles: int = 2000
     seed: int = 0
 
-    when_poor = ""
+    def when_poor(self, reduced: Reduction) -> str:
+        """Nothing is said: it is never poor."""
+        return ""
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""

@@ -5,7 +5,9 @@ bent. So the modes, and the wide Gaussians of windowed moments about them, only 
 posterior comes from importance weights (`aolink.estimation.pixels.importance`).
 
 Where that is not enough (`aolink.estimation.pixels.importance`), points are tempered, as many for an axis as ``points``
-says. If that is none, the fit stays as wide as its few effective points make it.
+says. If that is none, the fit stays as wide as its few effective points make it. Some hundred points miss modes as
+well, the more coefficients there are the more: so a share of the posterior stays what the windowed moments say, which
+are uncertain enough. With as many points as pairs of coefficients, or fewer, that is all of it, and none is tempered.
 
 A mode that was lost is found again: a thousandth of the prior is the prediction without any measurement. Its modes are
 searched where the NIS is larger than chance makes it.
@@ -65,11 +67,20 @@ class ImportanceUpdater:
         """The same with another number of tempered points, if not None."""
         return self if points is None else replace(self, points=points)
 
-    @property
-    def when_poor(self) -> str:
+    def when_poor(self, reduced: Reduction) -> str:
         """What it does where importance sampling is not enough, for the estimate's reason."""
-        what = f"{self.points} points tempered" if self.points else "the estimate is wide"
+        missed = self._missed(reduced)
+        if not self.points:
+            what = "the estimate is wide"
+        elif missed < 1:
+            what = f"{self.points} points tempered, and {missed:.0%} of windowed moments"
+        else:
+            what = "windowed moments"
         return f"too few importance weights count: {what}"
+
+    def _missed(self, reduced: Reduction) -> float:
+        """The share of a posterior that tempered points may have missed: pairs of coefficients to a point."""
+        return reduced.size**2 / self.points if self.points else 1.0
 
     def reduction(self, model: ExposureModel, sensor: BaseSensor) -> Reduction:
         """The coefficients that it works with."""
@@ -81,14 +92,16 @@ class ImportanceUpdater:
         modes, proposal = explored(view, prior)
         own = reduced.prior(prior.gaussian)
         new = innovation(view, own, modes)
-        lost = scattered(view, prior.log_weight, _wide_part(proposal, prior))
+        wide = _wide_part(proposal, prior)
+        lost = scattered(view, wide)
         doubted = np.flatnonzero(new.nis > 2 * special.gammainccinv(new.value.shape[1] / 2, _DOUBTED))
         if len(doubted):
-            _, more = explored(view.part(doubted), single(unseen.part(doubted)))
+            anew = single(unseen.part(doubted))
+            _, more = explored(view.part(doubted), anew)
             proposal = proposal.replaced(doubted, joined(proposal.part(doubted), more))
+            wide = wide.replaced(doubted, joined(wide.part(doubted), _wide_part(more, anew)))
         rest = replace(prior, log_weight=prior.log_weight + math.log1p(-_DOUBT))
-        doubt = replace(single(unseen), log_weight=np.full((len(unseen.mean), 1), math.log(_DOUBT)))
-        before = joined(rest, doubt)
+        before = joined(rest, single(unseen).weighted(_DOUBT))
         usual = np.flatnonzero(~lost | (self.points == 0))
         after, poor = proposal, lost.copy()
         if len(usual):
@@ -102,13 +115,17 @@ class ImportanceUpdater:
             poor[usual] |= ~good & new.believed[usual]
         few = np.flatnonzero(poor)
         if len(few) and self.points:
-            some = view.part(few)
-            fit, best = tempered(some, before.part(few), self.points, number)
+            some, fit, missed = view.part(few), wide.part(few), self._missed(reduced)
+            if missed < 1:
+                points, best = tempered(some, before.part(few), self.points, number)
+                in_doubt = np.flatnonzero(np.isin(few, doubted))
+                fit = fit.replaced(in_doubt, _by_share_of(points.part(in_doubt), fit.part(in_doubt)))
+                fit = joined(points.weighted(1 - missed), fit.weighted(missed))
+                # The search may have missed the mode that fits.
+                starts = whitened(own.part(few), best)
+                modes = without_repeats(with_more(modes, few, find_modes(some, own.part(few), starts)))
+                new = innovation(view, own, modes)
             after = after.replaced(few, fit)
-            # The search may have missed the mode that fits.
-            starts = whitened(own.part(few), best)
-            modes = without_repeats(with_more(modes, few, find_modes(some, own.part(few), starts)))
-            new = innovation(view, own, modes)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
         return MixtureUpdate(after.gaussian, carried, new, has_several(modes), poor)
 
@@ -144,7 +161,20 @@ def explored(view: PixelView, prior: GaussianMixture) -> tuple[Modes, GaussianMi
     return modes, proposed(modes.log_evidence, Gaussian(modes.mean, modes.covariance), prior.log_weight, flat)
 
 
-def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> Gaussian:
-    """The Gaussians of windowed moments in a proposal density, the last ones: one for each component of the prior."""
+def _wide_part(proposal: GaussianMixture, prior: GaussianMixture) -> GaussianMixture:
+    """The Gaussians of windowed moments, the last ones of a proposal density, with the weights of the prior's."""
     count = prior.mean.shape[1]
-    return Gaussian(proposal.mean[:, -count:], proposal.covariance[:, -count:])
+    return GaussianMixture(prior.log_weight, proposal.mean[:, -count:], proposal.covariance[:, -count:])
+
+
+def _by_share_of(points: GaussianMixture, wide: GaussianMixture) -> GaussianMixture:
+    """The wide Gaussians, each with the share of the points' mixture that lies nearest to it.
+
+    For axes whose prior is doubted: some of the wide Gaussians are about that prior, which the frame may rule out.
+    """
+    there = np.isfinite(wide.log_weight)
+    covariance = np.where(there[..., None, None], wide.covariance, np.eye(wide.mean.shape[2]))
+    logs = replace(wide, covariance=covariance).component_log_densities(points.mean)
+    share = np.exp(logs - log_sum(logs, axis=1)[:, None]) * np.exp(points.log_weight)[:, None]
+    with np.errstate(divide="ignore"):
+        return replace(wide, log_weight=np.log(share.sum(axis=2)))
