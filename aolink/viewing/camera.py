@@ -46,7 +46,7 @@ _POINTS_IN_ROW = 21
 """Of a path inside one row of a page: more than can be told apart."""
 _SWINGS_IN_ROW = 5
 """A path over some pixels that a line through so many points would miss is drawn as its range: a row is not high."""
-_PIXELS = 2.0
+_PIXELS = 6.0
 """That it has to move by."""
 _POINTS_OF_SPOT = 51
 """Of a spot's path on the frame."""
@@ -176,7 +176,7 @@ def log_page(
         for row, exposure in zip(rows, exposures, strict=True):
             if (path := by_frame.get(exposure.frame_id)) is not None:
                 if np.ptp(path) > _PIXELS * sensor.pixel_width and hides_swings(path, _SWINGS_IN_ROW):
-                    edges = extremes(path, _SWINGS_IN_ROW)
+                    edges: tuple[FloatArray, ...] = extremes(path, _SWINGS_IN_ROW)
                     places = (np.arange(len(edges[0])) + 0.5) / len(edges[0])
                 else:
                     some = _points_in_row(len(path))

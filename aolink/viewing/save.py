@@ -169,7 +169,7 @@ class Sender:
         restored = iter(recording.restored())
         ahead = next(restored, None)
         messages = self._messages(devices.EVERY_STEP)
-        waiting = next(messages, None)
+        waiting: Any = next(messages, None)
         for exposures, estimates, following in self._read():
             pictures: list[RestoredPictures] = []
             while ahead is not None and ahead.frame_id <= exposures[-1].frame_id:
@@ -177,8 +177,7 @@ class Sender:
                 ahead = next(restored, None)
             self._send(exposures, estimates, pictures, following)
             run: list[RecordedMessage] = []
-            until = following.host_start_ns if following else None
-            while waiting is not None and (until is None or waiting.log_time_ns < until):
+            while waiting is not None and (following is None or waiting.message.first_step < following.first_step):
                 run.append(waiting)
                 waiting = next(messages, None)
             self._send_messages(run)
