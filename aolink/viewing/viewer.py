@@ -120,12 +120,12 @@ def headless_viewer(
         try:
             client = _connected(process, port, said)
             client.open(str(path))
-            inside_ns = _time_inside_once_loaded(client)
+            timeline, inside = _inside_once_loaded(client)
             client.run_command("ui.toggle_top_panel")
-            if step is None:
-                client.set_time(TIME, duration=np.timedelta64(inside_ns, "ns"), play_state="paused")
+            if step is None and timeline == TIME:
+                client.set_time(TIME, duration=np.timedelta64(inside, "ns"), play_state="paused")
             else:
-                client.set_time(FAST_STEP, sequence=step, play_state="paused")
+                client.set_time(FAST_STEP, sequence=inside if step is None else step, play_state="paused")
             yield client
         except (RuntimeError, ConnectionError, ViewerError) as error:
             # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
@@ -333,17 +333,20 @@ def wait_for_server(port: int, process: subprocess.Popen[bytes], said: IO[bytes]
     _wait_for(lambda: not _is_free(port), process, said)
 
 
-def _time_inside_once_loaded(client: ViewerClient) -> int:
-    """A time at which everything has begun and nothing has ended, ns since the first exposure began."""
+def _inside_once_loaded(client: ViewerClient) -> tuple[str, int]:
+    """A place at which everything has begun and nothing has ended: ns since the first exposure began or, in a file of
+    an older aolink, a fast step; before it the timeline.
+    """
     deadline = time.monotonic() + _SETTLE_S
     while True:
         state = client.get_state()
-        found = [t for r in state.recordings for t in r.timelines if t.name == TIME]
-        if found and not state.loading:
-            start, end = found[0].start or 0, found[0].end or 0
-            return start + round(0.6 * (end - start))
+        timelines = {t.name: t for r in state.recordings for t in r.timelines}
+        name = TIME if TIME in timelines else FAST_STEP
+        if name in timelines and not state.loading:
+            start, end = timelines[name].start or 0, timelines[name].end or 0
+            return name, start + round(0.6 * (end - start))
         if time.monotonic() > deadline:
-            raise ViewerError("the viewer shows no recording with the time of exposures: give a file that aolink wrote")
+            raise ViewerError("the viewer shows no recording with fast steps: give a file that aolink wrote")
         time.sleep(_POLL_S)
 
 

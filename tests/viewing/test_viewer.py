@@ -28,7 +28,7 @@ from aolink.viewing.viewer import WEB_PORT, free_port, headless_viewer, settled_
 from aolink.viewing.vulkan import has_vulkan
 from tests.viewing.stand_in import StandIn, as_recording
 
-TEXTS = ("Session", "Log")
+TEXTS = ("Session", "Warnings", "Log")
 PICTURES = ("Camera", "Intensity")
 
 
