@@ -63,7 +63,7 @@ def view(
 ) -> None:
     """Open a recording in Rerun, or a Rerun file that was saved from one.
 
-    Of five exposures or fewer, paths are shown at every fast step; of more, at forty places of each exposure.
+    Of five exposures or fewer, paths are shown at every fast step; of more, at 32 places of each exposure.
     """
     import tempfile
 

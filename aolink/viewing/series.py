@@ -18,7 +18,7 @@ from aolink.viewing.timebase import Timebase
 
 PERCENTILES = (5, 50, 95)
 """What stands for many axes."""
-POINTS = 40
+POINTS = 32
 """That a path is drawn with in a long session: more than its exposure has columns on a screen."""
 _SECOND = 0.55
 """Opacity of the second of two lines that belong together, and of those that something is compared with."""
