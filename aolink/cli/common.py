@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -42,6 +43,9 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
 
 
+LensletOption = Annotated[
+    str | None, typer.Option(metavar="I,J", help="Row and column of the lenslet to draw, counted from 0.")
+]
 OutputOption = Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The recording to write.")]
 
 
@@ -79,6 +83,25 @@ def open_recording(file: str | Path | Url, *, check: bool = False, side: Sequenc
     if recording.damage:
         warn(f"{recording.path}: {recording.damage}")
     return recording
+
+
+def spot_of(sensor: object, lenslet: str) -> int:
+    """Number of the spot of a lenslet that is named by its row and column."""
+    import numpy as np
+
+    from aolink.optics.sensor import SpotSensor
+
+    if not (match := re.fullmatch(r"(\d+),(\d+)", lenslet)):
+        raise typer.BadParameter(f"--lenslet {lenslet}: give row and column, counted from 0, as 2,3")
+    if not isinstance(sensor, SpotSensor):
+        raise typer.BadParameter("--lenslet is for a sensor with lenslets; this one is a line")
+    row, column = map(int, match.groups())
+    rows, columns = sensor.grid
+    inside = row < rows and column < columns
+    found = np.flatnonzero(sensor.lit == row * columns + column)
+    if not (inside and len(found)):
+        raise typer.BadParameter(f"--lenslet {lenslet}: no light falls on it; the grid has {rows} x {columns} lenslets")
+    return int(found[0])
 
 
 def check_measured(file: Path | Url, scores: Mapping[str, Score]) -> None:

@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-import re
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import EstimatorOption, OverwriteOption, app, open_recording, progress, stdout
+from aolink.cli.common import (
+    EstimatorOption,
+    LensletOption,
+    OverwriteOption,
+    app,
+    open_recording,
+    progress,
+    spot_of,
+    stdout,
+)  # fmt: skip
 from aolink.errors import ExportError, RecordingError
 from aolink.files import check_target
+
+if TYPE_CHECKING:
+    from aolink.recording.reader import Recording
 
 
 class What(StrEnum):
@@ -40,8 +51,10 @@ def plot(
         int | None,
         typer.Option(min=0, metavar="N", help="Exposure to draw, counted from 0; else the one with the largest blur."),
     ] = None,
-    lenslet: Annotated[
-        str | None, typer.Option(metavar="I,J", help="Row and column of the lenslet to draw, counted from 0.")
+    lenslet: LensletOption = None,
+    side: Annotated[
+        list[str] | None,
+        typer.Option("--side", metavar="FILE", help="A side file: its estimates instead of the recording's own."),
     ] = None,
     steps: StepsOption = False,
     width_mm: Annotated[float, typer.Option(min=30, max=1000, help="Width on paper; 88 fits a column.")] = 180.0,
@@ -54,12 +67,13 @@ def plot(
     lenslets. scene: a picture as it came, restored, and at rest.
     """
     from aolink.plotting.files import FORMATS, save_figure
+    from aolink.recording.remote import location
 
     if output.suffix.lower() not in FORMATS:
         raise ExportError(f"cannot write {output}: a figure is a {', '.join(FORMATS)} file; give such a name")
-    recording = open_recording(file)
+    recording = open_recording(file, side=[location(each) for each in side or ()])
     check_target(output, overwrite=overwrite, sources=recording.files, error=ExportError)
-    spot = _spot(recording.rig.sensor, lenslet) if lenslet else 0
+    spot = spot_of(recording.rig.sensor, lenslet) if lenslet else 0
     with progress("read", recording.n_frames) as tell:
         save_figure(
             recording, what.value, output, estimators=estimator, exposure=exposure,
@@ -69,28 +83,11 @@ def plot(
     stdout.print(f"written: {output}", markup=False)
 
 
-def _spot(sensor: object, lenslet: str) -> int:
-    """Number of the spot of a lenslet that is named by its row and column."""
-    import numpy as np
-
-    from aolink.optics.sensor import SpotSensor
-
-    if not (match := re.fullmatch(r"(\d+),(\d+)", lenslet)):
-        raise typer.BadParameter(f"--lenslet {lenslet}: give row and column, counted from 0, as 2,3")
-    if not isinstance(sensor, SpotSensor):
-        raise typer.BadParameter("--lenslet is for a sensor with lenslets; this one is a line")
-    row, column = map(int, match.groups())
-    rows, columns = sensor.grid
-    inside = row < rows and column < columns
-    found = np.flatnonzero(sensor.lit == row * columns + column)
-    if not (inside and len(found)):
-        raise typer.BadParameter(f"--lenslet {lenslet}: no light falls on it; the grid has {rows} x {columns} lenslets")
-    return int(found[0])
-
-
 @app.command(epilog="Example: aolink report session.mcap -o report.html  |  aolink report results/ -o batch.html")
 def report(
-    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings, or folders of recordings.")],
+    files: Annotated[
+        list[str], typer.Argument(metavar="FILE...", help="Recordings, folders of them, and their side files.")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="X.html", help="The page to write.")],
     steps: StepsOption = False,
     overwrite: OverwriteOption = False,
@@ -102,13 +99,29 @@ def report(
     from aolink.plotting.report import write_report
 
     check_target(output, overwrite=overwrite, suffix=".html", error=ExportError)
-    recordings = [open_recording(each) for each in _in_folders(files)]
+    recordings = _with_sides(_in_folders(files))
     with progress("read", None) as tell:
         write_report(
             recordings, output, unit="steps" if steps else "s", overwrite=overwrite,
             progress=lambda name, done: tell(done, name),
         )  # fmt: skip
     stdout.print(f"written: {output}", markup=False)
+
+
+def _with_sides(files: list[str]) -> list[Recording]:
+    """The recordings, each with its side files among the others. Raises RecordingError for one of no recording here."""
+    from aolink.recording.reader import check_stands_alone
+
+    opened = [open_recording(each) for each in files]
+    alone, sides = [e for e in opened if not e.side_of], [e for e in opened if e.side_of]
+    if not sides:
+        return alone
+    digests = {each.digest for each in alone}
+    for each in sides:
+        if each.side_of not in digests:
+            check_stands_alone(each)
+    beside = {each.digest: [side.path for side in sides if side.side_of == each.digest] for each in alone}
+    return [open_recording(e.path, side=beside[e.digest]) if beside[e.digest] else e for e in alone]
 
 
 def _in_folders(files: list[str]) -> list[str]:

@@ -3,17 +3,34 @@
 from __future__ import annotations
 
 import json
+import math
+from bisect import bisect_left
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, stdout
+from aolink.cli.common import (
+    JsonOption,
+    LensletOption,
+    OverwriteOption,
+    app,
+    open_recording,
+    progress,
+    spot_of,
+    stdout,
+)  # fmt: skip
 from aolink.errors import FrameError, ViewerError
 from aolink.files import check_target
 
+if TYPE_CHECKING:
+    from aolink.recording.reader import Recording
 
-@app.command(epilog="Example: aolink view session.mcap --screenshot session.png")
+
+@app.command(
+    epilog="Example: aolink view session.mcap --screenshot session.png"
+    "  |  aolink view session.mcap --exposure 7  |  aolink view session.mcap --start 10 --end 20 --compare again.mcap"
+)
 def view(
     recorded: Annotated[
         str, typer.Argument(metavar="FILE", help="A recording, or a Rerun file (.rrd) that --save has written.")
@@ -31,38 +48,102 @@ def view(
     web: Annotated[
         bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")
     ] = False,
+    exposure: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Look into one exposure, counted from 0.")
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")
+    ] = None,
+    end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
+    lenslet: LensletOption = None,
+    compare: Annotated[
+        str | None, typer.Option(metavar="OTHER", help="Show another recording beside it, in fainter lines.")
+    ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Open a recording in Rerun, or a Rerun file that was saved from one."""
+    """Open a recording in Rerun, or a Rerun file that was saved from one.
+
+    Of five exposures or fewer, paths are shown at every fast step; of more, at 32 places of each exposure.
+    """
     import tempfile
 
     from aolink import viewing
     from aolink.recording.remote import location, only_paths
 
     file, *sides = map(location, [recorded, *(side or ())])
+    sources = only_paths([file, *sides, *([location(compare)] if compare else [])])
     for target, suffix in ((save, ".rrd"), (screenshot, ".png")):
         if target is not None:
-            check_target(target, overwrite=overwrite, sources=only_paths([file, *sides]), suffix=suffix)
+            check_target(target, overwrite=overwrite, sources=sources, suffix=suffix)
     recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
-    if recording is None and (save is not None or side):
-        raise typer.BadParameter(f"{file} is a Rerun file already: --save and side files are for a recording")
+    choices = (exposure, start, end, lenslet, compare)
+    if recording is None and (save is not None or side or any(each is not None for each in choices)):
+        raise typer.BadParameter(f"{file} is a Rerun file already: --save, side files and choices are for a recording")
     if not (web or save or screenshot):
-        viewing.check_display()  # before the recording is read, which may take minutes
-    with tempfile.TemporaryDirectory(prefix="aolink-") as folder:
-        rrd = Path(recorded)
-        if recording is not None:
-            rrd = save or Path(folder) / f"{file.stem}.rrd"
-            with progress("write .rrd", len(recording.estimators) + 2) as tell:
-                viewing.save_rrd(recording, rrd, overwrite=overwrite, progress=tell)
-        if save is not None:
-            stdout.print(f"written: {save}", markup=False)
+        viewing.check_display()
+    if recording is None:
         if screenshot is not None:
-            viewing.screenshot(rrd, screenshot)
+            viewing.screenshot(recorded, screenshot)
             stdout.print(f"written: {screenshot}", markup=False)
         if web:
-            viewing.serve_web(rrd, on_ready=lambda address: stdout.print(f"{address}\nCtrl-C stops it."))
+            viewing.serve_web(recorded, on_ready=_address)
+        elif screenshot is None:
+            viewing.open_viewer(recorded)
+        return
+    exposures = _numbers(recording, exposure, start, end)
+    look = viewing.Look(
+        exposures=exposures, spot=spot_of(recording.rig.sensor, lenslet) if lenslet else 0,
+        compared=open_recording(compare) if compare else None,
+    )  # fmt: skip
+    total = len(exposures) if exposures is not None else recording.n_frames
+    with tempfile.TemporaryDirectory(prefix="aolink-") as folder, progress("read", total) as tell:
+        if save is not None or screenshot is not None:
+            rrd = save or Path(folder) / f"{file.stem}.rrd"
+            viewing.save_rrd(recording, rrd, look=look, overwrite=overwrite, progress=tell)
+            if screenshot is not None:
+                viewing.screenshot(rrd, screenshot)
+        for written in (save, screenshot):
+            if written is not None:
+                stdout.print(f"written: {written}", markup=False)
+        if web:
+            viewing.serve(recording, look, on_ready=_address, progress=tell)
         elif save is None and screenshot is None:
-            viewing.open_viewer(rrd)
+            viewing.show(recording, look, progress=tell)
+
+
+def _address(address: str) -> None:
+    stdout.print(f"{address}\nCtrl-C stops it.")
+
+
+def _numbers(recording: Recording, exposure: int | None, start: float | None, end: float | None) -> range | None:
+    """Which exposures are asked for; None for all. Raises ViewerError where there are none."""
+    count = recording.n_frames
+    if exposure is not None:
+        if start is not None or end is not None:
+            raise typer.BadParameter("give --exposure, or --start and --end")
+        if exposure >= count:
+            there = f"has {count}, counted from 0" if count else "holds none"
+            raise ViewerError(f"there is no exposure {exposure}: {recording.path} {there}")
+        return range(exposure, exposure + 1)
+    if start is None and end is None:
+        return None
+    low, high = start or 0.0, math.inf if end is None else end
+    steps = _first_steps(recording)
+    since = [(step - steps[0]) * recording.rig.timing.fast_step_s for step in steps]
+    numbers = range(bisect_left(since, low), bisect_left(since, high))
+    if not numbers:
+        length = f"{since[-1]:.3g} s after the first" if since else "nowhere: there is none"
+        raise ViewerError(f"no exposure begins between {low:g} s and {high:g} s: the last begins {length}")
+    return numbers
+
+
+def _first_steps(recording: Recording) -> list[int]:
+    """The fast steps at which the exposures begin, by the messages that tell of them."""
+    from aolink.recording import topics
+    from aolink.recording.schemas_pb2 import ExposureInfo
+
+    messages = (each.message for each in recording.messages(topics.EXPOSURE))
+    return [message.first_step for message in messages if isinstance(message, ExposureInfo)]
 
 
 @app.command(epilog="Example: aolink slopes frame.fits --reference flat.fits --pitch-m 600e-6 --focal-m 0.04 -o s.npz")

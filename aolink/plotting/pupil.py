@@ -9,6 +9,7 @@ import numpy as np
 
 from aolink.colours import by_rank
 from aolink.errors import ExportError
+from aolink.estimation.estimate import Estimate
 from aolink.estimation.frames.spots import profiles
 from aolink.exporting.common import check_frame
 from aolink.exporting.series import Series
@@ -17,6 +18,7 @@ from aolink.optics.camera import to_density
 from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import SpotSensor
 from aolink.plotting.style import FloatArray, colour_bar, figure_or_new
+from aolink.rig import Rig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -77,40 +79,55 @@ def plot_pupil(
     return figure
 
 
+MAPS = {
+    "light": ("light", "1 = a lenslet wholly lit", "viridis"),
+    "slope_x": ("mean slope x", "slope units", "RdBu_r"),
+    "slope_y": ("mean slope y", "slope units", "RdBu_r"),
+    "blur": ("blur", "RMS of the path, slope units", "magma"),
+    "nis": ("NIS", "no unit", "magma"),
+}
+"""Maps by the name of their values: title, what the colours are, colour map."""
+
+
+def spot_values(rig: Rig, sensor: SpotSensor, exposure: Exposure, estimate: Estimate | None) -> dict[str, FloatArray]:
+    """A number for each lit lenslet, (spots,), by the names of `MAPS`: those that an exposure and its estimate tell.
+
+    Without an estimate slopes are the spots' centroids. NIS is there where each spot has axes of its own, and NaN
+    where nothing was measured.
+    """
+    found: dict[str, FloatArray] = {}
+    if exposure.mask.any():
+        density = np.where(exposure.mask, to_density(sensor, exposure.pixels), 0.0)
+        found["light"] = spot_windows(sensor, density).sum(axis=(-2, -1)) * sensor.pixel_size
+    if estimate is None:
+        slopes = exposure.slopes if exposure.slopes is not None else _centroids(sensor, exposure)
+    else:
+        slopes = estimate.path.mean(axis=1)
+        blur = np.mean((estimate.path - slopes[:, None]) ** 2, axis=1)
+        found["blur"] = np.sqrt(blur.reshape(-1, 2).sum(axis=1))
+        if rig.plant.n_outputs <= 2 and estimate.innovation.shape[1]:
+            measured = np.where(estimate.nis > 0, estimate.nis, np.nan)
+            found["nis"] = measured.reshape(-1, 2 // rig.plant.n_outputs).mean(axis=1)
+    found["slope_x"], found["slope_y"] = np.reshape(slopes, (-1, 2)).T
+    return found
+
+
 def _maps(series: Series, sensor: SpotSensor, names: Sequence[str]) -> dict[str, tuple[str, FloatArray, str]]:
     """Each map by its title: what its colours are, a value for each spot, a colour map."""
-    light, slopes, blur, nis = [], [], [], []
-    axes_of_spot = 2 // series.rig.plant.n_outputs if series.rig.plant.n_outputs <= 2 else 0
+    seen: dict[str, list[FloatArray]] = {}
     for number in np.unique(np.linspace(0, max(len(series) - 1, 0), _EXPOSURES).astype(int)):
         for exposure, estimates in series[int(number) : int(number) + 1].with_estimates(names):
             check_frame(series, exposure)
-            density = np.where(exposure.mask, to_density(sensor, exposure.pixels), 0.0)
-            windows = spot_windows(sensor, density)
-            light.append(windows.sum(axis=(-2, -1)) * sensor.pixel_size if exposure.mask.any() else None)
-            estimate = next(iter(estimates), None)
-            if estimate is None:
-                slopes.append(exposure.slopes if exposure.slopes is not None else _centroids(sensor, exposure))
-                continue
-            mean = estimate.path.mean(axis=1, keepdims=True)
-            slopes.append(mean[:, 0])
-            blur.append(np.sqrt(np.mean((estimate.path - mean) ** 2, axis=1).reshape(-1, 2).sum(axis=1)))
-            if axes_of_spot and estimate.innovation.shape[1]:
-                measured = np.where(estimate.nis > 0, estimate.nis, np.nan)
-                nis.append(measured.reshape(-1, axes_of_spot).mean(axis=1))
-    if not slopes:
+            for name, values in spot_values(series.rig, sensor, exposure, next(iter(estimates), None)).items():
+                seen.setdefault(name, []).append(values)
+    if not seen:
         raise ExportError(f"{series.path} holds no exposure to draw; `aolink info` says what it holds")
-    slope = np.mean(slopes, axis=0).reshape(-1, 2)
     by = names[0] if names else "centroid"
-    found = {}
-    if lit := [each for each in light if each is not None]:
-        found["light"] = ("1 = a lenslet wholly lit", np.mean(lit, axis=0), "viridis")
-    found[f"mean slope x ({by})"] = ("slope units", slope[:, 0], "RdBu_r")
-    found[f"mean slope y ({by})"] = ("slope units", slope[:, 1], "RdBu_r")
-    if blur:
-        found[f"blur ({by})"] = ("RMS of the path, slope units", np.mean(blur, axis=0), "magma")
-    if nis:
-        found[f"NIS ({by})"] = ("no unit", np.mean(nis, axis=0), "magma")
-    return found
+    return {
+        title if name == "light" else f"{title} ({by})": (label, np.mean(seen[name], axis=0), cmap)
+        for name, (title, label, cmap) in MAPS.items()
+        if name in seen
+    }
 
 
 def _centroids(sensor: SpotSensor, exposure: Exposure) -> FloatArray:

@@ -65,7 +65,7 @@ TOPICS = (
     Topic(name=RESTORATION, message=schemas_pb2.Restoration, belongs_to="exposure"),
     Topic(name=RESTORED_SCENE, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene"),
     Topic(name=RESTORED_SPOTS, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene"),
-    Topic(name=CONTROL, message=schemas_pb2.Control, belongs_to="exposure"),
+    Topic(name=CONTROL, message=schemas_pb2.Control, belongs_to="exposure", shown_by="devices"),
     Topic(name=LATENCY, message=schemas_pb2.Latency, belongs_to="exposure", shown_by="devices"),
     Topic(name=LINK, message=schemas_pb2.LinkStatistics, shown_by="devices"),
     Topic(name=CLOCK, message=schemas_pb2.ClockSample, shown_by="devices"),

@@ -4,17 +4,19 @@ Each topic has a function that turns a batch of plain data into Rerun entities o
 calls them with a whole recording, `LiveView` with one exposure after the other.
 """
 
-from aolink.viewing.live import LiveView, live_viewer
-from aolink.viewing.save import save_rrd, send_recording
+from aolink.viewing.live import LiveView, live_viewer, serve, show
+from aolink.viewing.save import Look, save_rrd
 from aolink.viewing.viewer import check_display, open_viewer, screenshot, serve_web
 
 __all__ = [
     "LiveView",
+    "Look",
     "check_display",
     "live_viewer",
     "open_viewer",
     "save_rrd",
     "screenshot",
-    "send_recording",
+    "serve",
     "serve_web",
+    "show",
 ]

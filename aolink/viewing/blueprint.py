@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import rerun.blueprint as rrb
 
 from aolink.optics.sensor import SpotSensor
 from aolink.plotting.overview import NIS_COVERAGE
+from aolink.plotting.pupil import MAPS
 from aolink.plotting.style import BAND
 from aolink.recording import topics
 from aolink.rig import Rig
 from aolink.viewing.camera import HISTORY, profile_bounds
+from aolink.viewing.motion import MOST_STATES
 from aolink.viewing.scene import RESTORED_SCENE, RESTORED_SPOTS, SCENE, TRUE_SCENE
-from aolink.viewing.timebase import DEVICE_TIME, FAST_STEP
+from aolink.viewing.series import Drawing
+from aolink.viewing.timebase import FAST_STEP, TIME
 
 PATH_WINDOW = 2
 """Exposures that the path's view shows to each side of the time cursor."""
+
+
+_LEGEND_ROW, _LEGEND_MOST = 0.1, 0.65
+"""Height of a legend's row in a plot of the bottom row over the plot's own, and the most that all of them get."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +44,16 @@ class Contents:
     restored_spots: bool = False
     topics: frozenset[str] = frozenset()
     """Those of the devices that have messages."""
+    drawn: Drawing
+    """What its lines were drawn on."""
+    maps: Mapping[str, float] = field(default_factory=dict)
+    """Maps over the lenslets, and where the colours of each end."""
+    warnings: bool = False
+    """Whether anything went wrong."""
+    alone: bool = False
+    """Whether it is one exposure that is looked into."""
+    compared: Contents | None = None
+    """What is shown beside it."""
 
     @property
     def focus(self) -> str | None:
@@ -45,15 +62,22 @@ class Contents:
 
 
 def blueprint(contents: Contents) -> rrb.Blueprint:
-    """The layout: the exposure on top, the session's estimates below it, the devices at the bottom."""
-    exposure = rrb.Horizontal(_camera(contents), _profile(contents), _paths(contents), column_shares=[4, 4, 7])
-    rows: list[rrb.Container | rrb.View] = [exposure]
-    if contents.estimators:
-        beliefs = [*_errors(contents), *_nis(contents), _states(contents)]
-        rows.append(rrb.Horizontal(contents=beliefs))
-    bottom = _devices(contents)
-    rows.append(rrb.Horizontal(contents=bottom, column_shares=[2.0] * (len(bottom) - 1) + [3.0]))
-    layout: rrb.Container = rrb.Vertical(contents=rows, row_shares=[10, 7, 7] if len(rows) == 3 else [10, 7])
+    """The layout: the exposure on top, the session's estimates below it, the devices at the bottom.
+
+    Of one exposure alone: why its blur looks as it does, beside its paths and its frame.
+    """
+    layout: rrb.Container
+    if contents.alone:
+        beside = rrb.Vertical(contents=[_paths(contents), _camera(contents), _texts(contents)], row_shares=[3, 3, 1])
+        layout = rrb.Horizontal(_profile(contents), beside, column_shares=[3, 2])
+    else:
+        exposure = rrb.Horizontal(_camera(contents), _profile(contents), _paths(contents), column_shares=[4, 4, 7])
+        rows: list[rrb.Container | rrb.View] = [exposure]
+        if beliefs := [*_errors(contents), *_nis(contents), *_states(contents), *_maps(contents)]:
+            rows.append(rrb.Horizontal(contents=beliefs))
+        bottom = _devices(contents)
+        rows.append(rrb.Horizontal(contents=bottom, column_shares=[2.0] * (len(bottom) - 1) + [3.0]))
+        layout = rrb.Vertical(contents=rows, row_shares=[10, 7, 7] if len(rows) == 3 else [10, 7])
     if contents.scenes:
         scenes = rrb.Vertical(contents=[_scene(contents, path) for path in contents.scenes])
         layout = rrb.Horizontal(contents=[layout, scenes], column_shares=[4, 1])
@@ -61,131 +85,181 @@ def blueprint(contents: Contents) -> rrb.Blueprint:
         layout,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=FAST_STEP, fps=contents.rig.timing.exposure_steps),
+        rrb.TimePanel(state="collapsed", timeline=TIME),
     )
 
 
 def _camera(contents: Contents) -> rrb.Container | rrb.View:
-    """The last exposures; where there are many spots they are those of the first one, behind the whole frame."""
+    """The frame and the page that the exposure is on; a tab for what is compared with it."""
     sensor = contents.rig.sensor
-    rows, columns = sensor.shape
-    restored = [_picture(RESTORED_SPOTS, "Camera: frame restored (pixels)", rows, columns)]
-    restored = restored if contents.restored_spots else []
-    if not isinstance(sensor, SpotSensor):
-        history = _history(contents, "paths in their blur")
-        return rrb.Tabs(history, *restored, active_tab=0) if restored else history
-    shown = ["camera/image", *(f"camera/image/path/{name}" for name in ("truth", contents.focus) if name)]
-    frame = rrb.Spatial2DView(
-        name="Camera: frame (pixels), paths in their blur",
-        contents=_exactly(shown),
-        visual_bounds=rrb.VisualBounds2D(x_range=(0, columns), y_range=(0, rows)),
-    )
-    return rrb.Tabs(frame, _history(contents, "first spot along x"), *restored, active_tab=0)
+    views: list[rrb.View] = []
+    for each in (contents, contents.compared):
+        if each is None:
+            continue
+        root, title = each.drawn.root, "Compared: " if each.drawn.root else "Camera: "
+        if isinstance(sensor, SpotSensor):
+            shown = ["camera/image", *(f"camera/image/path/{name}" for name in _drawn_paths(each))]
+            views.append(_picture([root + path for path in shown], f"{title}frame (pixels), paths", *sensor.shape))
+        shown = ["camera/history", "camera/history/centroid", "camera/history/now"]
+        shown += [f"camera/history/path/{name}" for name in _drawn_paths(each)]
+        what = "paths in their blur" if not isinstance(sensor, SpotSensor) else "one spot along x"
+        name = f"{title}{HISTORY} exposures (pixels), {what}"
+        views.append(_picture([root + path for path in shown], name, HISTORY, sensor.profile.pixels))
+        if each.restored_spots:
+            views.append(_picture([root + RESTORED_SPOTS], f"{title}frame restored (pixels)", *sensor.shape))
+    if contents.alone and contents.restored_spots:
+        return rrb.Horizontal(contents=views)
+    return rrb.Tabs(contents=views, active_tab=0) if len(views) > 1 else views[0]
+
+
+def _drawn_paths(contents: Contents) -> list[str]:
+    """The truth, where it is known, and the estimator that is shown first."""
+    return [*(["truth"] if contents.truth else []), *([contents.focus] if contents.focus else [])]
 
 
 def _scene(contents: Contents, path: str) -> rrb.View:
     assert contents.rig.scene is not None
     name = {SCENE: "Scene as it came", RESTORED_SCENE: "Scene restored", TRUE_SCENE: "Scene at rest (truth)"}[path]
-    return _picture(path, f"{name} (pixels)", *contents.rig.scene.shape)
+    return _picture([path], f"{name} (pixels)", *contents.rig.scene.shape)
 
 
-def _picture(path: str, name: str, rows: int, columns: int) -> rrb.View:
+def _picture(paths: list[str], name: str, rows: int, columns: int) -> rrb.View:
     bounds = rrb.VisualBounds2D(x_range=(0, columns), y_range=(0, rows))
-    return rrb.Spatial2DView(name=name, contents=_exactly([path]), visual_bounds=bounds)
+    return rrb.Spatial2DView(name=name, contents=[f"+ /{path}" for path in paths], visual_bounds=bounds)
 
 
-def _history(contents: Contents, what: str) -> rrb.View:
-    shown = ["camera/history", "camera/history/centroid"]
-    shown += [f"camera/history/path/{name}" for name in ("truth", contents.focus) if name]
-    return rrb.Spatial2DView(
-        name=f"Camera: last {HISTORY} exposures (pixels), {what}",
-        contents=_exactly(shown),
-        visual_bounds=rrb.VisualBounds2D(x_range=(0, contents.rig.sensor.profile.pixels), y_range=(0, HISTORY)),
-    )
-
-
-def _profile(contents: Contents) -> rrb.View:
-    x_range, y_range = profile_bounds(contents.rig.sensor.profile, contents.density_top)
-    return rrb.Spatial2DView(
-        origin="profile",
-        name="Intensity density (1/slope unit) over slope",
-        visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
-    )
+def _profile(contents: Contents) -> rrb.Container | rrb.View:
+    """Why the blur looks as it does: path, histogram and intensity over one axis, with the key of all colours."""
+    views: list[rrb.View] = []
+    for each in (contents, contents.compared):
+        if each is None:
+            continue
+        names = 1 + len(each.estimators) + each.truth
+        x_range, y_range = profile_bounds(each.rig.sensor.profile, each.density_top, names)
+        title = "Compared: path" if each.drawn.root else "Path"
+        views.append(
+            rrb.Spatial2DView(
+                origin=f"{each.drawn.root}profile",
+                name=f"{title}; time at a place; intensity (1/slope unit) over slope",
+                visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
+            )
+        )
+    return rrb.Tabs(contents=views, active_tab=0) if len(views) > 1 else views[0]
 
 
 def _paths(contents: Contents) -> rrb.Container | rrb.View:
     """A tab for each estimator with its band, the one to look at first in front, and one with all of them."""
-    truth = ["path/truth", "path/truth/axes"] if contents.truth else []
+    truth = _path(contents, "truth") if contents.truth else []
     names = contents.estimators
+    what = ", y fainter" if len(contents.drawn.chosen.labels) > 1 else ""
     tabs = [
         _lines(
-            f"Path, {name} ± {BAND:g} sd (slope units)",
-            [*truth, f"path/{name}/mean", f"path/{name}/mean/axes", f"path/{name}/band"],
-            window=contents.rig,
+            contents, f"Path, {name} ± {BAND:g} sd (slope units{what})",
+            [*truth, *_path(contents, name), f"path/{name}/band"], window=not contents.alone,
         )
         for name in reversed(names)
-    ]
-    everyone = [p for name in names for p in (f"path/{name}/mean", f"path/{name}/mean/axes")]
-    tabs.append(_lines("Path, all (slope units)", [*truth, *everyone], window=contents.rig))
+    ]  # fmt: skip
+    if not truth and not names:
+        return rrb.TextDocumentView(origin="session", name="No paths: no estimates, no truth")
+    everyone = [path for name in names for path in _path(contents, name)]
+    tabs.append(_lines(contents, f"Path, all (slope units{what})", [*truth, *everyone], window=not contents.alone))
     return rrb.Tabs(contents=tabs, active_tab=0)
 
 
+def _path(contents: Contents, name: str, what: str = "path") -> list[str]:
+    """A path's line with its percentiles, or its range."""
+    root = f"{what}/{name}"
+    if contents.drawn.swinging.get(root):
+        return [f"{root}/range"]
+    line = root if name == "truth" or what != "path" else f"{root}/mean"
+    return [line, f"{line}/axes"]
+
+
 def _errors(contents: Contents) -> list[rrb.Container | rrb.View]:
-    if not contents.truth:
+    if not contents.truth or not contents.estimators:
         return []
     names = contents.estimators
-    return [
-        rrb.Tabs(
-            _lines("Path error, RMS an exposure (slope units)", _with_axes(f"error/path_rms/{n}" for n in names)),
+    every_step = [path for n in names for path in _path(contents, n, "error/path")]
+    views = [
+        _lines(contents, "Path error, RMS an exposure (slope units)", _with_axes(f"error/path_rms/{n}" for n in names)),
+        _lines(contents, "Path error at fast steps (slope units)", every_step, window=True),
+        *[
             _lines(
-                "Path error at each fast step (slope units)",
-                _with_axes(f"error/path/{n}" for n in names),
-                window=contents.rig,
-            ),
-            *[
-                _lines(
-                    f"End state x{i + 1} error (plant's units)", _with_axes(f"error/end/x{i + 1}/{n}" for n in names)
-                )
-                for i in range(contents.rig.plant.n_states)
-            ],
-            active_tab=0,
-        )
-    ]
+                contents, f"End state x{i + 1} error (plant's units)",
+                _with_axes(f"error/end/x{i + 1}/{n}" for n in names),
+            )
+            for i in range(_states_of(contents))
+        ],
+    ]  # fmt: skip
+    return [rrb.Tabs(contents=views, active_tab=0)]
 
 
 def _nis(contents: Contents) -> list[rrb.View]:
     shown = [p for n in contents.measuring for p in (f"nis/{n}/value", f"nis/{n}/value/axes", f"nis/{n}/bounds")]
-    return [_lines(f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds", shown)] if shown else []
+    return [_lines(contents, f"NIS (no unit) with its {NIS_COVERAGE:.0%} bounds", shown)] if shown else []
 
 
-def _states(contents: Contents) -> rrb.Container:
+def _states(contents: Contents) -> list[rrb.Container]:
     names = contents.estimators
     tabs = []
     for where in ("end", "start"):
-        for i in range(contents.rig.plant.n_states):
+        for i in range(_states_of(contents) if names else 0):
             root = f"state/{where}/x{i + 1}"
             shown = [f"{root}/truth"] if contents.truth else []
             shown += [f"{root}/{n}/mean" for n in names]
-            shown += [f"{root}/{contents.focus}/band"]
-            tabs.append(_lines(f"{where.capitalize()} state x{i + 1} (plant's units)", _with_axes(shown)))
-    return rrb.Tabs(contents=tabs, active_tab=0)
+            shown = [*_with_axes(shown), f"{root}/{contents.focus}/band"]
+            tabs.append(_lines(contents, f"{where.capitalize()} state x{i + 1} (plant's units)", shown))
+    return [rrb.Tabs(contents=tabs, active_tab=0)] if tabs else []
+
+
+def _states_of(contents: Contents) -> int:
+    return min(contents.rig.plant.n_states, MOST_STATES)
+
+
+def _maps(contents: Contents) -> list[rrb.Container]:
+    """Maps over the lenslets, as tabs."""
+    if not contents.maps:
+        return []
+    assert isinstance(contents.rig.sensor, SpotSensor)
+    views = []
+    for name, (title, unit, colours) in MAPS.items():
+        if name in contents.maps:
+            end = f"{contents.maps[name]:.2g}"
+            low = f"-{end}" if colours == "RdBu_r" else "0"
+            words = f"{title[0].upper()}{title[1:]} ({unit}), {low} to {end}"
+            views.append(_picture([f"pupil/{name}"], words, *contents.rig.sensor.grid))
+    return [rrb.Grid(contents=views, grid_columns=2)]
 
 
 def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
     views: list[rrb.Container | rrb.View] = []
     if contents.topics & {topics.COMMAND, topics.APPLIED}:
-        views.append(_lines("Mirror input (mirror's units)", _with_axes(["mirror/command", "mirror/applied"])))
-    if topics.LATENCY in contents.topics:
-        views.append(_lines("Latency since exposure end (ms)", ["latency/**"]))
-    health = [_lines("Lost since start (count)", ["link/lost/**"])]
-    if topics.LINK in contents.topics:
-        health = [
-            _lines("Lost and faulty since start (count)", ["link/lost/**", "link/faults/camera", "link/faults/mirror"]),
-            _lines("Link faults by cause (count)", ["link/faults/**"]),
-            _lines("Command round trip (ms)", ["link/round_trip/**"]),
-            _lines("Received (kB/s)", ["link/received/**"]),
+        shown = [
+            path for topic, path in ((topics.COMMAND, "mirror/command"), (topics.APPLIED, "mirror/applied"))
+            if topic in contents.topics
+        ]  # fmt: skip
+        views.append(_lines(contents, "Mirror input (mirror's units)", _with_axes(shown), legend=True))
+    if topics.CONTROL in contents.topics:
+        loop = [
+            ("Loop: what is left (slope units)", ["control/slope_rms", "control/path_rms"]),
+            ("Loop: delay (ms)", ["control/delay"]),
+            ("Loop: steps clipped (count)", ["control/clipped"]),
         ]
-    views.append(rrb.Tabs(contents=health, active_tab=0))
+        lines = [_lines(contents, title, shown, legend=True) for title, shown in loop]
+        views.append(rrb.Tabs(contents=lines, active_tab=0))
+    if topics.LATENCY in contents.topics:
+        views.append(_lines(contents, "Latency since exposure end (ms)", ["latency/**"], legend=True))
+    health = [_lines(contents, "Lost since start (count)", ["link/lost/**"], legend=True)]
+    if topics.LINK in contents.topics:
+        lost = ["link/lost/**", "link/faults/camera", "link/faults/mirror"]
+        health = [
+            _lines(contents, "Lost and faulty since start (count)", lost, legend=True),
+            _lines(contents, "Link faults by cause (count)", ["link/faults/**"], legend=True),
+            _lines(contents, "Command round trip (ms)", ["link/round_trip/**"], legend=True),
+            _lines(contents, "Received (kB/s)", ["link/received/**"], legend=True),
+        ]
+    if topics.EXPOSURE in contents.topics:
+        views.append(rrb.Tabs(contents=health, active_tab=0))
     if topics.CLOCK in contents.topics:
         clocks = [
             ("sigma", "Clock offset sd (µs)"),
@@ -193,37 +267,75 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
             ("frequency", "Clock rate (ppm)"),
             ("round_trip", "Clock round trip (µs)"),
         ]
-        views.append(rrb.Tabs(contents=[_lines(title, [f"clock/{name}/**"]) for name, title in clocks], active_tab=0))
-    views.append(rrb.StateTimelineView(origin="status", name="Status of estimators and mirror"))
-    texts: list[rrb.View] = [rrb.TextDocumentView(origin="session", name="Session")]
-    if topics.LOG in contents.topics:
-        texts.append(rrb.TextLogView(origin="log", name="Log"))
-    views.append(rrb.Tabs(contents=texts, active_tab=0))
+        lines = [_lines(contents, title, [f"clock/{name}/**"], legend=True) for name, title in clocks]
+        views.append(rrb.Tabs(contents=lines, active_tab=0))
+    views.append(rrb.StateTimelineView(origin="status", name="Exposures, status of estimators and mirror"))
+    views.append(_texts(contents))
     return views
 
 
-def _lines(name: str, shown: list[str], *, window: Rig | None = None) -> rrb.TimeSeriesView:
-    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor."""
-    if window is None:
+def _texts(contents: Contents) -> rrb.Container:
+    texts: list[rrb.View] = [rrb.TextDocumentView(origin="session", name="Session")]
+    if contents.warnings:
+        texts.append(rrb.TextLogView(origin="warnings", name="Warnings"))
+    if topics.LOG in contents.topics:
+        texts.append(rrb.TextLogView(origin="log", name="Log"))
+    if contents.compared:
+        texts.append(rrb.TextDocumentView(origin=f"{contents.compared.drawn.root}session", name="Compared"))
+    return rrb.Tabs(contents=texts, active_tab=0)
+
+
+def _lines(
+    contents: Contents, name: str, shown: list[str], *, window: bool = False, legend: bool = False
+) -> rrb.TimeSeriesView:  # fmt: skip
+    """A plot over time: of the whole session, or of `PATH_WINDOW` exposures about the time cursor.
+
+    A ``legend`` stands above the lines; where there is none the profile's key has the colours.
+    """
+    axis_y = _room_above(contents, shown) if legend else None
+    corner = rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend)
+    expressions = [f"+ /{path}" for path in _with_compared(contents, shown)]
+    if not window:
         whole = rrb.TimeRange(rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.infinite())
+        axis_x = rrb.archetypes.TimeAxis(view_range=whole)
         return rrb.TimeSeriesView(
-            name=name,
-            contents=_exactly(shown),
-            axis_x=rrb.archetypes.TimeAxis(view_range=whole),
-            plot_legend=rrb.Corner2D.LeftTop,
-        )
-    steps = PATH_WINDOW * window.timing.frame_period_steps
-    seconds = steps * window.timing.fast_step_s
+            name=name, contents=expressions, axis_x=axis_x, axis_y=axis_y, plot_legend=corner
+        )  # fmt: skip
+    timing = contents.rig.timing
+    steps = PATH_WINDOW * timing.frame_period_steps
     near = rrb.TimeRangeBoundary.cursor_relative
     ranges = [
         rrb.VisibleTimeRange(FAST_STEP, start=near(seq=-steps), end=near(seq=steps)),
-        rrb.VisibleTimeRange(DEVICE_TIME, start=near(seconds=-seconds), end=near(seconds=seconds)),
+        rrb.VisibleTimeRange(
+            TIME, start=near(seconds=-steps * timing.fast_step_s), end=near(seconds=steps * timing.fast_step_s)
+        ),
     ]
-    return rrb.TimeSeriesView(name=name, contents=_exactly(shown), time_ranges=ranges, plot_legend=rrb.Corner2D.LeftTop)
+    return rrb.TimeSeriesView(name=name, contents=expressions, time_ranges=ranges, plot_legend=corner)
 
 
-def _exactly(paths: Iterable[str]) -> list[str]:
-    return [f"+ /{path}" for path in paths]
+def _room_above(contents: Contents, shown: list[str]) -> rrb.ScalarAxis | None:
+    """An axis with room above the lines for a legend of them all; None where nothing is known of them yet."""
+    found = [(path, ends) for path, ends in contents.drawn.extents.items() if any(_names(each, path) for each in shown)]
+    if not found:
+        return None
+    low, high = min(ends[0] for _, ends in found), max(ends[1] for _, ends in found)
+    span = high - low or abs(high) or 1.0
+    share = min(_LEGEND_MOST, _LEGEND_ROW * (len(found) + 1))
+    return rrb.ScalarAxis(range=(low - 0.05 * span, low + span / (1 - share)))
+
+
+def _names(expression: str, path: str) -> bool:
+    """Whether an expression of a view is of a path."""
+    return path == expression or (expression.endswith("/**") and path.startswith(expression[:-2]))
+
+
+def _with_compared(contents: Contents, paths: Iterable[str]) -> list[str]:
+    """The paths, and beside each its twin of the recording that is compared."""
+    every = list(paths)
+    if contents.compared is not None:
+        there, root = contents.compared.drawn.extents, contents.compared.drawn.root
+        every += [root + path for path in paths if any(_names(path, each) for each in there)]
+    return every
 
 
 def _with_axes(paths: Iterable[str]) -> list[str]:

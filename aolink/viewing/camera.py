@@ -1,12 +1,12 @@
-"""What the camera saw: frames, the last exposures under each other, the intensity profile.
+"""What the camera saw: frames, pages of exposures under each other, the intensity profile.
 
-The last exposures are one picture: a row each, the newest at the bottom, and time runs down inside a row
-too, so that a path is drawn as a line through the blur that it made.
+A page is one picture of neighbouring exposures: a row each, and time runs down inside a row too, so that a path is
+drawn as a line through the blur that it made.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -21,7 +21,9 @@ from aolink.exposure import Exposure
 from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
+from aolink.plotting.style import extremes, hides_swings
 from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH
+from aolink.viewing.series import POINTS, Drawing
 from aolink.viewing.timebase import Timebase
 
 FloatArray = NDArray[np.float64]
@@ -29,11 +31,23 @@ Paths = Mapping[str, Mapping[int, FloatArray]]
 """Name (``truth`` or an estimator's) and frame id -> spot position at each fast step, slope units, (n_steps,)."""
 
 HISTORY = 32
-"""Exposures in the picture of the last ones."""
-PROFILE_ASPECT = 0.7
-"""Height of the profile's plot over its width."""
+"""Exposures on a page."""
+_PANELS = (0.20, 0.16, 0.32)
+"""Heights of the profile's panels over the width of all: path, how long the spot was where, intensity."""
+_GAP = 0.03
+"""Between them."""
+_KEY_ROW, _KEY_COLUMNS = 0.095, 5
+"""Height of a row of the key over the width, and names in it."""
+_MOST = 1.0 + _GAP / _PANELS[2]
+"""Of a predicted intensity over the panel's top: what is higher would be in the panel above."""
+_LIGHT = 2.5
+"""Top of the histogram over that of the intensity, which is the histogram blurred."""
 _POINTS_IN_ROW = 21
-"""Of a path inside one row of the picture: more than can be told apart."""
+"""Of a path inside one row of a page: more than can be told apart."""
+_SWINGS_IN_ROW = 5
+"""A path over some pixels that a line through so many points would miss is drawn as its range: a row is not high."""
+_PIXELS = 6.0
+"""That it has to move by."""
 _POINTS_OF_SPOT = 51
 """Of a spot's path on the frame."""
 _BRIGHTEST = 190
@@ -65,29 +79,29 @@ def density_top(sensor: Sensor, exposures: Sequence[Exposure]) -> float:
     return top if top > pixel_noise_sd(sensor) else sensor.peak_density
 
 
-def log_frames(stream: rr.RecordingStream, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
+def log_frames(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
     """Frames as the camera sent them, in counts: ``/camera/image``. All have one shape."""
     rows, columns = exposures[0].pixels.shape
     layout = rr.components.ImageFormat(width=columns, height=rows, color_model="L", channel_datatype="U16")
-    stream.log("camera/image", rr.Image.from_fields(format=layout), static=True)
+    drawing.log("camera/image", rr.Image.from_fields(format=layout))
     buffers = np.stack([e.pixels.astype("<u2").ravel().view(np.uint8) for e in exposures])
-    _send_at_starts(stream, "camera/image", timebase, exposures, rr.Image.columns(buffer=buffers))
+    _send_at_starts(drawing, "camera/image", timebase, exposures, rr.Image.columns(buffer=buffers))
 
 
-def first_profiles(sensor: BaseSensor, exposures: Sequence[Exposure]) -> list[Exposure]:
-    """The exposures as ``sensor.profile`` would have seen them: of many spots, the first one along x."""
+def one_profile(sensor: BaseSensor, exposures: Sequence[Exposure], output: int) -> list[Exposure]:
+    """The exposures as ``sensor.profile`` would have seen them: of many spots, one along x or y."""
     if not isinstance(sensor, SpotSensor):
         return list(exposures)
     seen = []
     for exposure in exposures:
         found = profiles(sensor, exposure.pixels, exposure.mask)
-        counts: NDArray[Any] = found.counts[:1]
-        seen.append(replace(exposure, pixels=counts, mask=found.mask[:1]))
+        counts: NDArray[Any] = found.counts[output : output + 1]
+        seen.append(replace(exposure, pixels=counts, mask=found.mask[output : output + 1]))
     return seen
 
 
 def log_spot_paths(
-    stream: rr.RecordingStream, sensor: SpotSensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
+    drawing: Drawing, sensor: SpotSensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
     by_frame: Mapping[int, FloatArray],
 ) -> None:  # fmt: skip
     """Paths of all spots over the frame, in its pixels: ``/camera/image/path/NAME``.
@@ -108,109 +122,209 @@ def log_spot_paths(
         inside = np.clip((path[:, some] - sensor.field[0]) / sensor.pixel_width, 0, width)
         spots = inside.reshape(sensor.spots, 2, -1).swapaxes(1, 2) + corner[:, None]
         strips.append(list(spots.astype(np.float32)))
-    _send_strips(stream, f"camera/image/path/{name}", timebase, known, strips, colour_of(name), 1.5)
+    _send_strips(drawing, f"camera/image/path/{name}", timebase, known, strips, colour_of(name), 1.5)
 
 
-def log_history(
-    stream: rr.RecordingStream,
-    sensor: Sensor,
-    timebase: Timebase,
-    exposures: Sequence[Exposure],
-    paths: Paths,
-    top: float,
-    *,
-    since: int = 0,
-) -> None:
-    """The last `HISTORY` exposures under each other with the paths through them: ``/camera/history``.
+def page_of(exposure: Exposure, first_frame: int) -> int:
+    """Number of the page that an exposure is on, of a session that began with a frame."""
+    return (exposure.frame_id - first_frame) // HISTORY
+
+
+def log_page(
+    drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], paths: Paths, top: float, *,
+    until: int | None = None, at: Exposure | None = None,
+) -> None:  # fmt: skip
+    """A page of exposures under each other with the paths through them: ``/camera/history``.
 
     Parameters
     ----------
     exposures:
-        In order. Each from number ``since`` on gets a picture of itself and those before it in this sequence.
+        Those of one page, in order.
     top:
         Density that is drawn brightest.
+    until:
+        The frame that came after them: those on the page before it that are not here were lost.
+    at:
+        At the start of which exposure it appears; by default of the first.
     """
-    n = sensor.pixels
+    n, first = sensor.pixels, timebase.frame_id
+    origin = first + HISTORY * page_of(exposures[0], first)
+    rows = [e.frame_id - origin for e in exposures]
     profiles = np.stack([density(sensor, e) for e in exposures])
     grey = np.clip(np.nan_to_num(profiles) / top, 0, 1) ** 0.7 * _BRIGHTEST
-    rows = np.repeat(grey[:, :, None], 3, axis=2).astype(np.uint8)
-    rows[np.isnan(profiles)] = MISSING
-    drawn = range(since, len(exposures))
-    pictures = np.empty((len(drawn), HISTORY, n, 3), dtype=np.uint8)
-    pictures[:] = MISSING
-    for picture, j in zip(pictures, drawn, strict=True):
-        picture[: max(0, HISTORY - 1 - (exposures[j].frame_id - exposures[0].frame_id))] = NOTHING
-        for k, row in _visible(exposures, j):
-            picture[row] = rows[k]
+    shades = np.repeat(grey[:, :, None], 3, axis=2).astype(np.uint8)
+    shades[np.isnan(profiles)] = MISSING
+    picture = np.empty((HISTORY, n, 3), dtype=np.uint8)
+    picture[:] = NOTHING
+    picture[: rows[-1] if until is None else max(0, until - origin)] = MISSING
+    picture[rows] = shades
     layout = rr.components.ImageFormat(width=n, height=HISTORY, color_model="RGB", channel_datatype="U8")
-    stream.log("camera/history", rr.Image.from_fields(format=layout), static=True)
-    buffers = pictures.reshape(len(drawn), -1)
-    _send_at_starts(stream, "camera/history", timebase, exposures[since:], rr.Image.columns(buffer=buffers))
-    _log_centroids(stream, sensor, timebase, exposures, profiles, drawn)
+    drawing.log("camera/history", rr.Image.from_fields(format=layout))
+    shown = [at or exposures[0]]
+    _send_at_starts(drawing, "camera/history", timebase, shown, rr.Image.columns(buffer=picture.reshape(1, -1)))
+    slopes = [
+        centroid(sensor, p) if e.slopes is None else e.slopes[drawing.chosen.outputs[0]]
+        for e, p in zip(exposures, profiles, strict=True)
+    ]
+    points = np.stack([(np.array(slopes) - sensor.field[0]) / sensor.pixel_width, np.array(rows) + 0.5], axis=1)
+    look = rr.Points2D.from_fields(colors=(235, 235, 235), radii=rr.Radius.ui_points(2.5))
+    drawing.log("camera/history/centroid", look)
+    columns = rr.Points2D.columns(positions=points.astype(np.float32)).partition([len(points)])
+    _send_at_starts(drawing, "camera/history/centroid", timebase, shown, columns)
     for name, by_frame in paths.items():
-        _log_history_path(stream, sensor, timebase, exposures, name, by_frame, drawn)
+        strips = []
+        for row, exposure in zip(rows, exposures, strict=True):
+            if (path := by_frame.get(exposure.frame_id)) is not None:
+                if np.ptp(path) > _PIXELS * sensor.pixel_width and hides_swings(path, _SWINGS_IN_ROW):
+                    edges: tuple[FloatArray, ...] = extremes(path, _SWINGS_IN_ROW)
+                    places = (np.arange(len(edges[0])) + 0.5) / len(edges[0])
+                else:
+                    some = _points_in_row(len(path))
+                    edges, places = (path[some],), (some + 0.5) / len(path)
+                for edge in edges:
+                    x = np.clip((edge - sensor.field[0]) / sensor.pixel_width, 0, n)
+                    strips.append(np.stack([x, row + places], axis=1).astype(np.float32))
+        if strips:
+            _send_strips(drawing, f"camera/history/path/{name}", timebase, shown, [strips], colour_of(name), 1.5)
 
 
-def log_profile_axes(stream: rr.RecordingStream, sensor: Sensor, top: float) -> None:
-    """Grid and numbers of the profile's plot, whose lines Rerun has no other view for: ``/profile/axes``."""
+def log_now(drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
+    """A frame about each exposure's row of its page: ``/camera/history/now``."""
+    corners = np.array([(0, 0), (sensor.pixels, 0), (sensor.pixels, 1), (0, 1), (0, 0)], dtype=np.float32)
+    rows = [(e.frame_id - timebase.frame_id) % HISTORY for e in exposures]
+    strips = [[corners + np.array((0, row), dtype=np.float32)] for row in rows]
+    _send_strips(drawing, "camera/history/now", timebase, exposures, strips, (235, 235, 235), 1.0)
+
+
+def log_profile_axes(drawing: Drawing, sensor: Sensor, top: float, names: Sequence[str]) -> None:
+    """Grids, numbers and the key of the profile's plot, which Rerun has no view for: ``/profile/axes``.
+
+    The key has the colour of each of ``names`` and of what was measured; they are the same in all views.
+    """
     low, high = sensor.field
-    place = _profile_place(sensor, top)
-    slopes = _ticks(low, high)
-    heights = _ticks(0.0, top)
-    grid = [place([(x, 0.0), (x, top)]) for x in slopes] + [place([(low, y), (high, y)]) for y in heights]
+    place = Panels(sensor, top)
+    slopes, heights = _ticks(low, high), _ticks(0.0, top)
+    edges = [place.path, place.histogram, place.intensity]
+    grid = [panel(np.array([(x, 0.0), (x, 1.0)])) for panel in edges for x in slopes]
+    grid += [panel(np.array([(low, y), (high, y)])) for panel in edges for y in (0.0, 1.0)]
+    grid += [place.intensity(np.array([(low, y / top), (high, y / top)])) for y in heights[1:]]
     fine = rr.Radius.ui_points(0.5)
-    stream.log("profile/axes", rr.LineStrips2D(grid, colors=(90, 90, 90), radii=fine, draw_order=1.0), static=True)
-    names = [f"{x:g}" for x in slopes] + [f"{y:g}" for y in heights[1:]]
+    drawing.log("profile/axes", rr.LineStrips2D(grid, colors=(90, 90, 90), radii=fine, draw_order=1.0))
     left = low - 0.05 * (high - low)
-    below = _depth(sensor, top)
-    places = place([(x, -below) for x in slopes] + [(left, y) for y in heights[1:]])
-    numbers = rr.Points2D(places, labels=names, radii=rr.Radius.ui_points(0), colors=(140, 140, 140), show_labels=True)
-    stream.log("profile/axes/numbers", numbers, static=True)
+    below = place.depth / top + 0.08
+    places = [place.intensity(np.array([(x, -below)])) for x in slopes]
+    places += [place.intensity(np.array([(left, y / top)])) for y in heights[1:]]
+    numbers = [f"{x:g}" for x in slopes] + [f"{y:g}" for y in heights[1:]]
+    points = rr.Points2D(
+        np.concatenate(places), labels=numbers, radii=rr.Radius.ui_points(0), colors=(140, 140, 140), show_labels=True
+    )
+    drawing.log("profile/axes/numbers", points)
+    shown = ["measured", *names]
+    colours = [MEASURED, *map(colour_of, names)]
+    at = [place.key(k) for k in range(len(shown))]
+    named = rr.Points2D(at, labels=shown, colors=colours, radii=rr.Radius.ui_points(0), show_labels=True)
+    drawing.log("profile/key", named)
 
 
 def log_measured_profile(
-    stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], top: float
+    drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], top: float
 ) -> None:
     """Measured density over slope as a staircase of pixels: ``/profile/measured``."""
-    place = _profile_place(sensor, top)
+    place = Panels(sensor, top)
     slopes = np.repeat(sensor.edges, 2)[1:-1]
-    strips = [place(np.stack([slopes, np.repeat(np.nan_to_num(density(sensor, e)), 2)], axis=1)) for e in exposures]
-    _send_strips(stream, "profile/measured", timebase, exposures, [[s] for s in strips], MEASURED, 1.0)
+    seen = [np.repeat(np.nan_to_num(density(sensor, e)), 2) / top for e in exposures]
+    strips = [[place.intensity(np.stack([slopes, each], axis=1))] for each in seen]
+    _send_strips(drawing, "profile/measured", timebase, exposures, strips, MEASURED, 1.0)
 
 
-def log_predicted_profile(
-    stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
-    by_frame: Mapping[int, FloatArray], top: float,
+def log_path_profile(
+    drawing: Drawing, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
+    by_frame: Mapping[int, FloatArray], top: float, light: float = 1.0,
 ) -> None:  # fmt: skip
-    """Density that the kernel leaves along a path: ``/profile/predicted/NAME``."""
-    place = _profile_place(sensor, top)
+    """Why the blur looks as it does: a path, how long the spot was where, and what the kernel makes of that.
+
+    ``/profile/path/NAME`` (time runs upwards), ``/profile/histogram/NAME`` and ``/profile/predicted/NAME``, both as
+    densities over the same slopes. ``light`` is the spot's share of its light.
+    """
+    place = Panels(sensor, top)
     known = [e for e in exposures if e.frame_id in by_frame]
-    profiles = [exposure_density(sensor.kernel, sensor.edges, by_frame[e.frame_id]) for e in known]
-    strips = [[place(np.stack([sensor.centres, profile], axis=1))] for profile in profiles]
-    _send_strips(stream, f"profile/predicted/{name}", timebase, known, strips, colour_of(name), 1.5)
+    colour, field = colour_of(name), sensor.field
+    lines, stairs, profiles = [], [], []
+    for exposure in known:
+        path = by_frame[exposure.frame_id]
+        some = np.unique(np.linspace(0, len(path) - 1, POINTS).astype(int))
+        shares = np.clip((some + 0.5) / len(path), 0, 1)
+        lines.append([place.path(np.stack([np.clip(path[some], *field), shares], axis=1))])
+        stairs.append([place.histogram(_histogram(sensor, path, _LIGHT * top))])
+        predicted = light * exposure_density(sensor.kernel, sensor.edges, path) / top
+        profiles.append([place.intensity(np.stack([sensor.centres, np.minimum(predicted, _MOST)], axis=1))])
+    _send_strips(drawing, f"profile/path/{name}", timebase, known, lines, colour, 1.2)
+    _send_strips(drawing, f"profile/histogram/{name}", timebase, known, stairs, colour, 1.2)
+    _send_strips(drawing, f"profile/predicted/{name}", timebase, known, profiles, colour, 1.5)
 
 
-def profile_bounds(sensor: Sensor, top: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Range of the profile's plot in its drawing units: x, and y downwards."""
-    low, high = sensor.field
-    width = high - low
-    unit = PROFILE_ASPECT * width / top
-    return (low - 0.1 * width, high + 0.05 * width), (-1.06 * top * unit, (_depth(sensor, top) + 0.14 * top) * unit)
+def profile_bounds(sensor: Sensor, top: float, names: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Range of the profile's plot with a key of so many names in its drawing units: x, and y downwards."""
+    (low, high), place = sensor.field, Panels(sensor, top)
+    bottom = place.intensity(np.array([(low, -place.depth / top - 0.15)]))[0, 1]
+    return (low - 0.1 * (high - low), high + 0.05 * (high - low)), (
+        float(place.key(names - 1)[1]) - 0.08 * (high - low),
+        float(bottom),
+    )
 
 
-def _depth(sensor: Sensor, top: float) -> float:
-    """How far the noise reaches below zero: what is written under the plot goes there."""
-    return max(0.08 * top, 2.5 * pixel_noise_sd(sensor))
+class Panels:
+    """Where the three panels of the profile's plot lie in its drawing units: slope to the right, y downwards.
+
+    The path is above, then its histogram, and the intensity's zero is at y = 0.
+
+    Each panel takes points (slope, height from 0 to 1), (n, 2).
+    """
+
+    def __init__(self, sensor: Sensor, top: float) -> None:
+        self._low, high = sensor.field
+        self._width = high - self._low
+        self.depth = max(0.08 * top, 2.5 * pixel_noise_sd(sensor))
+        """How far the noise reaches below zero, in density: what is written under the plot goes there."""
+
+    def path(self, points: FloatArray) -> NDArray[np.float32]:
+        """Upwards: time in the exposure."""
+        return self._panel(points, 0)
+
+    def histogram(self, points: FloatArray) -> NDArray[np.float32]:
+        """Upwards: how long the spot was where."""
+        return self._panel(points, 1)
+
+    def intensity(self, points: FloatArray) -> NDArray[np.float32]:
+        """Upwards: intensity density."""
+        return self._panel(points, 2)
+
+    def key(self, number: int) -> NDArray[np.float32]:
+        """Middle of the ``number``-th name, above the panels, (2,)."""
+        row, column = divmod(number, _KEY_COLUMNS)
+        return np.array(
+            [
+                self._low + (column + 0.5) / _KEY_COLUMNS * self._width,
+                -(sum(_PANELS) + 2 * _GAP + (row + 1) * _KEY_ROW) * self._width,
+            ],
+            dtype=np.float32,
+        )
+
+    def _panel(self, points: FloatArray, number: int) -> NDArray[np.float32]:
+        base = -self._width * (sum(_PANELS[number + 1 :]) + (2 - number) * _GAP)
+        return np.stack([points[:, 0], base - _PANELS[number] * self._width * points[:, 1]], axis=1, dtype=np.float32)
 
 
-def _profile_place(sensor: Sensor, top: float) -> Callable[[object], NDArray[np.float32]]:
-    """From (slope, density) to where it is drawn: slope itself, density scaled and upwards."""
-    scale = -PROFILE_ASPECT * (sensor.field[1] - sensor.field[0]) / top
-
-    def place(points: object) -> NDArray[np.float32]:
-        return np.asarray(np.asarray(points, dtype=np.float64) * [1.0, scale], dtype=np.float32)
-
-    return place
+def _histogram(sensor: Sensor, path: FloatArray, top: float) -> FloatArray:
+    """How long a path was where as stairs of half a pixel, (n, 2): slope, density over ``top``."""
+    half = 0.5 * sensor.pixel_width
+    last = 2 * sensor.pixels - 1
+    bins = np.clip(((path - sensor.field[0]) / half).astype(int), 0, last)
+    low, high = int(bins.min()), int(bins.max())
+    density = np.bincount(bins - low, minlength=high - low + 1) / (len(path) * half) / top
+    edges = sensor.field[0] + half * np.arange(low, high + 2)
+    heights = np.concatenate([[0.0], np.repeat(np.minimum(density, 1.0), 2), [0.0]])
+    return np.stack([np.repeat(edges, 2), heights], axis=1)
 
 
 def _ticks(low: float, high: float) -> list[float]:
@@ -222,68 +336,27 @@ def _ticks(low: float, high: float) -> list[float]:
     return [float(k * step) for k in np.arange(first, last + 1)]
 
 
-def _visible(exposures: Sequence[Exposure], j: int) -> list[tuple[int, int]]:
-    """Indices of exposure ``j`` and those before it that fit into the picture, each with its row."""
-    newest = exposures[j].frame_id
-    rows = [(k, HISTORY - 1 - (newest - exposures[k].frame_id)) for k in range(max(0, j - HISTORY + 1), j + 1)]
-    return [(k, row) for k, row in rows if 0 <= row < HISTORY]
-
-
 @lru_cache(maxsize=8)
 def _points_in_row(n_steps: int) -> NDArray[np.int64]:
     """Which steps of a path are drawn in its row of the history."""
     return np.unique(np.linspace(0, n_steps - 1, min(_POINTS_IN_ROW, n_steps)).astype(np.int64))
 
 
-def _log_history_path(
-    stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
-    by_frame: Mapping[int, FloatArray], shown: range,
-) -> None:  # fmt: skip
-    drawn: dict[int, NDArray[np.float32]] = {}
-    for k, exposure in enumerate(exposures):
-        if (path := by_frame.get(exposure.frame_id)) is not None:
-            some = _points_in_row(len(path))
-            x = np.clip((path[some] - sensor.field[0]) / sensor.pixel_width, 0, sensor.pixels)
-            drawn[k] = np.stack([x, (some + 0.5) / len(path)], axis=1).astype(np.float32)
-    strips = [
-        [drawn[k] + np.array([0, row], dtype=np.float32) for k, row in _visible(exposures, j) if k in drawn]
-        for j in shown
-    ]
-    _send_strips(
-        stream, f"camera/history/path/{name}", timebase, exposures[shown.start :], strips, colour_of(name), 1.5
-    )
-
-
-def _log_centroids(
-    stream: rr.RecordingStream, sensor: Sensor, timebase: Timebase, exposures: Sequence[Exposure],
-    profiles: FloatArray, shown: range,
-) -> None:  # fmt: skip
-    slopes = [
-        centroid(sensor, p) if e.slopes is None else e.slopes[0] for e, p in zip(exposures, profiles, strict=True)
-    ]
-    x = [(slope - sensor.field[0]) / sensor.pixel_width for slope in slopes]
-    points = [[(x[k], row + 0.5) for k, row in _visible(exposures, j)] for j in shown]
-    path = "camera/history/centroid"
-    stream.log(path, rr.Points2D.from_fields(colors=(235, 235, 235), radii=rr.Radius.ui_points(2.5)), static=True)
-    columns = rr.Points2D.columns(positions=np.concatenate([np.array(p, dtype=np.float32) for p in points]))
-    _send_at_starts(stream, path, timebase, exposures[shown.start :], columns.partition([len(p) for p in points]))
-
-
 def _send_strips(
-    stream: rr.RecordingStream, path: str, timebase: Timebase, exposures: Sequence[Exposure],
+    drawing: Drawing, path: str, timebase: Timebase, exposures: Sequence[Exposure],
     strips: Sequence[Sequence[NDArray[np.float32]]], colour: Colour, radius: float,
 ) -> None:  # fmt: skip
     flat = [strip for group in strips for strip in group]
     if not flat:
         return
-    stream.log(path, rr.LineStrips2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius)), static=True)
+    drawing.log(path, rr.LineStrips2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius)))
     alike = len({strip.shape for strip in flat}) == 1  # as one array it is packed at once, not strip by strip
     columns = rr.LineStrips2D.columns(strips=np.array(flat) if alike else flat).partition([len(g) for g in strips])
-    _send_at_starts(stream, path, timebase, exposures, columns)
+    _send_at_starts(drawing, path, timebase, exposures, columns)
 
 
 def _send_at_starts(
-    stream: rr.RecordingStream,
+    drawing: Drawing,
     path: str,
     timebase: Timebase,
     exposures: Sequence[Exposure],
@@ -291,4 +364,4 @@ def _send_at_starts(
 ) -> None:
     """Send one row an exposure, at its start."""
     steps = [e.first_step for e in exposures]
-    stream.send_columns(path, timebase.at_steps(steps, [e.frame_id for e in exposures]), columns)
+    drawing.send_columns(path, timebase.at_steps(steps, [e.frame_id for e in exposures]), columns)

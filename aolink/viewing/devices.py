@@ -10,15 +10,17 @@ import rerun as rr
 
 from aolink.colours import estimator_colour
 from aolink.plotting.devices import LATENCY_STEPS
-from aolink.recording import topics
+from aolink.recording import schemas_pb2, topics
 from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
-from aolink.viewing.series import Style, send_axes, send_line, send_states
+from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_states, some_rows
 from aolink.viewing.timebase import Timebase
 from aolink.wire.messages_pb2 import Applied
 
 LINK_COUNTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplicates", "retransmits", "reports_asked")
 """Fields of LinkStatistics that count faults."""
 
+_MOST_INPUTS = 2
+"""That are lines of their own; of more it is the first ones, and percentiles of all."""
 _LEVELS = dict(enumerate(("TRACE", "DEBUG", "INFO", "WARN", "ERROR", "CRITICAL")))
 """Rerun's levels by the number of foxglove's."""
 
@@ -33,28 +35,25 @@ class Timed(Protocol):
     def message(self) -> Any: ...
 
 
-def log_commands(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
+def log_commands(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Commands as sent (CommandBlock), at every fast step: ``/mirror/command``, in the mirror's unit."""
     blocks = [r.message for r in records]
-    _send_blocks(stream, "mirror/command", timebase, blocks, Style("commanded", COMMANDED, width=1.0, steps=True))
+    _send_blocks(drawing, "mirror/command", timebase, blocks, Style("commanded", COMMANDED, width=1.0, steps=True))
 
 
-def log_applied(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
+def log_applied(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """What the mirror held (Applied), at every fast step: ``/mirror/applied``; and why: ``/status/mirror``."""
     # A report that was asked for again came out of order; what was never reported shows only in the status.
     blocks = sorted((r.message for r in records if r.message.source != Applied.AWAITED), key=lambda b: b.first_step)
     if not blocks:
         return
-    _send_blocks(stream, "mirror/applied", timebase, blocks, Style("applied", APPLIED, width=3.5, steps=True))
-    changes = [
-        b for before, b in zip([None, *blocks], blocks, strict=False) if before is None or before.source != b.source
-    ]
+    _send_blocks(drawing, "mirror/applied", timebase, blocks, Style("applied", APPLIED, width=3.5, steps=True))
     sources = Applied.Source.DESCRIPTOR.values_by_number
-    names = [sources[b.source].name if b.source in sources else f"UNKNOWN {b.source}" for b in changes]
-    send_states(stream, "status/mirror", timebase.at_steps([b.first_step for b in changes]), names)
+    names = [sources[b.source].name if b.source in sources else f"UNKNOWN {b.source}" for b in blocks]
+    send_states(drawing, "status/mirror", timebase, [b.first_step for b in blocks], names)
 
 
-def log_latency(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
+def log_latency(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Time since the end of the exposure at which each step of the loop was done, ms: ``/latency/STEP``.
 
     The lines lie above each other in the order of the steps: the distance between two is one step's time.
@@ -66,37 +65,30 @@ def log_latency(stream: rr.RecordingStream, timebase: Timebase, records: Sequenc
         milliseconds = [(t - m.exposure_end_ns) / 1e6 if t else np.nan for t, m in zip(at, latencies, strict=True)]
         if not np.isnan(milliseconds).all():
             send_line(
-                stream, f"latency/{field.removesuffix('_ns')}", times, milliseconds, Style(name, series_colour(i))
+                drawing, f"latency/{field.removesuffix('_ns')}", times, milliseconds, Style(name, series_colour(i))
             )
 
 
-def log_estimation(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
-    """What an estimator had time for: ``/latency/estimation/NAME``, ms for each estimate; ``/status/NAME`` where it
-    skipped an exposure.
-    """
-    accounts = [r.message for r in records]
-    name = accounts[0].estimator
-    made, skipped = [m for m in accounts if not m.skipped], [m for m in accounts if m.skipped]
+def log_estimation(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
+    """How long an estimator took for each estimate, ms: ``/latency/estimation/NAME``."""
+    name, made = records[0].message.estimator, [r.message for r in records if not r.message.skipped]
     if made:
         times = timebase.at_frames([m.frame_id for m in made])
         style = Style(f"{name} takes", estimator_colour(name))
-        send_line(stream, f"latency/estimation/{name}", times, [m.took_ns / 1e6 for m in made], style)
-    if skipped:
-        times = timebase.at_frames([m.frame_id for m in skipped])
-        send_states(stream, f"status/{name}", times, ["SKIPPED"] * len(skipped))
+        send_line(drawing, f"latency/estimation/{name}", times, [m.took_ns / 1e6 for m in made], style)
 
 
-def log_drops(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
+def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Frames and chunks lost since the start, from ExposureInfo: ``/link/lost/frames``, ``/link/lost/chunks``."""
     infos = [r.message for r in records]
     times = timebase.at_steps([m.first_step for m in infos], [m.frame_id for m in infos])
     frames = np.cumsum([m.frames_lost_before for m in infos])
     chunks = np.cumsum([m.chunks_lost for m in infos])
-    send_line(stream, "link/lost/frames", times, frames, Style("frames lost", (240, 80, 80), width=2.5, steps=True))
-    send_line(stream, "link/lost/chunks", times, chunks, Style("chunks lost", (250, 170, 90), steps=True))
+    send_line(drawing, "link/lost/frames", times, frames, Style("frames lost", (240, 80, 80), width=2.5, steps=True))
+    send_line(drawing, "link/lost/chunks", times, chunks, Style("chunks lost", (250, 170, 90), steps=True))
 
 
-def log_link(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
+def log_link(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Health of each device's link: faults by cause, command round trip and traffic.
 
     ``/link/faults/DEVICE`` and ``/link/faults/DEVICE/CAUSE`` (since the start), ``/link/round_trip/DEVICE`` (ms),
@@ -107,22 +99,24 @@ def log_link(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[T
         times = timebase.at_host(host)
         total = [sum(getattr(r.message, field) for field in LINK_COUNTS) for r in samples]
         send_line(
-            stream, f"link/faults/{device}", times, total, Style(f"{device} link faults", series_colour(d), steps=True)
+            drawing, f"link/faults/{device}", times, total, Style(f"{device} link faults", series_colour(d), steps=True)
         )
         for i, field in enumerate(LINK_COUNTS):
             counts = [getattr(r.message, field) for r in samples]
             style = Style(f"{device} {field.replace('_', ' ')}", series_colour(i), width=2.5 - d, steps=True)
-            send_line(stream, f"link/faults/{device}/{field}", times, counts, style)
+            send_line(drawing, f"link/faults/{device}/{field}", times, counts, style)
         trip = np.array([r.message.round_trip_s for r in samples]) * 1e3
         if not np.isnan(trip).all():
-            send_line(stream, f"link/round_trip/{device}", times, trip, Style(f"{device} round trip", series_colour(d)))
+            send_line(
+                drawing, f"link/round_trip/{device}", times, trip, Style(f"{device} round trip", series_colour(d))
+            )
         if len(samples) > 1:
             rate = np.diff([r.message.bytes_received for r in samples]) / np.maximum(np.diff(host), 1) * 1e6
             style = Style(f"{device} to host", series_colour(d))
-            send_line(stream, f"link/received/{device}", timebase.at_host(host[1:]), rate, style)
+            send_line(drawing, f"link/received/{device}", timebase.at_host(host[1:]), rate, style)
 
 
-def log_clock(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
+def log_clock(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """The regression of each device's clock on the host's.
 
     ``/clock/sigma/DEVICE`` (standard deviation of the offset, us), ``/clock/offset/DEVICE`` (change of the offset
@@ -138,21 +132,48 @@ def log_clock(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[
             ("frequency", "runs fast by", np.array([m.frequency_ppm for m in messages])),
             ("round_trip", "round trip", np.array([m.round_trip_ns for m in messages]) / 1e3),
         ):
-            send_line(stream, f"clock/{name}/{device}", times, values, Style(f"{device} {label}", series_colour(d)))
+            send_line(drawing, f"clock/{name}/{device}", times, values, Style(f"{device} {label}", series_colour(d)))
 
 
-def log_log(stream: rr.RecordingStream, timebase: Timebase, records: Sequence[Timed]) -> None:
+def log_log(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """The session's log: ``/log``."""
     times = timebase.at_host([r.log_time_ns for r in records])
     text = [f"{r.message.name}: {r.message.message}" if r.message.name else r.message.message for r in records]
     levels = [_LEVELS.get(r.message.level, "INFO") for r in records]
-    stream.send_columns("log", times, rr.TextLog.columns(text=text, level=levels))
+    drawing.send_columns("log", times, rr.TextLog.columns(text=text, level=levels))
 
 
-LOGS: dict[str, Callable[[rr.RecordingStream, Timebase, Sequence[Timed]], None]] = {
+def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
+    """What a controller has made of each exposure.
+
+    ``/control/slope_rms`` of the centroids and ``/control/path_rms`` inside the exposures (slope units),
+    ``/control/delay`` from the end of the exposure to the first step that it has changed (ms),
+    ``/control/clipped`` (fast steps), ``/status/loop``.
+    """
+    changes = [r.message for r in records]
+    times = timebase.at_frames([m.frame_id for m in changes])
+    delay = [m.delay_steps * timebase.fast_step_ns / 1e6 for m in changes]
+    for k, (name, label, values) in enumerate((
+        ("slope_rms", "RMS of the slopes", [m.slope_rms for m in changes]),
+        ("path_rms", "RMS inside the exposure", [m.path_rms for m in changes]),
+        ("delay", "exposure's end to first input", delay),
+        ("clipped", "steps that limits changed", [m.clipped_steps for m in changes]),
+    )):  # fmt: skip
+        send_line(drawing, f"control/{name}", times, values, Style(label, series_colour(k)))
+    states = [
+        f"{schemas_pb2.Control.State.Name(m.state)}{' LATE' if m.late else ''}"
+        if m.state in schemas_pb2.Control.State.values()
+        else f"UNKNOWN {m.state}"
+        for m in changes
+    ]
+    send_states(drawing, "status/loop", timebase, timebase.step_of_frame([m.frame_id for m in changes]), states)
+
+
+LOGS: dict[str, Callable[[Drawing, Timebase, Sequence[Timed]], None]] = {
     topics.COMMAND: log_commands,
     topics.APPLIED: log_applied,
     topics.EXPOSURE: log_drops,
+    topics.CONTROL: log_control,
     topics.LATENCY: log_latency,
     topics.ESTIMATION: log_estimation,
     topics.LINK: log_link,
@@ -160,18 +181,26 @@ LOGS: dict[str, Callable[[rr.RecordingStream, Timebase, Sequence[Timed]], None]]
     topics.LOG: log_log,
 }
 """What shows the messages of a topic, of which there is one at least."""
+EVERY_STEP = (topics.COMMAND, topics.APPLIED)
+"""Topics with values for every fast step: in a long session, these are many."""
 
 
-def _send_blocks(
-    stream: rr.RecordingStream, path: str, timebase: Timebase, blocks: Sequence[Any], style: Style
-) -> None:
+def _send_blocks(drawing: Drawing, path: str, timebase: Timebase, blocks: Sequence[Any], style: Style) -> None:
     """Send (first_step, n_steps, u) blocks as one value a fast step and input."""
     blocks = [b for b in blocks if len(b.u)]
     if not blocks:
         return
     steps = np.concatenate([np.arange(b.first_step, b.first_step + b.n_steps, dtype=np.int64) for b in blocks])
     inputs = np.concatenate([np.reshape(b.u, (b.n_steps, -1)) for b in blocks])
-    send_axes(stream, path, timebase.every_step(steps), inputs, style)
+    shown = range(min(inputs.shape[1], _MOST_INPUTS))
+    if drawing.points is not None:
+        changed = np.flatnonzero(np.any(np.diff(inputs, axis=0, prepend=np.nan, append=np.nan)[:-1] != 0, axis=1))
+        kept = np.unique([*changed, len(inputs) - 1])
+        most = -(-len(steps) * drawing.points // timebase.frame_period_steps)
+        kept = kept[some_rows(inputs[kept][:, list(shown)], most)]
+        steps, inputs = steps[kept], inputs[kept]
+    labels = [f" {k + 1}" for k in shown] if len(shown) > 1 else [""]
+    send_axes(drawing, path, timebase.every_step(steps), inputs, style, shown, labels)
 
 
 def _by_device(records: Iterable[Timed]) -> dict[str, list[Timed]]:

@@ -1,11 +1,11 @@
-"""A session or a replay as it goes on, in a viewer: the functions that show a file, fed exposure by exposure."""
+"""A viewer that is fed: by a session as it goes on, exposure by exposure, or by a recording as it is read."""
 
 from __future__ import annotations
 
-import tempfile
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
@@ -17,14 +17,18 @@ from aolink.estimation import Estimate
 from aolink.exposure import Exposure
 from aolink.restoration import deblur
 from aolink.rig import Rig
-from aolink.viewing import motion, scene
+from aolink.viewing import incidents, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.camera import HISTORY
-from aolink.viewing.save import APPLICATION, send_camera
+from aolink.viewing.save import APPLICATION, Look, identity, send_camera, sent_parts
+from aolink.viewing.series import Chosen, Drawing
 from aolink.viewing.timebase import Timebase
-from aolink.viewing.viewer import HOST, free_port, has_display, running_rerun, wait_for_server
+from aolink.viewing.viewer import Server, has_display, serving, window
 
-_FLUSH_S = 5.0
+if TYPE_CHECKING:
+    from aolink.recording.reader import Recording
+
+_FLUSH_S = 60.0
 """For what the viewer has not taken yet at the end."""
 
 
@@ -41,9 +45,10 @@ class LiveView:
         estimators: Sequence[str],
         true_scene: NDArray[np.uint16] | None = None,
     ) -> None:
-        self._stream, self._rig, self._names = stream, rig, by_rank(list(estimators))
+        self._drawing = Drawing(stream=stream, chosen=Chosen.of(rig))
+        self._rig, self._names = rig, by_rank(list(estimators))
         self._exposures: list[Exposure] = []
-        """The last ones, as many as the picture of the last exposures shows."""
+        """The last ones, as many as a page has."""
         self._estimates: dict[str, list[Estimate]] = {name: [] for name in self._names}
         self._timebase: Timebase | None = None
         self._top: float | None = None
@@ -60,16 +65,23 @@ class LiveView:
             self._estimates[each.estimator] = [*self._estimates[each.estimator][-HISTORY + 1 :], each]
         if self._timebase is None:
             self._timebase = Timebase.of(self._rig, [exposure])
-        since, stream, timebase = len(self._exposures) - 1, self._stream, self._timebase
-        first = self._top is None
+        drawing, timebase, first = self._drawing, self._timebase, self._top is None
+        names = [*(["truth"] if exposure.truth is not None else ()), *self._names]
+        known = {name: {e.frame_id: e for e in sequence} for name, sequence in self._estimates.items()}
         self._top = send_camera(
-            stream, self._rig, timebase, self._exposures, self._estimates, top=self._top, since=since
+            drawing, self._rig, timebase, self._exposures, known, names, top=self._top, live=True
         )  # fmt: skip
-        motion.log_truth(stream, timebase, [exposure])
+        motion.log_truth(drawing, timebase, [exposure])
         truths = {exposure.frame_id: exposure.truth} if exposure.truth is not None else {}
+        before = self._exposures[-2] if len(self._exposures) > 1 else None
+        incidents.log_exposures(drawing, timebase, [exposure], before)
+        now = {each.estimator: {each.frame_id: each} for each in estimates}
+        incidents.log_warnings(drawing, timebase, [exposure], now, {}, before)
         for each in estimates:
-            motion.log_estimates(stream, timebase, [each])
-            motion.log_errors(stream, timebase, [each], truths)
+            motion.log_estimates(drawing, timebase, [each])
+            motion.log_errors(drawing, timebase, [each], truths)
+            its = [e for e in self._exposures if e.frame_id == each.frame_id]
+            incidents.log_status(drawing, timebase, each.estimator, its, now[each.estimator])
         shown = self._show_scene(exposure, estimates)
         measuring = {each.estimator for each in estimates if each.innovation.shape[1]} - self._measuring
         if first or measuring or shown != self._scenes:
@@ -83,15 +95,15 @@ class LiveView:
         shown = set(self._scenes)
         if sensor is None or timebase is None or exposure.scene is None:
             return self._scenes
-        scene.log_scenes(self._stream, sensor, timebase, [exposure])
+        scene.log_scenes(self._drawing, sensor, timebase, [exposure])
         shown.add(scene.SCENE)
         focus = [each for each in estimates if each.estimator == self._names[-1] and each.frame_id == exposure.frame_id]
         if focus:
             done = deblur(self._rig, exposure, focus[0])
-            if scene.log_restored(self._stream, timebase, [exposure], [done]):
+            if scene.log_restored(self._drawing, timebase, [exposure], [done]):
                 shown.add(scene.RESTORED_SCENE)
         if self._true_scene is not None and scene.TRUE_SCENE not in shown:
-            scene.log_true_scene(self._stream, sensor, self._true_scene)
+            scene.log_true_scene(self._drawing, sensor, self._true_scene)
             shown.add(scene.TRUE_SCENE)
         return [path for path in scene.SCENES if path in shown]
 
@@ -103,8 +115,10 @@ class LiveView:
             density_top=self._top or 1.0,
             truth=exposure.truth is not None,
             scenes=self._scenes,
+            drawn=self._drawing,
+            warnings=True,
         )
-        self._stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
+        self._drawing.stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
 
 
 @contextmanager
@@ -120,20 +134,69 @@ def live_viewer(
     """
     if not has_display():
         raise ViewerError("there is no display for --view: record or replay without it, then `aolink view --web`")
-    port = free_port()
-    with tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process:
-        wait_for_server(port, process, said)
-        stream = rr.RecordingStream(APPLICATION)
-        stream.connect_grpc(f"rerun+http://{HOST}:{port}/proxy")
-        try:
-            yield LiveView(stream, rig, estimators, true_scene)
-            # Without a bound for it, a viewer that takes nothing would be waited for without end, and no signal heard.
-            flushing = threading.Thread(target=stream.flush, daemon=True)
-            flushing.start()
-            flushing.join(_FLUSH_S)
-            if flushing.is_alive():
-                process.kill()
-                raise ViewerError(f"the viewer has taken nothing for {_FLUSH_S:g} s, and was ended")
-            process.wait()
-        finally:
-            stream.disconnect()
+    with window() as server, fed(server) as stream:
+        yield LiveView(stream, rig, estimators, true_scene)
+
+
+@contextmanager
+def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.RecordingStream]:
+    """A stream into a viewer, which stays after the block until it is closed.
+
+    Raises `ViewerError` where the viewer takes nothing any more.
+    """
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    stream.connect_grpc(server.data_address)
+    try:
+        yield stream
+        # Without a bound for it, a viewer that takes nothing would be waited for without end, and no signal heard.
+        flushing = threading.Thread(target=stream.flush, daemon=True)
+        flushing.start()
+        flushing.join(_FLUSH_S)
+        if flushing.is_alive() and server.process.poll() is None:
+            server.process.kill()
+            raise ViewerError(f"the viewer has taken nothing for {_FLUSH_S:g} s, and was ended")
+        server.process.wait()
+    finally:
+        stream.disconnect()
+
+
+def show(recording: Recording, look: Look | None = None, *, progress: Callable[[int], None] | None = None) -> None:
+    """Open a recording in the native viewer while it is read, and wait until the window is closed.
+
+    Parameters
+    ----------
+    look:
+        A part of it, another spot, or another recording beside it; by default all of it alone.
+    progress:
+        Is told how many exposures have been sent.
+
+    Raises
+    ------
+    ViewerError
+        There is no display, the viewer does not start, or the recording has nothing to show.
+    """
+    with window() as server:
+        _feed(server, recording, look or Look(), progress)
+
+
+def serve(
+    recording: Recording, look: Look | None = None, *, port: int | None = None,
+    on_ready: Callable[[str], None] | None = None, progress: Callable[[int], None] | None = None,
+) -> None:  # fmt: skip
+    """Serve a recording with the web viewer on this machine's loopback until interrupted, from when it is being read.
+
+    Parameters are those of `show` and of `serve_web`. Raises `ViewerError`.
+    """
+    with serving((), port) as server:
+        if on_ready is not None:
+            on_ready(server.address)
+        _feed(server, recording, look or Look(), progress)
+
+
+def _feed(server: Server, recording: Recording, look: Look, progress: Callable[[int], None] | None) -> None:
+    with fed(server, identity(recording, look)) as stream:
+        for done in sent_parts(stream, recording, look, at_once=True):
+            if server.process.poll() is not None:
+                return  # its window was closed
+            if progress:
+                progress(done)

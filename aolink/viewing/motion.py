@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import rerun as rr
@@ -13,73 +14,74 @@ from aolink.estimation.estimate import Estimate
 from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure, Truth
 from aolink.plotting.overview import NIS_COVERAGE, nis_bounds
-from aolink.plotting.style import BAND
+from aolink.plotting.style import BAND, extremes, hides_swings
 from aolink.viewing.palette import TRUTH
-from aolink.viewing.series import Style, send_axes, send_line, send_states
+from aolink.viewing.series import Drawing, Style, send_axes, send_line
 from aolink.viewing.timebase import Timebase
 
 FloatArray = NDArray[np.float64]
 
+MOST_STATES = 8
+"""Of a plant with more the first ones are drawn: all of them are in the recording."""
 
-def log_truth(stream: rr.RecordingStream, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
+
+def log_truth(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure]) -> None:
     """Path and states of a simulated rig: ``/path/truth``, ``/state/start/xI/truth``, ``/state/end/xI/truth``."""
     known = [(e, e.truth) for e in exposures if e.truth is not None]
     if not known:
         return
     style = Style("truth", TRUTH, width=2.5)
-    paths = [(e.first_step, truth.path) for e, truth in known]
-    steps, values = _joined(paths)
-    send_axes(stream, "path/truth", timebase.every_step(steps), values, style)
+    _send_path(drawing, "path/truth", timebase, [(e.first_step, truth.path) for e, truth in known], style)
     frames = [e.frame_id for e, _ in known]
     starts = np.array([e.first_step for e, _ in known])
     ends = starts + [e.n_steps for e, _ in known]
     for where, at, states in (
-        ("start", starts, [truth.start_state for _, truth in known]),
-        ("end", ends, [truth.end_state for _, truth in known]),
+        ("start", starts, np.array([truth.start_state for _, truth in known])),
+        ("end", ends, np.array([truth.end_state for _, truth in known])),
     ):
         times = timebase.at_steps(at, frames)
-        for i, column in enumerate(np.moveaxis(np.array(states), 2, 0)):
-            send_axes(stream, f"state/{where}/x{i + 1}/truth", times, column, style)
+        for i in range(min(states.shape[2], MOST_STATES)):
+            _send_state(drawing, f"state/{where}/x{i + 1}/truth", times, states[:, :, i], style)
 
 
-def log_estimates(stream: rr.RecordingStream, timebase: Timebase, estimates: Sequence[Estimate]) -> None:
+def log_estimates(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]) -> None:
     """One estimator's path with its band, states with theirs, NIS with its bounds, and status.
 
-    ``/path/NAME/mean`` and ``/band`` (two lines, `BAND` standard deviations up and down, of the first output),
-    ``/state/start/xI/NAME/mean`` and ``/band``, ``/state/end/...`` alike, ``/nis/NAME``, ``/status/NAME``; and
-    ``/estimate/NAME``, which is not drawn: columns for whoever reads the file as a table.
+    ``/path/NAME/mean`` and ``/band`` (lines `BAND` standard deviations up and down, of the chosen outputs), or
+    ``/path/NAME/range`` of a path that swings too often for a line, with ``/band`` outside of it;
+    ``/state/start/xI/NAME/mean`` and ``/band``, ``/state/end/...`` alike, ``/nis/NAME``; and ``/estimate/NAME``, which
+    is not drawn: columns for whoever reads the file as a table.
     """
     if not estimates:
         return
-    name = estimates[0].estimator
+    name, chosen = estimates[0].estimator, drawing.chosen
     line, band = Style(name, estimator_colour(name), width=1.8), _band_style(name)
-    steps, mean = _joined([(e.first_step, e.path) for e in estimates])
-    _, sd = _joined([(e.first_step, e.path_sd[:1]) for e in estimates])
-    times = timebase.every_step(steps)
-    send_axes(stream, f"path/{name}/mean", times, mean, line)
-    send_line(stream, f"path/{name}/band", times, mean[:, :1] + BAND * sd * [1.0, -1.0], band)
+    outputs = list(chosen.outputs)
+    means = [(e.first_step, e.path) for e in estimates]
+    deviations = [BAND * e.path_sd[outputs] for e in estimates]
+    _send_path(drawing, f"path/{name}", timebase, means, line, deviations, band)
 
     frames = [e.frame_id for e in estimates]
     starts = np.array([e.first_step for e in estimates])
     ends = starts + [e.n_steps for e in estimates]
+    axes = list(chosen.axes)
     for where, at, states, covariances in (
-        ("start", starts, [e.start_state for e in estimates], [e.start_covariance[0] for e in estimates]),
-        ("end", ends, [e.end_state for e in estimates], [e.end_covariance[0] for e in estimates]),
+        ("start", starts, [e.start_state for e in estimates], [e.start_covariance[axes] for e in estimates]),
+        ("end", ends, [e.end_state for e in estimates], [e.end_covariance[axes] for e in estimates]),
     ):
         times = timebase.at_steps(at, frames)
-        deviation = np.sqrt(np.diagonal(np.array(covariances), axis1=1, axis2=2))
-        for i, column in enumerate(np.moveaxis(np.array(states), 2, 0)):
-            send_axes(stream, f"state/{where}/x{i + 1}/{name}/mean", times, column, line)
-            limits = column[:, :1] + BAND * deviation[:, i : i + 1] * [1.0, -1.0]
-            send_line(stream, f"state/{where}/x{i + 1}/{name}/band", times, limits, band)
-    _log_nis(stream, timebase, estimates)
-    times = timebase.at_steps(starts, frames)
-    send_states(stream, f"status/{name}", times, [e.status.name for e in estimates])
-    _send_table(stream, f"estimate/{name}", times, estimates)
+        every = np.array(states)
+        deviation = np.sqrt(np.diagonal(np.array(covariances), axis1=2, axis2=3))
+        for i in range(min(every.shape[2], MOST_STATES)):
+            _send_state(drawing, f"state/{where}/x{i + 1}/{name}/mean", times, every[:, :, i], line)
+            limits = _about(every[:, axes, i], BAND * deviation[:, :, i])
+            send_line(drawing, f"state/{where}/x{i + 1}/{name}/band", times, limits, band)
+    _log_nis(drawing, timebase, estimates)
+    _send_table(drawing, f"estimate/{name}", timebase.at_steps(starts, frames), estimates)
 
 
 def log_errors(
-    stream: rr.RecordingStream, timebase: Timebase, estimates: Sequence[Estimate], truths: Mapping[int, Truth]
+    drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate], truths: Mapping[int, Truth]
 ) -> None:
     """Estimate minus truth of one estimator, where the truth is known.
 
@@ -91,59 +93,125 @@ def log_errors(
     name = known[0][0].estimator
     style = Style(name, estimator_colour(name))
     errors = [e.path - truth.path for e, truth in known]
-    steps, values = _joined([(e.first_step, error) for (e, _), error in zip(known, errors, strict=True)])
-    send_axes(stream, f"error/path/{name}", timebase.every_step(steps), values, style)
+    _send_path(
+        drawing, f"error/path/{name}", timebase,
+        [(e.first_step, error) for (e, _), error in zip(known, errors, strict=True)], style,
+    )  # fmt: skip
     frames = [e.frame_id for e, _ in known]
     starts = np.array([e.first_step for e, _ in known])
     rms = [np.sqrt(np.mean(error**2, axis=1)) for error in errors]
-    send_axes(stream, f"error/path_rms/{name}", timebase.at_steps(starts, frames), np.array(rms), style)
+    chosen = drawing.chosen
+    times = timebase.at_steps(starts, frames)
+    send_axes(drawing, f"error/path_rms/{name}", times, np.array(rms), style, chosen.outputs, chosen.labels)
     ends = timebase.at_steps(starts + [e.n_steps for e, _ in known], frames)
-    for i, column in enumerate(np.moveaxis(np.array([e.end_state - truth.end_state for e, truth in known]), 2, 0)):
-        send_axes(stream, f"error/end/x{i + 1}/{name}", ends, column, style)
+    ended = np.array([e.end_state - truth.end_state for e, truth in known])
+    for i in range(min(ended.shape[2], MOST_STATES)):
+        _send_state(drawing, f"error/end/x{i + 1}/{name}", ends, ended[:, :, i], style)
 
 
-def _send_table(
-    stream: rr.RecordingStream, path: str, times: Sequence[rr.TimeColumn], estimates: Sequence[Estimate]
-) -> None:
+def _send_table(drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], estimates: Sequence[Estimate]) -> None:
     """Columns ``status`` and ``reason``, and those of `estimate_scalars` with a number for each axis."""
     words = rr.AnyValues.columns(status=[e.status.name for e in estimates], reason=[e.reason for e in estimates])
     scalars = [estimate_scalars(e) for e in estimates]
     numbers = rr.AnyValues.columns(
         True, **{name: np.concatenate([each[name] for each in scalars]) for name in scalars[0]}
     )
-    stream.send_columns(path, times, [*words, *numbers.partition([len(e.start_state) for e in estimates])])
+    drawing.send_columns(path, times, [*words, *numbers.partition([len(e.start_state) for e in estimates])])
 
 
-def _log_nis(stream: rr.RecordingStream, timebase: Timebase, estimates: Sequence[Estimate]) -> None:
+def _log_nis(drawing: Drawing, timebase: Timebase, estimates: Sequence[Estimate]) -> None:
     """``/nis/NAME/value`` and ``/bounds``; nothing for an estimator that measures nothing."""
     measured = [e for e in estimates if e.innovation.shape[1]]
     if not measured:
         return
     name = measured[0].estimator
     times = timebase.at_steps([e.first_step for e in measured], [e.frame_id for e in measured])
-    send_axes(
-        stream, f"nis/{name}/value", times, np.array([e.nis for e in measured]), Style(name, estimator_colour(name))
-    )
+    line = Style(name, estimator_colour(name))
+    values = np.array([e.nis for e in measured])
+    _send_state(drawing, f"nis/{name}/value", times, values, line)
     bounds = np.array([nis_bounds(e.innovation.shape[1]) for e in measured])
+    # What stays the same is a line between its ends.
+    kept = [0, *range(len(bounds) - 1, 0, -1)[:1]] if (bounds == bounds[0]).all() else list(range(len(bounds)))
+    ends = timebase.at_steps([measured[k].first_step for k in kept], [measured[k].frame_id for k in kept])
     label = f"{name}, {NIS_COVERAGE:.0%} bounds"
-    send_line(stream, f"nis/{name}/bounds", times, bounds, Style(label, estimator_colour(name), width=1.0, alpha=140))
+    send_line(drawing, f"nis/{name}/bounds", ends, bounds[kept], Style(label, line.colour, width=1.0, alpha=140))
 
 
 def _band_style(name: str) -> Style:
     return Style(f"{name} ± {BAND:g} sd", estimator_colour(name), width=1.0, alpha=150)
 
 
-def _joined(paths: Sequence[tuple[int, FloatArray]]) -> tuple[NDArray[np.int64], FloatArray]:
-    """Paths (first step, (n_outputs, n_steps)) end to end: steps (n,) and values (n, n_outputs).
+def _send_path(
+    drawing: Drawing, path: str, timebase: Timebase, paths: Sequence[tuple[int, FloatArray]], style: Style,
+    reach: Sequence[FloatArray] = (), band: Style | None = None,
+) -> None:  # fmt: skip
+    """Paths (first step, (n_outputs, n_steps)) end to end; where one does not follow at once, the line is broken.
 
-    Where the next one does not follow at once a row of NaN breaks the line.
+    With a ``band`` the path is at ``path``/mean, and lines at ``reach`` from it, (outputs chosen, n_steps), at
+    ``path``/band. Of a path that swings more than its points would show, ``path``/range has what it is between.
     """
-    steps, values, after = [], [], None
-    for first, path in paths:
-        if after is not None and first > after:
+    chosen, points = drawing.chosen, drawing.points
+    outputs = list(chosen.outputs)
+    if path not in drawing.swinging:
+        hidden = [hides_swings(one, points) for _, each in paths for one in each[outputs]] if points else [False]
+        drawing.swinging[path] = float(np.mean(hidden)) > 0.5
+    swings = drawing.swinging[path]
+    steps: list[NDArray[np.int64]] = []
+    lines: list[FloatArray] = []
+    limits: list[FloatArray] = []
+    after = paths[0][0]
+    for (first, every), half in zip(paths, reach or [np.zeros((len(outputs), 1))] * len(paths), strict=True):
+        if first > after:
             steps.append(np.array([after]))
-            values.append(np.full((1, path.shape[0]), np.nan))
-        after = first + path.shape[1]
-        steps.append(np.arange(first, after))
-        values.append(path.T)
-    return np.concatenate(steps), np.concatenate(values)
+            lines.append(np.full((1, lines[-1].shape[1]), np.nan))
+            limits.append(np.full((1, limits[-1].shape[1]), np.nan))
+        after = first + every.shape[1]
+        places, line, outside = (_range if swings else _line)(every, half, outputs, points or every.shape[1])
+        steps.append(first + places)
+        lines.append(line)
+        limits.append(outside)
+    times, values = timebase.every_step(np.concatenate(steps)), np.concatenate(lines)
+    if swings:
+        labels = [f"{label}, {end}" for label in chosen.labels for end in ("highest", "lowest")]
+        send_line(drawing, f"{path}/range", times, values, replace(style, width=1.2), labels)
+    else:
+        mean = f"{path}/mean" if band else path
+        send_axes(drawing, mean, times, values, style, outputs, chosen.labels)
+    if band:
+        send_line(drawing, f"{path}/band", times, np.concatenate(limits), band)
+
+
+def _line(
+    every: FloatArray, half: FloatArray, outputs: list[int], points: int
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:  # fmt: skip
+    """Some steps of a path, evenly spread: which, its values, and what is above and below of the outputs."""
+    steps = every.shape[1]
+    kept = np.arange(steps) if steps <= points else np.linspace(0, steps - 1, points).astype(np.int64)
+    ends = [(every[outputs] + sign * half)[:, kept].T for sign in (1, -1)]
+    return kept, every[:, kept].T, np.asarray(np.stack(ends, axis=-1).reshape(len(kept), -1))
+
+
+def _range(
+    every: FloatArray, half: FloatArray, outputs: list[int], points: int
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:  # fmt: skip
+    """What a path is between in each part of it: the parts' middles, the outputs' extremes, and those of the band."""
+    parts = max(1, points // 2)
+    middles = np.array([part[len(part) // 2] for part in np.array_split(np.arange(every.shape[1]), parts)])
+    chosen = every[outputs]
+    inside = [end for path in chosen for end in extremes(path, parts)[::-1]]
+    above = [extremes(path, parts)[1] for path in chosen + half]
+    below = [extremes(path, parts)[0] for path in chosen - half]
+    outside = [end for pair in zip(above, below, strict=True) for end in pair]
+    return middles, np.stack(inside, axis=1), np.stack(outside, axis=1)
+
+
+def _about(middle: FloatArray, reach: FloatArray) -> FloatArray:
+    """Above and below each column of (rows, n), (rows, 2 n)."""
+    return np.asarray(np.stack([middle + reach, middle - reach], axis=-1).reshape(len(middle), -1))
+
+
+def _send_state(drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], values: FloatArray, style: Style) -> None:
+    """A component of the states, (rows, axes)."""
+    chosen = drawing.chosen
+    labels = chosen.labels if len(chosen.axes) == len(chosen.labels) else ("",)
+    send_axes(drawing, path, times, values, style, chosen.axes, labels)

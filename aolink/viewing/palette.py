@@ -33,8 +33,18 @@ STATUS_COLOURS: dict[str, Colour] = {
     "COMMAND": (45, 110, 75),
     "PARKED": (80, 80, 100),
     "CLIPPED": (190, 50, 50),
+    "WATCHDOG": (190, 50, 50),
+    "LATE": (190, 140, 30),
+    "NOT_REPORTED": (120, 60, 60),
+    "CLOSED": (45, 110, 75),
+    "CLOSED LATE": (190, 140, 30),
+    "HELD": (190, 50, 50),
+    "EXPOSURE": (60, 90, 130),
+    "NEXT EXPOSURE": (40, 60, 95),
+    "READOUT": (25, 25, 25),
+    "LOST": (190, 50, 50),
 }
-"""Colours of an estimate's status and of what drove the mirror."""
+"""Colours of an estimate's status, of what drove the mirror, of the loop, and of what the camera did."""
 
 
 def series_colour(index: int) -> Colour:

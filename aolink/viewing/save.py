@@ -1,11 +1,12 @@
-"""A whole recording as a Rerun file, with its layout inside."""
+"""A recording as Rerun entities, part by part, and as a Rerun file with its layout inside."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import rerun as rr
@@ -13,15 +14,19 @@ import rerun as rr
 from aolink.colours import by_rank
 from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
-from aolink.estimation.score import score
+from aolink.estimation.score import Scorer
 from aolink.exposure import Exposure
 from aolink.optics.sensor import SpotSensor
+from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
 from aolink.recording.reader import check_stands_alone
+from aolink.restoration import RestoredPictures
 from aolink.rig import Rig
-from aolink.viewing import camera, devices, motion, scene
-from aolink.viewing.blueprint import Contents, blueprint
+from aolink.viewing import camera, devices, incidents, motion, scene
+from aolink.viewing.blueprint import PATH_WINDOW, Contents, blueprint
+from aolink.viewing.pupil import log_maps
 from aolink.viewing.rrd_file import new_rrd
+from aolink.viewing.series import POINTS, Chosen, Drawing
 from aolink.viewing.timebase import Timebase
 
 if TYPE_CHECKING:
@@ -29,11 +34,33 @@ if TYPE_CHECKING:
 
 APPLICATION = "aolink"
 """Rerun keeps a user's own layouts by this name."""
+COMPARED = "compared/"
+"""Begins the names of what is beside the recording."""
+
+_PAGES = 16
+"""Of exposures in a part of a recording, which is in memory as a whole; the first part has one, to be there soon."""
+_BYTES_IN_PART = 100e6
+"""That its frames, and as many numbers of each estimator's paths, may take."""
+_BESIDE_NS = 1_000_000_000
+"""How long before and after its exposures a part's messages may have come."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look:
+    """What of a recording is shown, and how closely."""
+
+    exposures: range | None = None
+    """Numbers of the exposures, counted from 0; None for all. Of a few, paths are shown at every fast step."""
+    spot: int = 0
+    """Which of many spots has its lines, its profile and its pages."""
+    compared: Recording | None = None
+    """A recording that is shown beside it, from its own first exposure on."""
 
 
 def save_rrd(
-    recording: Recording, path: str | Path, *, overwrite: bool = False, progress: Callable[[int], None] | None = None
-) -> Path:
+    recording: Recording, path: str | Path, *, look: Look | None = None, overwrite: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Path:  # fmt: skip
     """Write a recording as an .rrd file that any Rerun viewer opens with aolink's layout.
 
     Its recording id in Rerun is the digest of the recording's bytes: the same recording opened twice is one there.
@@ -44,143 +71,347 @@ def save_rrd(
         A recording, as `aolink.read` opens it.
     path:
         The file to write; it appears only when it is whole.
+    look:
+        A part of it, another spot, or another recording beside it; by default all of it alone.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
-        Is told how many parts are written: the frames, each estimator's, the devices'.
+        Is told how many exposures are written.
 
     Raises
     ------
     ViewerError
         The file exists already or cannot be written, or the recording has nothing to show.
     """
-    path = Path(path)
-    with new_rrd(APPLICATION, path, overwrite=overwrite, sources=recording.files, identity=recording.digest) as stream:
-        contents = send_recording(stream, recording, progress or (lambda parts: None))
-        # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
-        stream.send_blueprint(blueprint(contents), make_active=True, make_default=True)
-        stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
+    path, look = Path(path), look or Look()
+    sources = [*recording.files, *(look.compared.files if look.compared else ())]
+    with new_rrd(APPLICATION, path, overwrite=overwrite, sources=sources, identity=identity(recording, look)) as stream:
+        for done in sent_parts(stream, recording, look):
+            if progress:
+                progress(done)
     return path
 
 
-def send_recording(
-    stream: rr.RecordingStream, recording: Recording, progress: Callable[[int], None] = lambda parts: None
-) -> Contents:
-    """Send everything in a recording to a stream; tells what there was, for the layout."""
-    check_stands_alone(recording)
-    rig = recording.rig
-    exposures = list(recording.exposures())
-    if strange := [e for e in exposures if e.pixels.shape != rig.sensor.shape]:
-        raise ViewerError(
-            f"frame {strange[0].frame_id} of {recording.path} has {strange[0].pixels.shape} pixels, the sensor of the"
-            f" rig file in it {rig.sensor.shape}: it was recorded with another rig file"
-        )
-    timebase = Timebase.of(rig, exposures)
-    truths = {e.frame_id: e.truth for e in exposures if e.truth is not None}
-    names = by_rank(list(recording.estimators))
-    estimates = {name: recording.estimates(name) for name in names}
+def identity(recording: Recording, look: Look) -> str:
+    """What Rerun knows a recording by, and this look at it."""
+    if look == Look():
+        return recording.digest
+    exposures, spot, other = look.exposures, look.spot, look.compared
+    part = f"{exposures.start}-{exposures.stop}" if exposures else "all"
+    return f"{recording.digest}/{part}/{spot}/{other.digest if other else ''}"
 
-    top = send_camera(stream, rig, timebase, exposures, estimates)
-    motion.log_truth(stream, timebase, exposures)
-    progress(1)
-    for part, sequence in enumerate(estimates.values(), 2):
-        motion.log_estimates(stream, timebase, sequence)
-        motion.log_errors(stream, timebase, sequence, truths)
-        progress(part)
-    scenes = rig.scene is not None and scene.log_scenes(stream, rig.scene, timebase, exposures)
-    restored = list(recording.restored())
-    scenes_restored = scene.log_restored(stream, timebase, exposures, restored)
-    true_scene = recording.true_scene
-    if rig.scene is not None and true_scene is not None:
-        scene.log_true_scene(stream, rig.scene, true_scene)
-    stream.log(
-        "session", rr.TextDocument(_summary(recording, exposures, estimates), media_type="text/markdown"), static=True
-    )
-    contents = Contents(
-        rig=rig,
-        estimators=names,
-        measuring=[name for name, sequence in estimates.items() if any(e.innovation.shape[1] for e in sequence)],
-        density_top=top,
-        truth=bool(truths),
-        scenes=list(compress(scene.SCENES, (scenes, scenes_restored, true_scene is not None))),
-        restored_spots=any(each.spots is not None for each in restored),
-        topics=_send_devices(stream, recording, timebase),
-    )
-    progress(len(names) + 2)
-    return contents
+
+def sent_parts(
+    stream: rr.RecordingStream, recording: Recording, look: Look, *, at_once: bool = False
+) -> Iterator[int]:  # fmt: skip
+    """Send a recording to a stream part by part, at the end its layout; gives how many exposures have been sent.
+
+    With ``at_once`` a layout comes after the first part too, for a viewer that shows what there is by then.
+
+    Raises
+    ------
+    ViewerError
+        There is nothing to show, or the frames are not those of the rig's sensor.
+    RecordingError
+        It is a side file.
+    """
+    sender = Sender(stream, recording, look)
+    other = None
+    if look.compared is not None:
+        other = Sender(stream, look.compared, Look(exposures=look.exposures, spot=look.spot), root=COMPARED)
+    stream.send_recording_name(f"{recording.rig.name} · {recording.path.name}")
+
+    def lay_out() -> None:
+        # Active too: a viewer that gets the data over the network would otherwise keep a layout of its own.
+        stream.send_blueprint(blueprint(sender.contents(other)), make_active=True, make_default=True)
+
+    theirs = other.parts() if other else iter(())
+    for done in sender.parts():
+        next(theirs, None)
+        if at_once:
+            lay_out()
+            at_once = False
+        yield done
+    for _ in theirs:
+        pass
+    lay_out()
+
+
+class Sender:
+    """Sends a recording to a stream, part by part: what is in memory does not grow with its length."""
+
+    def __init__(self, stream: rr.RecordingStream, recording: Recording, look: Look, root: str = "") -> None:
+        check_stands_alone(recording)
+        self._recording, self._look, self._rig = recording, look, recording.rig
+        whole = range(len(recording))
+        self._numbers = look.exposures if look.exposures is not None else whole
+        few = len(self._numbers) <= 2 * PATH_WINDOW + 1
+        chosen = Chosen.of(recording.rig, look.spot)
+        self._drawing = Drawing(stream=stream, chosen=chosen, root=root, points=None if few else POINTS)
+        self._names = by_rank(list(recording.estimators))
+        self._skipped = {name: recording.skipped(name) for name in self._names}
+        self._scorers = {name: Scorer() for name in self._names}
+        self._measuring: set[str] = set()
+        self._known: set[str] = set()
+        """Entities and kinds of data that there are."""
+        self._scales: dict[str, float] = {}
+        self._timebase: Timebase | None = None
+        self._top: float | None = None
+        self._last: Exposure | None = None
+        self._lost = self._warnings = 0
+        self._finished = False
+        self.done = 0
+        """Exposures that have been sent."""
+
+    def parts(self) -> Iterator[int]:
+        """Send the exposures with what belongs to them, then the devices; gives after each part how many are sent."""
+        recording = self._recording
+        restored = iter(recording.restored())
+        ahead = next(restored, None)
+        messages = self._messages(devices.EVERY_STEP)
+        waiting: Any = next(messages, None)
+        for exposures, estimates, following in self._read():
+            pictures: list[RestoredPictures] = []
+            while ahead is not None and ahead.frame_id <= exposures[-1].frame_id:
+                pictures.append(ahead)
+                ahead = next(restored, None)
+            self._send(exposures, estimates, pictures, following)
+            run: list[RecordedMessage] = []
+            while waiting is not None and (following is None or waiting.message.first_step < following.first_step):
+                run.append(waiting)
+                waiting = next(messages, None)
+            self._send_messages(run)
+            self.done += len(exposures)
+            yield self.done
+        if self._timebase is None:
+            raise ViewerError(
+                f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
+            )
+        rest = [topic for topic in recording.counts if topics.named(topic).name in devices.LOGS]
+        rest = [topic for topic in rest if topic not in devices.EVERY_STEP]
+        self._send_messages(list(self._messages(rest)))
+        true_scene = recording.true_scene
+        if self._rig.scene is not None and true_scene is not None:
+            scene.log_true_scene(self._drawing, self._rig.scene, true_scene)
+            self._known.add(scene.TRUE_SCENE)
+        text = rr.TextDocument(self._summary(), media_type="text/markdown")
+        self._drawing.log("session", text)
+        self._finished = True
+
+    def _read(self) -> Iterator[tuple[list[Exposure], dict[str, dict[int, Estimate]], Exposure | None]]:
+        """Parts: whole pages of exposures, their estimates by name and frame, and the exposure after them."""
+        rig = self._rig
+        series = self._recording[self._numbers.start : self._numbers.stop] if self._look.exposures else self._recording
+        steps = rig.timing.exposure_steps * rig.n_outputs * 8 * (1 + 2 * len(self._names))
+        pages = int(max(1, min(_PAGES, _BYTES_IN_PART // (camera.HISTORY * (steps + 4 * np.prod(rig.sensor.shape))))))
+        exposures: list[Exposure] = []
+        estimates: dict[str, dict[int, Estimate]] = {name: {} for name in self._names}
+        first: int | None = None
+        for exposure, found in series.with_estimates(self._names):
+            if exposure.pixels.shape != rig.sensor.shape:
+                raise ViewerError(
+                    f"frame {exposure.frame_id} of {self._recording.path} has {exposure.pixels.shape} pixels, the"
+                    f" sensor of the rig file in it {rig.sensor.shape}: it was recorded with another rig file"
+                )
+            first = exposure.frame_id if first is None else first
+            part, last = (-(-camera.page_of(e, first) // pages) for e in (exposure, (exposures or [exposure])[0]))
+            if part != last:
+                yield exposures, estimates, exposure
+                exposures, estimates = [], {name: {} for name in self._names}
+            exposures.append(exposure)
+            for name, estimate in zip(self._names, found, strict=True):
+                if estimate is not None:
+                    estimates[name][exposure.frame_id] = estimate
+        if exposures:
+            yield exposures, estimates, None
+
+    def _send(
+        self, exposures: list[Exposure], estimates: dict[str, dict[int, Estimate]],
+        restored: list[RestoredPictures], following: Exposure | None,
+    ) -> None:  # fmt: skip
+        drawing, rig = self._drawing, self._rig
+        self._timebase = timebase = (
+            Timebase.of(rig, exposures) if self._timebase is None else self._timebase.followed_by(exposures)
+        )
+        names = [*(["truth"] if any(e.truth is not None for e in exposures) else ()), *self._names]
+        self._top = send_camera(drawing, rig, timebase, exposures, estimates, names, top=self._top, following=following)
+        motion.log_truth(drawing, timebase, exposures)
+        truths = {e.frame_id: e.truth for e in exposures if e.truth is not None}
+        self._known |= {"truth"} if truths else set()
+        for name, by_frame in estimates.items():
+            found = list(by_frame.values())
+            motion.log_estimates(drawing, timebase, found)
+            motion.log_errors(drawing, timebase, found, truths)
+            incidents.log_status(drawing, timebase, name, exposures, by_frame, self._skipped[name])
+            self._measuring |= {name} if any(e.innovation.shape[1] for e in found) else set()
+            for exposure in exposures:
+                if exposure.frame_id in by_frame:
+                    self._scorers[name].add(exposure, by_frame[exposure.frame_id])
+        incidents.log_exposures(drawing, timebase, exposures, self._last)
+        self._warnings += incidents.log_warnings(
+            drawing, timebase, exposures, estimates, self._skipped, self._last
+        )  # fmt: skip
+        before = self._last.frame_id if self._last else exposures[0].frame_id - 1
+        self._lost += exposures[-1].frame_id - before - len(exposures)
+        self._last = exposures[-1]
+        if isinstance(rig.sensor, SpotSensor) and has_pupil(self._recording):
+            best = estimates[self._names[-1]] if self._names else {}
+            log_maps(drawing, timebase, rig, rig.sensor, exposures, best, self._scales)
+        if rig.scene is not None and scene.log_scenes(drawing, rig.scene, timebase, exposures):
+            self._known.add(scene.SCENE)
+        if scene.log_restored(drawing, timebase, exposures, restored):
+            self._known.add(scene.RESTORED_SCENE)
+        if any(each.spots is not None for each in restored):
+            self._known.add(scene.RESTORED_SPOTS)
+
+    def _messages(self, wanted: Sequence[str]) -> Iterator[RecordedMessage]:
+        """Messages of some topics: of a part of the recording those that belong to it."""
+        recording = self._recording
+        there = [topic for topic in wanted if recording.counts.get(topic)]
+        if not there:
+            return
+        if self._look.exposures is None:
+            yield from recording.messages(*there)
+            return
+        first, last = (self._recording[self._numbers[k]] for k in (0, -1))
+        period = self._rig.timing.frame_period_steps * self._rig.timing.fast_step_ns
+        low, high = first.host_start_ns - _BESIDE_NS, last.host_start_ns + period + _BESIDE_NS
+        if high < recording.start_ns or low > recording.end_ns:  # the log has other times than its frames
+            low, high = recording.start_ns, recording.end_ns + 1
+        end, ended_ns = last.first_step + last.n_steps, last.host_start_ns + period
+        for each in recording.messages(*there, start_ns=max(low, 0), end_ns=high):
+            message: Any = each.message
+            if each.topic in devices.EVERY_STEP:
+                inside = message.first_step < end and message.first_step + message.n_steps > first.first_step
+            else:
+                frame = getattr(message, "frame_id", None)
+                inside = (
+                    first.host_start_ns <= each.log_time_ns < ended_ns
+                    if frame is None
+                    else first.frame_id <= frame <= last.frame_id
+                )
+            if inside:
+                yield each
+
+    def _send_messages(self, messages: list[RecordedMessage]) -> None:
+        by_topic: dict[str, list[RecordedMessage]] = {}
+        for record in messages:
+            by_topic.setdefault(record.topic, []).append(record)
+        assert self._timebase is not None
+        for name, log in devices.LOGS.items():
+            for topic, records in by_topic.items():
+                if topics.named(topic).name == name:
+                    log(self._drawing, self._timebase, records)
+        self._known |= by_topic.keys()
+
+    def contents(self, other: Sender | None = None) -> Contents:
+        """What has been sent, for the layout."""
+        return Contents(
+            rig=self._rig,
+            estimators=self._names,
+            measuring=[name for name in self._names if name in self._measuring],
+            density_top=self._top or 1.0,
+            truth="truth" in self._known,
+            scenes=list(compress(scene.SCENES, (each in self._known for each in scene.SCENES))),
+            restored_spots=scene.RESTORED_SPOTS in self._known,
+            topics=frozenset(self._recording.counts.keys() & (self._known if self._finished else devices.LOGS.keys())),
+            drawn=self._drawing,
+            maps=self._scales,
+            warnings=self._warnings > 0,
+            alone=len(self._numbers) == 1,
+            compared=other.contents() if other else None,
+        )
+
+    def _summary(self) -> str:
+        """What a session was, what it has not, and, where the truth is known, who was right: a page of Markdown."""
+        rig, recording, last = self._rig, self._recording, self._last
+        assert last is not None
+        assert self._timebase is not None
+        steps = rig.timing.exposure_steps
+        part = ""
+        if self._look.exposures is not None:
+            part = f" ({self._numbers.start} to {self._numbers.stop - 1} of {len(recording)}, counted from 0)"
+        lines = [
+            f"## {rig.name}",
+            f"{self.done} exposure{'s' if self.done != 1 else ''}{part} of {steps} fast steps,"
+            f" {steps * rig.timing.fast_step_s:g} s each; {self._lost} frames lost. The first began at"
+            f" {self._timebase.origin_ns / 1e9:.6f} s of the camera's clock.",
+            "",
+        ]
+        if self._names:
+            lines += [
+                "| estimator | path RMSE (slope units) | end state | NIS (95 % bounds) | gated |",
+                "| --- | --- | --- | --- | --- |",
+            ]
+        for name, scorer in self._scorers.items():
+            result = scorer.result()
+            path, end = (
+                f"{x:.4f}" if result.exposures else "truth unknown" for x in (result.path_rmse, result.end_rmse)
+            )
+            nis = result.nis
+            shown = "" if np.isnan(nis.mean) else f"{nis.mean:.2f} ({nis.low:.2f} to {nis.high:.2f})"
+            lines.append(f"| {name} | {path} | {end} | {shown} | {result.gated} of {result.estimated} |")
+        skipped = {name: len(frames) for name, frames in self._skipped.items() if frames}
+        if skipped:
+            lines += ["", "Exposures skipped for want of time: " + ", ".join(f"{k} {n}" for k, n in skipped.items())]
+        if self._look.compared is not None:
+            other = self._look.compared.path.name
+            lines += ["", f"Fainter lines are of {other}, from its own first exposure on."]
+        if missing := self._missing():
+            lines += ["", "What it has not: " + "; ".join(missing) + "."]
+        if recording.damage:
+            lines += ["", f"Damaged: {recording.damage}"]
+        return "\n".join([*lines, "", rig.summary])
+
+    def _missing(self) -> list[str]:
+        """What other recordings have and this one has not, and what would make it."""
+        known, found = self._known, []
+        if not self._names:
+            found.append(f"no estimates (`aolink estimate {self._recording.path.name}` makes them)")
+        if "truth" not in known:
+            found.append("no truth, which only a simulated rig knows")
+        if topics.COMMAND not in known and topics.APPLIED not in known:
+            found.append("no commands and no report of a mirror")
+        if topics.LATENCY not in known:
+            found.append("no latencies")
+        return found
 
 
 def send_camera(
-    stream: rr.RecordingStream,
-    rig: Rig,
-    timebase: Timebase,
-    exposures: list[Exposure],
-    estimates: Mapping[str, Sequence[Estimate]],
-    *,
-    top: float | None = None,
-    since: int = 0,
-) -> float:
-    """Send frames, history and profiles of the exposures from number ``since`` on.
+    drawing: Drawing, rig: Rig, timebase: Timebase, exposures: Sequence[Exposure],
+    estimates: Mapping[str, Mapping[int, Estimate]], names: Sequence[str], *, top: float | None = None,
+    following: Exposure | None = None, live: bool = False,
+) -> float:  # fmt: skip
+    """Send frames, pages and profiles of exposures; of a live session the last of them and its page.
 
     Gives the density at the top of the profile's plot, found from the exposures if ``top`` is not given.
     """
-    sensor = rig.sensor
-    new = exposures[since:]
+    sensor, output = rig.sensor, drawing.chosen.outputs[0]
+    new = exposures[-1:] if live else exposures
     outputs = {"truth": {e.frame_id: e.truth.path for e in exposures if e.truth is not None}}
-    outputs |= {name: {e.frame_id: e.path for e in sequence} for name, sequence in estimates.items()}
-    camera.log_frames(stream, timebase, new)
+    outputs |= {name: {k: e.path for k, e in by_frame.items()} for name, by_frame in estimates.items()}
+    camera.log_frames(drawing, timebase, new)
+    light = 1.0
     if isinstance(sensor, SpotSensor):
+        light = 1.0 if sensor.spot_light is None else float(sensor.spot_light[output // 2])
         for name, by_frame in outputs.items():
-            camera.log_spot_paths(stream, sensor, timebase, new, name, by_frame)
-    # What follows is one slope over time: the first one.
-    paths = {name: {k: path[0] for k, path in by_frame.items()} for name, by_frame in outputs.items()}
-    line, seen = sensor.profile, camera.first_profiles(sensor, exposures)
+            camera.log_spot_paths(drawing, sensor, timebase, new, name, by_frame)
+    # What follows is one slope over time.
+    paths = {name: {k: path[output] for k, path in by_frame.items()} for name, by_frame in outputs.items()}
+    line, seen = sensor.profile, camera.one_profile(sensor, exposures, output)
     if top is None:
         top = camera.density_top(line, seen)
-        camera.log_profile_axes(stream, line, top)
-    camera.log_history(stream, line, timebase, seen, paths, top, since=since)
-    camera.log_measured_profile(stream, line, timebase, seen[since:], top)
-    for name, first in paths.items():
-        camera.log_predicted_profile(stream, line, timebase, seen[since:], name, first, top)
+        camera.log_profile_axes(drawing, line, top, names)
+    first, at = timebase.frame_id, seen[-1] if live else None
+    pages: dict[int, list[Exposure]] = {}
+    for each in seen:
+        pages.setdefault(camera.page_of(each, first), []).append(each)
+    for number, page in list(pages.items())[-1 if live else 0 :]:
+        after = next((p[0] for k, p in pages.items() if k > number), following)
+        camera.log_page(drawing, line, timebase, page, paths, top, until=after.frame_id if after else None, at=at)
+    shown = seen[-1:] if live else seen
+    camera.log_now(drawing, line, timebase, shown)
+    camera.log_measured_profile(drawing, line, timebase, shown, top)
+    for name, by_frame in paths.items():
+        camera.log_path_profile(drawing, line, timebase, shown, name, by_frame, top, light)
     return top
-
-
-def _send_devices(stream: rr.RecordingStream, recording: Recording, timebase: Timebase) -> frozenset[str]:
-    """Send what does not come from exposures and estimates; the topics that had messages."""
-    by_topic: dict[str, list[RecordedMessage]] = {
-        topic: [] for topic in recording.counts if topics.named(topic).name in devices.LOGS
-    }
-    for record in recording.messages(*by_topic) if by_topic else ():
-        by_topic[record.topic].append(record)
-    for name, log in devices.LOGS.items():
-        for topic, records in by_topic.items():
-            if topics.named(topic).name == name and records:
-                log(stream, timebase, records)
-    return frozenset(by_topic)
-
-
-def _summary(recording: Recording, exposures: list[Exposure], estimates: dict[str, list[Estimate]]) -> str:
-    """What a session was and, where the truth is known, who was right: a page of Markdown."""
-    rig = recording.rig
-    steps = rig.timing.exposure_steps
-    frames = exposures[-1].frame_id - exposures[0].frame_id + 1
-    lines = [
-        f"## {rig.name}",
-        f"{len(exposures)} exposures of {steps} fast steps, {steps * rig.timing.fast_step_s:g} s each;"
-        f" {frames - len(exposures)} frames lost.",
-        "",
-        "| estimator | path RMSE (slope units) | end state | NIS (95 % bounds) | gated |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    by_frame = {e.frame_id: e for e in exposures}
-    for name, sequence in estimates.items():
-        known = [e for e in sequence if e.frame_id in by_frame]
-        result = score([by_frame[e.frame_id] for e in known], known)
-        path, end = (f"{x:.4f}" if result.exposures else "truth unknown" for x in (result.path_rmse, result.end_rmse))
-        nis = result.nis
-        shown = "" if np.isnan(nis.mean) else f"{nis.mean:.2f} ({nis.low:.2f} to {nis.high:.2f})"
-        lines.append(f"| {name} | {path} | {end} | {shown} | {result.gated} of {len(known)} |")
-    skipped = {name: n for name in estimates if (n := len(recording.skipped(name)))}
-    if skipped:
-        lines += ["", "Exposures skipped for want of time: " + ", ".join(f"{name} {n}" for name, n in skipped.items())]
-    return "\n".join([*lines, "", rig.summary])

@@ -15,6 +15,7 @@ from aolink.exposure import Exposure
 from aolink.optics.scene import SceneSensor
 from aolink.restoration import RestoredPictures
 from aolink.viewing.palette import MISSING
+from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import Timebase
 
 FloatArray = NDArray[np.float64]
@@ -27,9 +28,7 @@ SCENES = (SCENE, RESTORED_SCENE, TRUE_SCENE)
 """What is shown of the scene, in this order."""
 
 
-def log_scenes(
-    stream: rr.RecordingStream, sensor: SceneSensor, timebase: Timebase, exposures: Sequence[Exposure]
-) -> bool:
+def log_scenes(drawing: Drawing, sensor: SceneSensor, timebase: Timebase, exposures: Sequence[Exposure]) -> bool:
     """Scenes as they came, lost pixels in a colour of their own: ``/scene/image``; gives whether there is one."""
     known = [(e, e.scene) for e in exposures if e.scene is not None]
     pictures = []
@@ -37,17 +36,17 @@ def log_scenes(
         grey = np.repeat(_grey(sensor.to_intensity(scene.pixels))[..., None], 3, axis=2)
         grey[~scene.mask] = MISSING
         pictures.append(grey)
-    _send(stream, SCENE, timebase, [e.first_step for e, _ in known], [e.frame_id for e, _ in known], pictures)
+    _send(drawing, SCENE, timebase, [e.first_step for e, _ in known], [e.frame_id for e, _ in known], pictures)
     return bool(known)
 
 
-def log_true_scene(stream: rr.RecordingStream, sensor: SceneSensor, counts: NDArray[np.uint16]) -> None:
+def log_true_scene(drawing: Drawing, sensor: SceneSensor, counts: NDArray[np.uint16]) -> None:
     """The scene at rest: ``/scene/true``."""
-    stream.log(TRUE_SCENE, rr.Image(_grey(sensor.to_intensity(counts)), color_model="L"), static=True)
+    drawing.log(TRUE_SCENE, rr.Image(_grey(sensor.to_intensity(counts)), color_model="L"))
 
 
 def log_restored(
-    stream: rr.RecordingStream, timebase: Timebase, exposures: Sequence[Exposure], restored: Sequence[RestoredPictures]
+    drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure], restored: Sequence[RestoredPictures]
 ) -> bool:
     """Pictures without their blur: ``/restored/image``, ``/restored/spot`` (the most light in it is white).
 
@@ -63,7 +62,7 @@ def log_restored(
     ]
     for path, pictures in ((RESTORED_SCENE, scenes), (RESTORED_SPOTS, spots)):
         frames = [frame_id for frame_id, _ in pictures]
-        _send(stream, path, timebase, [starts[k] for k in frames], frames, [picture for _, picture in pictures])
+        _send(drawing, path, timebase, [starts[k] for k in frames], frames, [picture for _, picture in pictures])
     return bool(scenes)
 
 
@@ -72,7 +71,7 @@ def _grey(intensity: NDArray[np.floating]) -> NDArray[np.uint8]:
 
 
 def _send(
-    stream: rr.RecordingStream, path: str, timebase: Timebase, steps: Sequence[int], frames: Sequence[int],
+    drawing: Drawing, path: str, timebase: Timebase, steps: Sequence[int], frames: Sequence[int],
     pictures: Sequence[NDArray[np.uint8]],
 ) -> None:  # fmt: skip
     """Send pictures of one shape, (rows, columns) or (rows, columns, 3), a row of the columns each."""
@@ -81,6 +80,6 @@ def _send(
     height, width = pictures[0].shape[:2]
     model = rr.ColorModel.RGB if pictures[0].ndim == 3 else rr.ColorModel.L
     layout = rr.components.ImageFormat(width=width, height=height, color_model=model, channel_datatype="U8")
-    stream.log(path, rr.Image.from_fields(format=layout), static=True)
+    drawing.log(path, rr.Image.from_fields(format=layout))
     buffers = np.stack([picture.ravel() for picture in pictures])
-    stream.send_columns(path, timebase.at_steps(steps, frames), rr.Image.columns(buffer=buffers))
+    drawing.send_columns(path, timebase.at_steps(steps, frames), rr.Image.columns(buffer=buffers))

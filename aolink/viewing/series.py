@@ -1,19 +1,75 @@
-"""Lines over time: how a column of numbers becomes a named, coloured Rerun entity."""
+"""What is drawn on, and lines over time: how a column of numbers becomes a named, coloured Rerun entity."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.colours import Colour
+from aolink.optics.sensor import SpotSensor
+from aolink.rig import Rig
 from aolink.viewing.palette import STATUS_COLOURS
+from aolink.viewing.timebase import Timebase
 
 PERCENTILES = (5, 50, 95)
 """What stands for many axes."""
+POINTS = 32
+"""That a path is drawn with in a long session: more than its exposure has columns on a screen."""
+_SECOND = 0.55
+"""Opacity of the second of two lines that belong together, and of those that something is compared with."""
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Which of many spots is drawn as lines."""
+
+    outputs: tuple[int, ...]
+    """Rows of a path."""
+    axes: tuple[int, ...]
+    """Axes whose states and NIS belong to it."""
+    labels: tuple[str, ...] = ("",)
+    """What the legend adds for each output."""
+
+    @classmethod
+    def of(cls, rig: Rig, spot: int = 0) -> Chosen:
+        """x and y of a spot on a plane, or the one position of a spot on a line."""
+        if not isinstance(rig.sensor, SpotSensor):
+            return cls((spot,), (spot,))
+        outputs = (2 * spot, 2 * spot + 1)
+        return cls(outputs, tuple(dict.fromkeys(k // rig.plant.n_outputs for k in outputs)), (" x", " y"))
+
+
+@dataclass(kw_only=True)
+class Drawing:
+    """A stream into a file or a viewer, how things are drawn on it, and what is known of what has been drawn."""
+
+    stream: rr.RecordingStream
+    chosen: Chosen
+    root: str = ""
+    """Begins the name of every entity, with its slash, where a recording is shown beside another."""
+    points: int | None = POINTS
+    """That a path of one exposure is drawn with; None: every fast step."""
+    extents: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """The least and the largest value of each entity's lines."""
+    swinging: dict[str, bool] = field(default_factory=dict)
+    """Whether a path swings more than its points show, so that its range is drawn; by its name."""
+    states: dict[str, str] = field(default_factory=dict)
+    """The last state of each lane."""
+
+    def log(self, path: str, what: Any) -> None:
+        """Log what holds for the whole session."""
+        self.stream.log(self.root + path, what, static=True)
+
+    def send_columns(self, path: str, times: Sequence[rr.TimeColumn], columns: Iterable[Any]) -> None:
+        """Send rows of an entity."""
+        self.stream.send_columns(self.root + path, times, columns)
 
 
 @dataclass(frozen=True)
@@ -31,59 +87,84 @@ class Style:
 
 
 def send_line(
-    stream: rr.RecordingStream, path: str, times: Sequence[rr.TimeColumn], values: ArrayLike, style: Style
-) -> None:
-    """Send one entity of one or more lines that look the same; NaN breaks a line.
+    drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], values: ArrayLike, style: Style,
+    labels: Sequence[str] = (),
+) -> None:  # fmt: skip
+    """Send one entity of one or more lines; NaN breaks a line.
 
     Parameters
     ----------
     values:
         (rows,) or (rows, lines).
+    labels:
+        What the legend adds to the name of each line; all but the first are then fainter.
     """
     columns: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
     if not len(columns):
         return
     lines = 1 if columns.ndim == 1 else columns.shape[1]
+    alpha = round(style.alpha * (_SECOND if drawing.root else 1.0))
+    faint = [alpha if k == 0 or not labels else round(_SECOND * alpha) for k in range(lines)]
     look = rr.SeriesLines(
-        names=[style.name] * lines,
-        colors=[(*style.colour, style.alpha)] * lines,
+        names=[style.name + label for label in (labels or [""] * lines)],
+        colors=[(*style.colour, each) for each in faint],
         widths=[style.width] * lines,
         interpolation_mode="StepAfter" if style.steps else "Linear",
     )
-    stream.log(path, look, static=True)
-    stream.send_columns(path, times, rr.Scalars.columns(scalars=columns))
+    drawing.log(path, look)
+    drawing.send_columns(path, times, rr.Scalars.columns(scalars=columns))
+    if np.isfinite(columns).any():
+        low, high = drawing.extents.get(path, (np.inf, -np.inf))
+        drawing.extents[path] = (min(low, float(np.nanmin(columns))), max(high, float(np.nanmax(columns))))
 
 
 def send_axes(
-    stream: rr.RecordingStream, path: str, times: Sequence[rr.TimeColumn], values: ArrayLike, style: Style
-) -> None:
-    """Send the first of many axes as a line at ``path``, and percentiles over all of them at ``path``/axes.
+    drawing: Drawing, path: str, times: Sequence[rr.TimeColumn], values: ArrayLike, style: Style,
+    shown: Sequence[int], labels: Sequence[str],
+) -> None:  # fmt: skip
+    """Send some of many axes as lines at ``path``, and percentiles over all of them at ``path``/axes.
 
     Parameters
     ----------
     values:
-        (rows, axes); with one axis there are no percentiles.
+        (rows, axes); where all of them are shown there are no percentiles.
+    shown:
+        Those that are lines of their own.
+    labels:
+        What the legend adds to the name of each of those.
     """
     columns = np.asarray(values, dtype=np.float64)
-    n = columns.shape[1]
-    if n == 1:
-        send_line(stream, path, times, columns[:, 0], style)
+    send_line(drawing, path, times, columns[:, list(shown)], style, labels if len(shown) > 1 else ())
+    if columns.shape[1] > len(shown):
+        words = f"{style.name}, {'/'.join(map(str, PERCENTILES))} % of {columns.shape[1]}"
+        spread = Style(words, style.colour, 0.8, 130, style.steps)
+        send_line(drawing, f"{path}/axes", times, np.percentile(columns, PERCENTILES, axis=1).T, spread)
+
+
+def send_states(drawing: Drawing, path: str, timebase: Timebase, steps: ArrayLike, states: Sequence[str]) -> None:
+    """Send a lane of named states from fast steps on, coloured by `STATUS_COLOURS`, where they change."""
+    before = [drawing.states.get(path, ""), *states]
+    changed = [k for k, state in enumerate(states) if state != before[k]]
+    if not changed:
         return
-    send_line(
-        stream,
-        path,
-        times,
-        columns[:, 0],
-        Style(f"{style.name}, 1st of {n}", style.colour, style.width, style.alpha, style.steps),
-    )
-    spread = Style(f"{style.name}, {'/'.join(map(str, PERCENTILES))} % of {n}", style.colour, 0.8, 130, style.steps)
-    send_line(stream, f"{path}/axes", times, np.percentile(columns, PERCENTILES, axis=1).T, spread)
-
-
-def send_states(stream: rr.RecordingStream, path: str, times: Sequence[rr.TimeColumn], states: Iterable[str]) -> None:
-    """Send a lane of named states, coloured by `STATUS_COLOURS`."""
+    drawing.states[path] = states[-1]
     names = list(STATUS_COLOURS)
-    stream.log(
-        path, rr.StateConfiguration(values=names, labels=names, colors=list(STATUS_COLOURS.values())), static=True
-    )
-    stream.send_columns(path, times, rr.StateChange.columns(state=list(states)))
+    drawing.log(path, rr.StateConfiguration(values=names, labels=names, colors=list(STATUS_COLOURS.values())))
+    times = timebase.at_steps(np.asarray(steps)[changed])
+    drawing.send_columns(path, times, rr.StateChange.columns(state=[states[k] for k in changed]))
+
+
+def some_rows(values: NDArray[np.float64], count: int) -> IntArray:
+    """Which rows to keep of lines with more than ``count``: those of the extremes of each part, and the ends.
+
+    Parameters
+    ----------
+    values:
+        (rows, lines).
+    """
+    rows, lines = values.shape
+    if rows <= count:
+        return np.arange(rows)
+    parts = np.array_split(np.arange(rows), max(1, count // (2 * lines)))
+    ends = [part[find(values[part], axis=0)] for part in parts for find in (np.argmin, np.argmax)]
+    return np.unique(np.concatenate([*ends, [0, rows - 1]]))

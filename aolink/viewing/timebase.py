@@ -1,14 +1,13 @@
-"""The three timelines of every view: fast step, device time and frame number.
+"""The three timelines of every view: seconds since the first exposure began, fast step and frame number.
 
-Fast steps are what the devices count, so device time and frame number follow from them exactly; what
-only has a host time (the log, the link) comes to device time by the exposures' own pairs of both. Device
-time is a timestamp: a device that counts from its power-up begins in 1970.
+Fast steps are what the devices count, so the time on their clock and the frame number follow from them exactly; what
+only has a host time (the log, the link) comes to the devices' clock by the exposures' own pairs of both.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from aolink.exposure import Exposure
 from aolink.rig import Rig
 
 FAST_STEP = "fast_step"
-DEVICE_TIME = "device_time"
+TIME = "time"
 FRAME = "frame"
 
 IntArray = NDArray[np.int64]
@@ -36,6 +35,8 @@ class Timebase:
     """First fast step of the exposure that the others are counted from."""
     frame_id: int
     """Its frame."""
+    origin_ns: int
+    """When it began on the device's clock, ns: the zero of the timeline of seconds."""
     device_ns: IntArray
     """Starts of exposures on the device's clock, ns, (n,)."""
     host_ns: IntArray
@@ -53,13 +54,21 @@ class Timebase:
             frame_period_steps=rig.timing.frame_period_steps,
             first_step=exposures[0].first_step,
             frame_id=exposures[0].frame_id,
+            origin_ns=exposures[0].device_start_ns,
             device_ns=np.array([e.device_start_ns for e in exposures], dtype=np.int64),
             host_ns=np.array([e.host_start_ns for e in exposures], dtype=np.int64),
         )
 
+    def followed_by(self, exposures: Sequence[Exposure]) -> Timebase:
+        """The same, knowing the times of later exposures too."""
+        device, host = ([getattr(e, name) for e in exposures] for name in ("device_start_ns", "host_start_ns"))
+        return replace(
+            self, device_ns=np.append(self.device_ns, device), host_ns=np.append(self.host_ns, host)
+        )  # fmt: skip
+
     def device_of_step(self, steps: ArrayLike) -> IntArray:
         """Device time at which a fast step begins, ns."""
-        device: IntArray = self.device_ns[0] + (np.asarray(steps, dtype=np.int64) - self.first_step) * self.fast_step_ns
+        device: IntArray = self.origin_ns + (np.asarray(steps, dtype=np.int64) - self.first_step) * self.fast_step_ns
         return device
 
     def frame_of_step(self, steps: ArrayLike) -> IntArray:
@@ -78,7 +87,7 @@ class Timebase:
     def every_step(self, steps: ArrayLike) -> list[rr.TimeColumn]:
         """Columns for values at fast steps; they have no frame number, or a frame's 200 would share one place."""
         steps = np.asarray(steps, dtype=np.int64)
-        return [_sequence(FAST_STEP, steps), _timestamp(self.device_of_step(steps))]
+        return [_sequence(FAST_STEP, steps), self._seconds(self.device_of_step(steps))]
 
     def at_steps(self, steps: ArrayLike, frames: ArrayLike | None = None) -> list[rr.TimeColumn]:
         """Columns on all three timelines for values that come once a frame."""
@@ -87,19 +96,22 @@ class Timebase:
 
     def at_frames(self, frames: ArrayLike) -> list[rr.TimeColumn]:
         """Columns on all three timelines for values that belong to frames: at the start of their exposures."""
-        frames = np.asarray(frames, dtype=np.int64)
-        return self.at_steps(self.first_step + (frames - self.frame_id) * self.frame_period_steps, frames)
+        return self.at_steps(self.step_of_frame(frames), frames)
+
+    def step_of_frame(self, frames: ArrayLike) -> IntArray:
+        """The fast step at which a frame's exposure begins."""
+        since: IntArray = (np.asarray(frames, dtype=np.int64) - self.frame_id) * self.frame_period_steps
+        return self.first_step + since
 
     def at_host(self, host_ns: ArrayLike) -> list[rr.TimeColumn]:
         """Columns on all three timelines for values that only have a host time."""
         device = self.device_of_host(host_ns)
-        steps = self.first_step + (device - self.device_ns[0]) // self.fast_step_ns
-        return [_sequence(FAST_STEP, steps), _timestamp(device), _sequence(FRAME, self.frame_of_step(steps))]
+        steps = self.first_step + (device - self.origin_ns) // self.fast_step_ns
+        return [_sequence(FAST_STEP, steps), self._seconds(device), _sequence(FRAME, self.frame_of_step(steps))]
+
+    def _seconds(self, device_ns: IntArray) -> rr.TimeColumn:
+        return rr.TimeColumn(TIME, duration=(device_ns - self.origin_ns).astype("timedelta64[ns]"))
 
 
 def _sequence(name: str, values: Any) -> rr.TimeColumn:
     return rr.TimeColumn(name, sequence=values)
-
-
-def _timestamp(nanoseconds: IntArray) -> rr.TimeColumn:
-    return rr.TimeColumn(DEVICE_TIME, timestamp=nanoseconds.astype("datetime64[ns]"))

@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 from urllib.parse import quote
@@ -29,7 +30,7 @@ from rerun.experimental import ViewerClient
 
 from aolink.errors import RendererError, ViewerError
 from aolink.files import check_target, writing
-from aolink.viewing.timebase import FAST_STEP
+from aolink.viewing.timebase import FAST_STEP, TIME
 from aolink.viewing.vulkan import has_vulkan
 
 HOST = "127.0.0.1"
@@ -75,7 +76,8 @@ def screenshot(
     png_path:
         The picture to write; an older one is replaced.
     step:
-        Fast step on which the time cursor stands; by default well inside the session.
+        Fast step on which the time cursor stands, and which the axes then count; by default a time well inside the
+        session.
     size:
         Width and height, pixels.
 
@@ -118,9 +120,12 @@ def headless_viewer(
         try:
             client = _connected(process, port, said)
             client.open(str(path))
-            inside = _step_inside_once_loaded(client)
+            timeline, inside = _inside_once_loaded(client)
             client.run_command("ui.toggle_top_panel")
-            client.set_time(FAST_STEP, sequence=inside if step is None else step, play_state="paused")
+            if step is None and timeline == TIME:
+                client.set_time(TIME, duration=np.timedelta64(inside, "ns"), play_state="paused")
+            else:
+                client.set_time(FAST_STEP, sequence=inside if step is None else step, play_state="paused")
             yield client
         except (RuntimeError, ConnectionError, ViewerError) as error:
             # A viewer that cannot draw answers at first and ends with its first frame, during any of these calls;
@@ -186,20 +191,60 @@ def serve_web(
     on_ready:
         Called once with the address to open.
     """
-    path = _existing(rrd_path)
+    with serving([str(_existing(rrd_path))], port) as server:
+        if on_ready is not None:
+            on_ready(server.address)
+        server.wait()
+
+
+@dataclass(frozen=True)
+class Server:
+    """Rerun's program as it listens for data, and shows it."""
+
+    process: subprocess.Popen[bytes]
+    said: IO[bytes]
+    data_port: int
+    """Where data comes in and, for a web page, goes out."""
+    address: str = ""
+    """Of the web page."""
+
+    @property
+    def data_address(self) -> str:
+        return f"rerun+http://{HOST}:{self.data_port}/proxy"
+
+    def wait(self) -> None:
+        """Until it ends. Raises `ViewerError` where nobody has ended it."""
+        if self.process.wait() != 0:
+            raise _why_it_ended(self.said)
+
+
+@contextmanager
+def serving(files: Sequence[str] = (), port: int | None = None) -> Iterator[Server]:
+    """The web viewer's page on this machine's loopback, which shows files, or what comes to its data's address.
+
+    Raises `ViewerError` where the port that is asked for is in use, or nothing answers.
+    """
     if port is None:
         port = WEB_PORT if _is_free(WEB_PORT) else free_port()
     elif not _is_free(port):
         raise ViewerError(f"port {port} is in use: stop what uses it or choose another one")
     data_port = free_port()
-    options = [str(path), "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
+    options = [*files, "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
     with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
         for listening in (port, data_port):
             wait_for_server(listening, process, said)
-        if on_ready is not None:
-            on_ready(f"http://{HOST}:{port}/?url={quote(f'rerun+http://{HOST}:{data_port}/proxy', safe='')}")
-        if process.wait() != 0:
-            raise _why_it_ended(said)
+        data = quote(f"rerun+http://{HOST}:{data_port}/proxy", safe="")
+        yield Server(process, said, data_port, f"http://{HOST}:{port}/?url={data}")
+
+
+@contextmanager
+def window() -> Iterator[Server]:
+    """The native viewer, empty, on the screen. Raises `ViewerError` where there is none, or nothing answers."""
+    check_display()
+    port = free_port()
+    with tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process:
+        wait_for_server(port, process, said)
+        yield Server(process, said, port)
 
 
 def free_port() -> int:
@@ -288,15 +333,18 @@ def wait_for_server(port: int, process: subprocess.Popen[bytes], said: IO[bytes]
     _wait_for(lambda: not _is_free(port), process, said)
 
 
-def _step_inside_once_loaded(client: ViewerClient) -> int:
-    """A fast step at which everything has begun and nothing has ended."""
+def _inside_once_loaded(client: ViewerClient) -> tuple[str, int]:
+    """A place at which everything has begun and nothing has ended: ns since the first exposure began or, in a file of
+    an older aolink, a fast step; before it the timeline.
+    """
     deadline = time.monotonic() + _SETTLE_S
     while True:
         state = client.get_state()
-        found = [t for r in state.recordings for t in r.timelines if t.name == FAST_STEP]
-        if found and not state.loading:
-            start, end = found[0].start or 0, found[0].end or 0
-            return start + round(0.6 * (end - start))
+        timelines = {t.name: t for r in state.recordings for t in r.timelines}
+        name = TIME if TIME in timelines else FAST_STEP
+        if name in timelines and not state.loading:
+            start, end = timelines[name].start or 0, timelines[name].end or 0
+            return name, start + round(0.6 * (end - start))
         if time.monotonic() > deadline:
             raise ViewerError("the viewer shows no recording with fast steps: give a file that aolink wrote")
         time.sleep(_POLL_S)

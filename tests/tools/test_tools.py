@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -30,7 +32,7 @@ def test_every_program_is_run_somewhere() -> None:
     programs = {each.name for each in TOOLS.iterdir() if each.is_file() and each.read_bytes()[:2] == b"#!"}
     by_ci, here, by_their_own_tests = (
         {"demo", "test", "bench", "fuzz"},
-        {"protocol", "recordings", "scene"},
+        {"pictures", "protocol", "recordings", "scene"},
         {"family", "paper"},
     )
     assert programs == by_ci | here | by_their_own_tests
@@ -147,3 +149,28 @@ def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytes
     }
     written = {name for name in written if not name.startswith("_")}
     assert written == set(rooms[room])
+
+
+@pytest.mark.parametrize("name", ["demo", "method", "scene", "pupil", "loop"])
+def test_pictures_are_made_and_are_those_of_the_pages(name: str, tmp_path: Path) -> None:
+    """Short ones; README and the gallery show the repository's own, which are small."""
+    done = run(TOOLS / "pictures", name, "--short", "--out", tmp_path)
+    if "no Vulkan driver" in done.stderr and not os.environ.get("AOLINK_REQUIRE_ALL"):
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    pictures = ROOT / "recordings" / "pictures"
+    for made in (tmp_path / f"{name}.png", pictures / f"{name}.png"):
+        assert made.stat().st_size <= 300_000
+        with Image.open(made) as picture:
+            assert picture.format == "PNG"
+            assert len(picture.convert("RGB").getcolors(1 << 24)) > 50
+    assert f"recordings/pictures/{name}.png" in (ROOT / "README.md").read_text()
+    assert f"({name}.png)" in (pictures / "README.md").read_text()
+
+
+def test_links_of_the_pages_lead_somewhere() -> None:
+    for page in (ROOT / "README.md", ROOT / "recordings" / "pictures" / "README.md"):
+        links = re.findall(r"\]\(([^)#]+)", page.read_text())
+        assert links
+        for link in links:
+            assert (page.parent / link).exists(), f"{page}: {link}"

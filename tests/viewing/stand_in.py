@@ -14,6 +14,7 @@ from scipy.signal import lfilter
 
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.model.exposure_model import exposure_model
+from aolink.exporting.series import Series
 from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.plain import plain_data
@@ -51,7 +52,7 @@ class Drawn(Estimate):
 
 
 @dataclass
-class StandIn:
+class StandIn(Series):
     """What `aolink.recording.reader.Recording` offers."""
 
     n: int = 12
@@ -100,6 +101,21 @@ class StandIn:
                 )
             )  # fmt: skip
 
+    damage = ""
+
+    @property
+    def has_truth(self) -> bool:
+        return self.with_truth
+
+    def __len__(self) -> int:
+        return len(self._exposures)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._exposures[index]
+
+    def iter_estimates(self, name: str) -> Iterator[Estimate]:
+        return iter(self.estimates(name))
+
     @property
     def estimators(self) -> list[str]:
         return list(self.names)
@@ -121,7 +137,7 @@ class StandIn:
     def exposures(self) -> Iterator[Exposure]:
         return iter(self._exposures)
 
-    def estimates(self, name: str) -> list[Drawn]:
+    def estimates(self, name: str) -> list[Any]:
         rng = np.random.default_rng(len(name))
         sd, m = SD[name], MEASUREMENTS[name]
         made = []
@@ -145,7 +161,7 @@ class StandIn:
 
     def messages(self, *topics: str) -> Iterator[Recorded]:
         made = [r for source in (self._blocks(), self._per_frame(), self._per_second()) for r in source]
-        return iter([r for r in made if not topics or r.topic in topics])
+        return iter(sorted((r for r in made if not topics or r.topic in topics), key=lambda r: r.log_time_ns))
 
     def _blocks(self) -> Iterator[Recorded]:
         block = self.rig.mirror.block_steps

@@ -19,14 +19,17 @@ from aolink.viewing.camera import HISTORY
 from aolink.viewing.motion import log_estimates
 from aolink.viewing.palette import MISSING, NOTHING, TRUTH
 from aolink.viewing.save import save_rrd
+from aolink.viewing.series import POINTS, Chosen, Drawing
 from aolink.viewing.timebase import Timebase
 from tests.conftest import Session
 from tests.kinds import truth_of
 from tests.viewing.rrd import Entities, read_blueprint, read_rrd, scalars
-from tests.viewing.stand_in import DEVICE_ZERO_NS, MEASUREMENTS, StandIn, as_recording
+from tests.viewing.stand_in import MEASUREMENTS, StandIn, as_recording
 
 N = 200
 LOST = 3
+SHOWN = np.linspace(0, N - 1, POINTS).astype(int)
+"""The fast steps of an exposure at which a path is drawn."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +61,7 @@ def absent_from_views(path: Path) -> list[str]:
         for expression in row
     ]
     exact = [q.removeprefix("+ ") for q in queries if "*" not in q and "$" not in q]
-    assert len(exact) > 30
+    assert len(exact) > 2
     return [name for name in exact if not name.endswith("/axes") and name not in entities]
 
 
@@ -68,8 +71,8 @@ def test_a_recorded_session_shows_its_estimates(recorded: Session, tmp_path: Pat
     entities = read_rrd(path)
     for name in recording.estimators:
         shown = scalars(entities[f"/path/{name}/mean"])[:, 0]
-        np.testing.assert_array_equal(shown, np.concatenate([e.path[0] for e in recording.estimates(name)]))
-    truth = np.concatenate([truth_of(e).path[0] for e in recording.exposures()])
+        np.testing.assert_array_equal(shown, np.concatenate([e.path[0, SHOWN] for e in recording.estimates(name)]))
+    truth = np.concatenate([truth_of(e).path[0, SHOWN] for e in recording.exposures()])
     np.testing.assert_array_equal(scalars(entities["/path/truth"])[:, 0], truth)
     assert entities["/camera/image"]["frame"] == [e.frame_id for e in recording.exposures()]
     assert absent_from_views(path) == []
@@ -83,8 +86,8 @@ def test_rerun_finds_no_fault_in_the_file(saved: Path) -> None:
 @pytest.mark.parametrize("name", sorted(MEASUREMENTS))
 def test_path_and_band_are_the_estimates(recording: StandIn, entities: Entities, name: str) -> None:
     estimates = recording.estimates(name)
-    mean = np.concatenate([e.path[0] for e in estimates])
-    sd = np.concatenate([e.path_sd[0] for e in estimates])
+    mean = np.concatenate([e.path[0, SHOWN] for e in estimates])
+    sd = np.concatenate([e.path_sd[0, SHOWN] for e in estimates])
     np.testing.assert_array_equal(without_breaks(scalars(entities[f"/path/{name}/mean"]))[:, 0], mean)
     band = without_breaks(scalars(entities[f"/path/{name}/band"]))
     np.testing.assert_allclose(band, np.stack([mean + 2 * sd, mean - 2 * sd], axis=1), rtol=1e-14)
@@ -95,7 +98,7 @@ def test_errors_are_estimate_minus_truth(recording: StandIn, entities: Entities,
     pairs = list(zip(recording.estimates(name), recording.exposures(), strict=True))
     error = [estimate.path[0] - truth_of(exposure).path[0] for estimate, exposure in pairs]
     np.testing.assert_allclose(
-        without_breaks(scalars(entities[f"/error/path/{name}"]))[:, 0], np.concatenate(error), atol=1e-15
+        without_breaks(scalars(entities[f"/error/path/{name}"]))[:, 0], np.concatenate(error)[_shown(11)], atol=1e-15
     )
     rms = scalars(entities[f"/error/path_rms/{name}"])[:, 0]
     np.testing.assert_allclose(rms, [np.linalg.norm(e) / np.sqrt(N) for e in error])
@@ -104,10 +107,15 @@ def test_errors_are_estimate_minus_truth(recording: StandIn, entities: Entities,
         np.testing.assert_allclose(scalars(entities[f"/error/end/x{i + 1}/{name}"])[:, 0], end, atol=1e-15)
 
 
-def test_a_path_is_at_its_own_fast_steps_and_device_times(recording: StandIn, entities: Entities) -> None:
+def _shown(exposures: int) -> np.ndarray:
+    """Places of the shown steps among all of so many exposures."""
+    return np.concatenate([N * k + SHOWN for k in range(exposures)])
+
+
+def test_a_path_is_at_its_own_fast_steps_and_seconds(recording: StandIn, entities: Entities) -> None:
     truth = entities["/path/truth"]
     steps = np.array(truth["fast_step"])
-    np.testing.assert_array_equal(np.array(truth["device_time"]), DEVICE_ZERO_NS + steps * 1_000_000)
+    np.testing.assert_array_equal(np.array(truth["time"]), steps * 1_000_000)
     known = ~np.isnan(scalars(truth)[:, 0])
     np.testing.assert_array_equal(scalars(truth)[known, 0], recording.spot[steps[known]])
     assert "frame" not in truth
@@ -143,7 +151,9 @@ def test_nis_is_shown_between_its_95_percent_bounds(
     )
     low, high = nis_bounds(degrees)
     assert stats.chi2.cdf(high, degrees) - stats.chi2.cdf(low, degrees) == pytest.approx(0.95)
-    np.testing.assert_array_equal(scalars(entities[f"/nis/{name}/bounds"]), [[low, high]] * 11)
+    bounds = entities[f"/nis/{name}/bounds"]
+    np.testing.assert_array_equal(scalars(bounds), [[low, high]] * 2)
+    assert bounds["frame"] == [0, 11]
 
 
 def test_an_estimator_that_does_not_measure_has_no_nis(entities: Entities) -> None:
@@ -158,32 +168,76 @@ def test_frames_are_the_counts_that_came(recording: StandIn, entities: Entities)
     assert frames["frame"] == recording.frame_ids
 
 
-def test_the_newest_exposure_is_the_last_row_and_what_never_came_is_marked(entities: Entities) -> None:
-    buffers = entities["/camera/history"]["Image:buffer"]
-    pictures = {
-        frame: np.array(buffer[0], dtype=np.uint8).reshape(HISTORY, 40, 3)
-        for frame, buffer in zip(entities["/camera/history"]["frame"], buffers, strict=True)
-    }
-    np.testing.assert_array_equal(pictures[6][-2], pictures[5][-1])
-    assert (pictures[5][-1, 30:34] == MISSING).all()
-    assert (pictures[LOST + 1][-2] == MISSING).all()
-    assert not (pictures[4][-1] == MISSING).all(axis=1).any()
-    assert (pictures[4][: HISTORY - 5] == NOTHING).all()
+def test_a_page_has_a_row_for_each_exposure_and_marks_what_never_came(entities: Entities) -> None:
+    ((buffer,),) = entities["/camera/history"]["Image:buffer"]
+    page = np.array(buffer, dtype=np.uint8).reshape(HISTORY, 40, 3)
+    assert (page[5, 30:34] == MISSING).all()
+    assert (page[LOST] == MISSING).all()
+    assert not (page[4] == MISSING).all(axis=1).any()
+    assert (page[12:] == NOTHING).all()
+    rows = [np.array(strips[0])[:, 1] for strips in entities["/camera/history/now"]["LineStrips2D:strips"]]
+    assert [(row.min(), row.max()) for row in rows] == [(k, k + 1) for k in range(12) if k != LOST]
+
+
+def test_pages_follow_each_other_and_each_picture_is_sent_once(tmp_path: Path) -> None:
+    """A frame that is lost where a page ends is marked there."""
+    entities = read_rrd(save_rrd(as_recording(StandIn(n=70, lost=(31, 40), names=("o3",))), tmp_path / "long.rrd"))
+    history = entities["/camera/history"]
+    assert history["frame"] == [0, 32, 64]
+    pages = [np.array(buffer[0], dtype=np.uint8).reshape(HISTORY, 40, 3) for buffer in history["Image:buffer"]]
+    assert [[k for k in range(HISTORY) if (page[k] == MISSING).all()] for page in pages] == [[31], [8], []]
+    strips = entities["/camera/history/path/o3"]["LineStrips2D:strips"]
+    assert [len(each) for each in strips] == [31, 31, 6]
+
+
+def test_exposures_are_intervals_and_what_went_wrong_is_on_the_timeline(entities: Entities) -> None:
+    """Frame 3 was lost, of frame 5 four columns of forty are missing."""
+    lane = entities["/status/exposure"]
+    assert lane["fast_step"] == [k * N for k in range(12)]
+    assert [state for (state,) in lane["StateChange:state"]][2:5] == ["EXPOSURE", "LOST", "EXPOSURE"]
+    warnings = entities["/warnings"]
+    assert [text for (text,) in warnings["TextLog:text"]] == [
+        "1 frame lost before frame 4", "frame 5 is incomplete: 10% of its pixels never came",
+    ]  # fmt: skip
+    assert warnings["frame"] == [4, 5]
+
+
+def test_a_path_that_swings_too_often_for_a_line_is_drawn_as_its_range(tmp_path: Path) -> None:
+    """What it is between holds every fast step, and the estimate's band is outside of it."""
+    recording = StandIn(n=12, names=("o3",))
+    swing = 0.2 * np.sin(2 * np.pi * np.arange(N) / 6.1)
+    estimates = [replace(e, drawn=swing[None] + 0.01 * k) for k, e in enumerate(recording.estimates("o3"))]
+    path = tmp_path / "swings.rrd"
+    with rr.RecordingStream("test") as stream:
+        stream.save(path)
+        timebase = Timebase.of(recording.rig, list(recording.exposures()))
+        log_estimates(Drawing(stream=stream, chosen=Chosen.of(recording.rig)), timebase, estimates)
+    entities = read_rrd(path)
+    assert "/path/o3/mean" not in entities
+    high, low = scalars(entities["/path/o3/range"]).T
+    above, below = scalars(entities["/path/o3/band"]).T
+    assert len(high) == 12 * POINTS // 2
+    parts = [part for e in estimates for part in np.array_split(e.path[0], POINTS // 2)]
+    np.testing.assert_array_equal(high, [part.max() for part in parts])
+    np.testing.assert_array_equal(low, [part.min() for part in parts])
+    assert (above > high).all()
+    assert (below < low).all()
+
+
+def test_of_a_few_exposures_every_fast_step_is_shown(tmp_path: Path) -> None:
+    recording = StandIn(n=4, names=("o3",))
+    entities = read_rrd(save_rrd(as_recording(recording), tmp_path / "few.rrd"))
+    mean = scalars(entities["/path/o3/mean"])[:, 0]
+    np.testing.assert_array_equal(mean, np.concatenate([e.path[0] for e in recording.estimates("o3")]))
 
 
 def test_a_path_runs_down_its_own_row(recording: StandIn, entities: Entities) -> None:
-    strips = dict(
-        zip(
-            entities["/camera/history/path/truth"]["frame"],
-            entities["/camera/history/path/truth"]["LineStrips2D:strips"],
-            strict=True,
-        )
-    )
-    newest = np.array(strips[11][-1])
-    assert len(strips[11]) == 11
+    (strips,) = entities["/camera/history/path/truth"]["LineStrips2D:strips"]
+    newest = np.array(strips[-1])
+    assert len(strips) == 11
     path = truth_of(list(recording.exposures())[-1]).path[0]
     np.testing.assert_allclose(newest[[0, -1], 0], (path[[0, -1]] + 1) / 0.05, rtol=1e-6)
-    assert HISTORY - 1 < newest[0, 1] < newest[-1, 1] < HISTORY
+    assert 11 < newest[0, 1] < newest[-1, 1] < 12
 
 
 def test_predicted_profile_has_unit_mass_about_the_path_it_came_from(recording: StandIn, entities: Entities) -> None:
@@ -200,12 +254,17 @@ def test_predicted_profile_has_unit_mass_about_the_path_it_came_from(recording: 
 
 
 def test_commands_and_what_was_applied(recording: StandIn, entities: Entities) -> None:
-    steps = np.arange(12 * N)
+    """At the steps where they change, and of those so many that a path has; the extremes are among them."""
     sent, held = entities["/mirror/command"], entities["/mirror/applied"]
-    assert sent["fast_step"] == held["fast_step"] == steps.tolist()
     expected = recording.rig.drive.inputs(0, 12 * N, 1e-3)
-    np.testing.assert_array_equal(scalars(sent), expected)
-    np.testing.assert_array_equal(scalars(held), np.round(expected, 4))
+    for shown, inputs in ((sent, expected), (held, np.round(expected, 4))):
+        steps = shown["fast_step"]
+        assert (steps[0], steps[-1]) == (0, 12 * N - 1)
+        assert len(steps) <= 12 * POINTS + 2
+        np.testing.assert_array_equal(scalars(shown), inputs[steps])
+        assert scalars(shown).min() == inputs.min()
+        assert scalars(shown).max() == inputs.max()
+    assert len(sent["fast_step"]) > 12 * POINTS // 3
     assert entities["/status/mirror"]["StateChange:state"] == [["COMMAND"], ["PARKED"], ["COMMAND"]]
     assert entities["/status/mirror"]["fast_step"] == [0, 150, 200]
 
@@ -226,7 +285,7 @@ def test_what_links_and_clocks_do_is_shown_in_its_units(entities: Entities) -> N
     np.testing.assert_allclose(scalars(entities["/link/round_trip/camera"])[:, 0], 0.2)
     np.testing.assert_allclose(scalars(entities["/clock/offset/camera"])[:, 0], [0, 20, 40])
     np.testing.assert_allclose(scalars(entities["/clock/sigma/mirror"])[:, 0], [90, 45, 30])
-    assert entities["/clock/sigma/mirror"]["device_time"][1] - DEVICE_ZERO_NS == 10**9
+    assert entities["/clock/sigma/mirror"]["time"][1] == 10**9
     assert entities["/clock/sigma/mirror"]["fast_step"] == [0, 1000, 2000]
 
 
@@ -278,7 +337,8 @@ def test_many_axes_become_percentiles(tmp_path: Path) -> None:
     path = tmp_path / "many.rrd"
     with rr.RecordingStream("test") as stream:
         stream.save(path)
-        log_estimates(stream, Timebase.of(recording.rig, list(recording.exposures())), estimates)
+        timebase = Timebase.of(recording.rig, list(recording.exposures()))
+        log_estimates(Drawing(stream=stream, chosen=Chosen.of(recording.rig), points=None), timebase, estimates)
     entities = read_rrd(path)
     assert len(entities) < 30
     values = np.concatenate([e.path for e in estimates], axis=1)
@@ -316,7 +376,7 @@ def test_a_full_disk_is_one_clear_error_and_leaves_nothing(tmp_path: Path) -> No
 
 
 def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session, tmp_path: Path) -> None:
-    """Frames, histories, paths and errors are those of `save_rrd`; only the brightness follows the first frame."""
+    """Frames, paths, errors and states are those of `save_rrd`; only the brightness follows the first frame."""
     import rerun as rr
 
     from aolink.session.replay import replay
@@ -333,7 +393,7 @@ def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session
     live_entities, file_entities = (read_rrd(tmp_path / name) for name in ("live.rrd", "file.rrd"))
     for entity, component in (
         ("/camera/image", "Image:buffer"),
-        ("/camera/history/path/o3", "LineStrips2D:strips"),
+        ("/profile/path/o3", "LineStrips2D:strips"),
         ("/path/o3/mean", "Scalars:scalars"),
         ("/error/path/o1", "Scalars:scalars"),
         ("/status/o3", "StateChange:state"),
@@ -344,6 +404,9 @@ def test_fed_exposure_by_exposure_it_shows_what_the_file_shows(recorded: Session
             )
             assert ours == theirs, (entity, column)
             assert ours
+    pages = [each["/camera/history/path/o3"]["LineStrips2D:strips"] for each in (live_entities, file_entities)]
+    assert pages[0][-1] == pages[1][-1]
+    assert len(pages[0]) == len(recording)
 
 
 def test_a_live_view_takes_an_estimate_with_a_later_exposure(recorded: Session, tmp_path: Path) -> None:
@@ -360,16 +423,20 @@ def test_a_live_view_takes_an_estimate_with_a_later_exposure(recorded: Session, 
     stream.disconnect()
     entities = read_rrd(tmp_path / "live.rrd")
     shown = scalars(entities["/path/o3/mean"])[:, 0]
-    np.testing.assert_array_equal(shown, np.concatenate([late[k].path[0] for k in (0, 1, 3)]))
+    np.testing.assert_array_equal(shown, np.concatenate([late[k].path[0, SHOWN] for k in (0, 1, 3)]))
     steps = [step for step in entities["/path/o3/mean"]["fast_step"] if step is not None]
-    assert steps == [e.first_step + k for e in (late[0], late[1], late[3]) for k in range(e.n_steps)]
+    assert steps == [e.first_step + k for e in (late[0], late[1], late[3]) for k in SHOWN]
 
 
 def test_what_an_estimator_had_no_time_for_is_shown(tmp_path: Path) -> None:
     save_rrd(as_recording(StandIn(n=12, without_time=(7, 8))), tmp_path / "a.rrd")
     entities = read_rrd(tmp_path / "a.rrd")
     assert len(scalars(entities["/latency/estimation/o3"])) == 10
-    states = [each for each in entities["/status/o3"]["StateChange:state"] if each is not None]
-    assert sum(each == ["SKIPPED"] or each == "SKIPPED" for each in states) == 2
+    lane = entities["/status/o3"]
+    assert [state for (state,) in lane["StateChange:state"]] == ["OK", "SKIPPED", "OK"]
+    assert lane["frame"] == [0, 7, 9]
+    assert [text for (text,) in entities["/warnings"]["TextLog:text"]][-2:] == [
+        "o3 had no time for frame 7", "o3 had no time for frame 8",
+    ]  # fmt: skip
     (text,) = [each for each in entities["/session"]["TextDocument:text"] if each is not None]
     assert "skipped for want of time: o3 2" in str(text)

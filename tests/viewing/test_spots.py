@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from aolink.estimation import run
 from aolink.estimation.estimate import Estimate, Status
+from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.restoration import deblur
 from aolink.rig import Rig, load_rig
@@ -25,11 +27,11 @@ NAMES = ["o1", "open-loop"]
 
 
 @dataclass
-class Simulated:
+class Simulated(Series):
     """What `aolink.recording.reader.Recording` offers, of a rig that no device was part of."""
 
     rig: Rig
-    estimators: list[str] = field(default_factory=lambda: NAMES)
+    names: list[str] = field(default_factory=lambda: NAMES)
     path: Path = Path("session.mcap")
     metadata: dict[str, str] = field(default_factory=dict)
     digest: str = "1" * 64
@@ -38,16 +40,32 @@ class Simulated:
 
     def __post_init__(self) -> None:
         self._exposures = simulate(self.rig, N)
-        self._estimates = run(self.rig, self._exposures, self.estimators)
+        self._estimates = run(self.rig, self._exposures, self.names)
 
-    def exposures(self) -> list[Exposure]:
-        return self._exposures
+    damage = ""
+    has_truth = True
+
+    @property
+    def estimators(self) -> list[str]:
+        return self.names
+
+    def __len__(self) -> int:
+        return N
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._exposures[index]
+
+    def iter_estimates(self, name: str) -> Iterator[Estimate]:
+        return iter(self._estimates[name])
+
+    def exposures(self) -> Iterator[Exposure]:
+        return iter(self._exposures)
 
     def estimates(self, name: str) -> list[Estimate]:
         return self._estimates[name]
 
-    def messages(self, *topics: str) -> list[Any]:
-        return []
+    def messages(self, *topics: str) -> Iterator[Any]:
+        return iter(())
 
     @property
     def counts(self) -> dict[str, int]:
@@ -56,8 +74,8 @@ class Simulated:
     def skipped(self, name: str) -> frozenset[int]:
         return frozenset()
 
-    def restored(self) -> list[Any]:
-        return [deblur(self.rig, self._exposures[0], self._estimates["o1"][0])]
+    def restored(self) -> Iterator[Any]:
+        yield deblur(self.rig, self._exposures[0], self._estimates["o1"][0])
 
     true_scene = None
 
@@ -98,7 +116,7 @@ def test_the_profile_is_that_of_the_first_spot_along_x(recording: Simulated, sav
     (strip,) = read_rrd(saved)["/profile/measured"]["LineStrips2D:strips"][0]
     assert len(strip) == 2 * 24
     line = recording.rig.sensor.profile
-    counts = recording.exposures()[0].pixels[:24, :24].sum(axis=0, dtype=np.int64)
+    counts = recording[0].pixels[:24, :24].sum(axis=0, dtype=np.int64)
     density = (counts - line.black_level) / line.counts_per_density
     drawn = -np.array(strip)[::2, 1]
     np.testing.assert_allclose(drawn / drawn.max(), density / density.max(), atol=1e-6)

@@ -13,7 +13,7 @@ PERIOD, STEP_NS = 200, 1_000_000
 def timebase(drift_ppm: float = 0.0) -> Timebase:
     starts = np.arange(50, dtype=np.int64) * PERIOD * STEP_NS
     return Timebase(
-        fast_step_ns=STEP_NS, frame_period_steps=PERIOD, first_step=1000, frame_id=5,
+        fast_step_ns=STEP_NS, frame_period_steps=PERIOD, first_step=1000, frame_id=5, origin_ns=9_000_000_000,
         device_ns=9_000_000_000 + starts,
         host_ns=1_700_000_000_000_000_000 + starts - np.rint(starts * drift_ppm * 1e-6).astype(np.int64),
     )  # fmt: skip

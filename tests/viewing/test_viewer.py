@@ -28,7 +28,7 @@ from aolink.viewing.viewer import WEB_PORT, free_port, headless_viewer, settled_
 from aolink.viewing.vulkan import has_vulkan
 from tests.viewing.stand_in import StandIn, as_recording
 
-TEXTS = ("Session", "Log")
+TEXTS = ("Session", "Warnings", "Log")
 PICTURES = ("Camera", "Intensity")
 
 
@@ -220,6 +220,36 @@ def test_a_viewer_that_gets_the_data_over_the_network_shows_the_layout(rrd: Path
     except ViewerError as error:
         needs_a_renderer(error)
     assert {"Session", "Log", "Path, all (slope units)"} <= names
+
+
+@pytest.mark.long
+def test_a_recording_is_served_while_it_is_read(
+    tmp_path: Path, start_aolink: Callable[..., subprocess.Popen[str]]
+) -> None:
+    """A viewer that takes what `aolink view RECORDING --web` serves has its exposures and its layout."""
+    recording = Path(__file__).parents[2] / "recordings" / "section-vi-lively.mcap"
+    with rr.RecordingStream("another") as stream:
+        stream.save(tmp_path / "another.rrd")
+        stream.send_columns("line", [rr.TimeColumn("time", duration=[0, 1])], rr.Scalars.columns(scalars=[0.0, 1.0]))
+    serving = start_aolink("view", recording, "--web")
+    assert serving.stdout is not None
+    address = serving.stdout.readline().strip()
+    (data,) = urllib.parse.parse_qs(urllib.parse.urlsplit(address).query)["url"]
+    names: set[str] = set()
+    try:
+        with headless_viewer(tmp_path / "another.rrd") as client:
+            client.open(data)
+            deadline = time.monotonic() + 30
+            while "Session" not in names and time.monotonic() < deadline:
+                time.sleep(0.1)
+                names.update(view.name for view in client.get_state().views)
+    except ViewerError as error:
+        needs_a_renderer(error)
+    finally:
+        serving.send_signal(signal.SIGINT)
+        serving.communicate(timeout=60)
+    assert {"Session", "Path, all (slope units)", "NIS (no unit) with its 95% bounds"} <= names
+    assert serving.returncode == 130
 
 
 def test_a_port_in_use_is_one_clear_error(rrd: Path) -> None:

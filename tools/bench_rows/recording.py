@@ -313,3 +313,54 @@ def rrd_of_ten_minutes(effort: Effort) -> Row:
     return Row(
         f".rrd of ten minutes, {rows / 1e3:.0f}k rows", f"{ours:.1f} s", f"rr.log {theirs:.0f} s", theirs / ours, 20
     )
+
+
+def _hour(folder: Path, effort: Effort) -> Recording:
+    """An hour of a session at 5 exposures a second, with o3."""
+    from aolink.recording.reestimate import write_reestimated
+
+    record_long(folder / "bare.mcap", effort.of(18_000, 64))
+    write_reestimated(Recording(folder / "bare.mcap"), ["o3"], folder / "hour.mcap")
+    return Recording(folder / "hour.mcap")
+
+
+def rrd_size(effort: Effort) -> Row:
+    """The .rrd of an hour, in bytes of the recording; and by how much writing it makes the process grow."""
+    from aolink.viewing import save_rrd
+
+    with tempfile.TemporaryDirectory() as name:
+        recording = _hour(Path(name), effort)
+        grown: list[float] = []
+        saved = save_rrd(recording, Path(name) / "a.rrd", progress=lambda done: grown.append(resident_mb()))
+        ratio = saved.stat().st_size / recording.size
+        more = max(grown) - grown[0]
+    ours = f"{ratio:.2f} times the recording, {more:.0f} MB more memory after the first part"
+    return Row(f".rrd of {len(recording)} exposures", ours, "limit 4 times", 4 / ratio, 1.0)
+
+
+def view_first(effort: Effort) -> Row:
+    """From when a recording of an hour is opened until its first part is with the viewer, which is an unseen one."""
+    import rerun as rr
+
+    from aolink.viewing import Look
+    from aolink.viewing.save import sent_parts
+    from aolink.viewing.viewer import free_port, running_rerun, wait_for_server
+
+    times = []
+    with tempfile.TemporaryDirectory() as name:
+        path = _hour(Path(name), effort).path
+        for _ in range(effort.of(5)):
+            start, port = time.perf_counter(), free_port()
+            with (
+                tempfile.TemporaryFile() as said,
+                running_rerun(["--serve-grpc", "--port", str(port)], said) as process,
+            ):
+                wait_for_server(port, process, said)
+                stream = rr.RecordingStream("aolink")
+                stream.connect_grpc(f"rerun+http://127.0.0.1:{port}/proxy")
+                next(sent_parts(stream, Recording(path), Look(), at_once=True))
+                stream.flush()
+                times.append(time.perf_counter() - start)
+                stream.disconnect()
+    ours = statistics.median(times)
+    return Row("first picture's data of an hour in the viewer", f"{ours:.2f} s", "limit 2 s", 2 / ours, 1.0)

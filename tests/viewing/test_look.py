@@ -1,0 +1,124 @@
+"""A part of a recording, one of many spots, two recordings beside each other: the command and what it draws."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.jobs.demo import simulated_rig
+from aolink.recording.reader import Recording
+from aolink.recording.reestimate import write_reestimated
+from aolink.rig import load_rig
+from aolink.session import record
+from aolink.viewing import Look, save_rrd
+from tests.needs import needed
+from tests.viewing.rrd import read_blueprint, read_rrd, scalars
+
+RECORDINGS = Path(__file__).parents[2] / "recordings"
+LIVELY = RECORDINGS / "section-vi-lively.mcap"
+Aolink = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def test_one_exposure_has_every_step_of_its_paths_and_nothing_of_others(aolink: Aolink, tmp_path: Path) -> None:
+    done = aolink("view", LIVELY, "--exposure", "7", "--save", "one.rrd")
+    assert done.returncode == 0, done.stderr
+    entities, recording = read_rrd(tmp_path / "one.rrd"), Recording(LIVELY)
+    estimate = recording.estimates("o3")[7]
+    np.testing.assert_array_equal(scalars(entities["/path/o3/mean"])[:, 0], estimate.path[0])
+    assert entities["/camera/image"]["frame"] == [estimate.frame_id]
+    applied = entities["/mirror/applied"]["fast_step"]
+    assert applied[0] <= estimate.first_step < applied[-1] < estimate.first_step + 2 * estimate.n_steps
+    layout = str(read_blueprint(tmp_path / "one.rrd"))
+    assert "Path; time at a place; intensity" in layout
+    assert "Latency" not in layout
+
+
+def test_a_part_has_the_exposures_that_begin_in_it(aolink: Aolink, tmp_path: Path) -> None:
+    done = aolink("view", LIVELY, "--start", "0.3", "--end", "1.25", "--save", "part.rrd")
+    assert done.returncode == 0, done.stderr
+    exposures = list(Recording(LIVELY))[2:7]  # one each 0.2 s
+    entities = read_rrd(tmp_path / "part.rrd")
+    assert entities["/camera/image"]["frame"] == [e.frame_id for e in exposures]
+    assert entities["/camera/image"]["time"][0] == 0
+
+
+def test_a_lenslet_has_its_own_lines_as_x_and_y(tmp_path: Path, aolink: Aolink) -> None:
+    recording = Recording(RECORDINGS / "tip-tilt.mcap")
+    done = aolink("view", recording.path, "--lenslet", "0,0", "--save", "spot.rrd")
+    assert done.returncode == 0, done.stderr
+    entities = read_rrd(tmp_path / "spot.rrd")
+    truth = entities["/path/truth"]
+    assert scalars(truth).shape[1] == 2
+    assert [name for names in truth["SeriesLines:names"] for name in names or []] == ["truth x", "truth y"]
+    assert "/path/truth/axes" not in entities
+    assert scalars(entities["/mirror/command"]).shape[1] == 2
+    for options, why in ((("--lenslet", "4,4"), "no light falls on it"), (("--lenslet", "one"), "row and column")):
+        assert why in " ".join(aolink("view", recording.path, *options, "--save", "x.rrd").stderr.split())
+
+
+def test_two_estimates_and_two_recordings_are_drawn_in_the_same_plots(tmp_path: Path) -> None:
+    """The second in fainter lines, from its own first exposure on."""
+    recording = Recording(LIVELY)
+    again = tmp_path / "again.mcap"
+    write_reestimated(recording, ["o1"], again, only=True)
+    path = save_rrd(recording, tmp_path / "both.rrd", look=Look(compared=Recording(again)))
+    entities = read_rrd(path)
+    first, second = (entities[f"{root}/path/o1/mean"] for root in ("", "/compared"))
+    np.testing.assert_allclose(scalars(first), scalars(second), rtol=1e-9)
+    assert first["time"] == second["time"]
+    opacities = [
+        [colour & 255 for row in each["SeriesLines:colors"] for colour in row or []] for each in (first, second)
+    ]
+    assert opacities[0] == [255]
+    assert opacities[1][0] < 200
+    layout = str(read_blueprint(path))
+    assert "+ /compared/path/o1/mean" in layout
+    assert "+ /compared/path/o3/mean" not in layout
+    assert "Compared" in layout
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (("--exposure", "20"), "there is no exposure 20"),
+        (("--start", "60"), "no exposure begins between 60 s and inf s: the last begins 3.8 s after the first"),
+        (("--start", "2", "--end", "1"), "no exposure begins between 2 s and 1 s"),
+        (("--exposure", "1", "--start", "1"), "give --exposure, or --start and --end"),
+    ],
+)
+def test_what_is_not_there_is_one_clear_error(
+    aolink: Aolink, tmp_path: Path, options: tuple[str, ...], why: str
+) -> None:  # fmt: skip
+    done = aolink("view", LIVELY, *options, "--save", "x.rrd")
+    assert done.returncode in (2, 7)
+    assert why in " ".join(done.stderr.replace("│", " ").split())
+    assert not (tmp_path / "x.rrd").exists()
+
+
+def test_side_files_are_drawn_and_reported(aolink: Aolink, tmp_path: Path) -> None:
+    needed("matplotlib")
+    shutil.copy(LIVELY, tmp_path / "a.mcap")
+    assert aolink("estimate", "a.mcap", "-e", "o1", "--side", "-o", "sides").returncode == 0
+    (side,) = (tmp_path / "sides").glob("*.mcap")
+    assert aolink("plot", "a.mcap", "nis", "--side", side, "-o", "a.png").returncode == 0
+    assert aolink("report", "a.mcap", side, "-o", "a.html").returncode == 0
+    alone = aolink("report", side, "-o", "b.html")
+    assert alone.returncode != 0
+    assert "is a side file" in alone.stderr
+
+
+def test_a_closed_loop_is_shown(tmp_path: Path) -> None:
+    rig = load_rig("loop")
+    with simulated_rig("loop") as ports:
+        record(rig, *ports, tmp_path / "loop.mcap", estimators=["o1"], exposures=8, control="lqg")
+    entities = read_rrd(save_rrd(Recording(tmp_path / "loop.mcap"), tmp_path / "loop.rrd"))
+    left = scalars(entities["/control/slope_rms"])
+    assert np.isfinite(left).any()
+    assert (scalars(entities["/control/delay"]) > 0).all()
+    assert next(state for (state,) in entities["/status/loop"]["StateChange:state"]).startswith("CLOSED")
+    assert "Loop: what is left (slope units)" in str(read_blueprint(tmp_path / "loop.rrd"))
