@@ -97,10 +97,13 @@ def spot_of(sensor: object, lenslet: str) -> int:
         raise typer.BadParameter("--lenslet is for a sensor with lenslets; this one is a line")
     row, column = map(int, match.groups())
     rows, columns = sensor.grid
-    inside = row < rows and column < columns
+    if not (row < rows and column < columns):
+        raise typer.BadParameter(
+            f"--lenslet {lenslet}: the grid has {rows} x {columns} lenslets, counted from 0,0 to {rows - 1},{columns - 1}"
+        )
     found = np.flatnonzero(sensor.lit == row * columns + column)
-    if not (inside and len(found)):
-        raise typer.BadParameter(f"--lenslet {lenslet}: no light falls on it; the grid has {rows} x {columns} lenslets")
+    if not len(found):
+        raise typer.BadParameter(f"--lenslet {lenslet}: no light falls on it")
     return int(found[0])
 
 

@@ -103,7 +103,8 @@ def _camera(contents: Contents) -> rrb.Container | rrb.View:
         shown = ["camera/history", "camera/history/centroid", "camera/history/now"]
         shown += [f"camera/history/path/{name}" for name in _drawn_paths(each)]
         what = "paths in their blur" if not isinstance(sensor, SpotSensor) else "one spot along x"
-        name = f"{title}{HISTORY} exposures (pixels), {what}"
+        count = "one exposure" if contents.alone else f"{HISTORY} exposures"
+        name = f"{title}{count} (pixels), {what}"
         views.append(_picture([root + path for path in shown], name, HISTORY, sensor.profile.pixels))
         if each.restored_spots:
             views.append(_picture([root + RESTORED_SPOTS], f"{title}frame restored (pixels)", *sensor.shape))
