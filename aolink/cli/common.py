@@ -99,7 +99,7 @@ def spot_of(sensor: object, lenslet: str) -> int:
     rows, columns = sensor.grid
     if not (row < rows and column < columns):
         raise typer.BadParameter(
-            f"--lenslet {lenslet}: the grid has {rows} x {columns} lenslets, counted from 0,0 to {rows - 1},{columns - 1}"
+            f"--lenslet {lenslet}: the grid has {rows} x {columns} lenslets, from 0,0 to {rows - 1},{columns - 1}"
         )
     found = np.flatnonzero(sensor.lit == row * columns + column)
     if not len(found):
