@@ -31,6 +31,9 @@ class Options:
     """Whether a measurement too far from its prediction is left out."""
     engine: Engine = "aolink"
     """What o1 to o3 run on: "aolink", or "filterpy", for one axis."""
+    second_order: bool = False
+    """Whether o2 and o3 allow for what their linearisation leaves out (`SecondOrderMoments`): their covariance is then
+    right where the prior is as wide as the spot's way, at the price of a weaker correction."""
     orders: tuple[int, ...] = (0, 1, 2, 3)
     """Orders of the moments that `moments` takes, in its basis; 0 is the light in the window."""
     basis: Basis = "monomial"
@@ -65,6 +68,8 @@ def checked_options(**options: Any) -> Options:
         raise EstimatorError(
             f"tempered = {chosen.tempered}: use at least {_FEWEST_TEMPERED} points, or 0 for no tempering"
         )
+    if chosen.second_order and chosen.engine == "filterpy":
+        raise EstimatorError("second_order is not for the engine 'filterpy', whose filters are of first order")
     orders = tuple(chosen.orders)
     if len(set(orders)) < len(orders) or not any(orders) or not set(orders) <= set(range(_HIGHEST_ORDER + 1)):
         raise EstimatorError(f"orders = {orders}: use different ones from 0 to {_HIGHEST_ORDER}, not 0 alone")

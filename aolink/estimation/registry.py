@@ -27,7 +27,7 @@ from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import SpotWindows
 from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
 from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
-from aolink.estimation.kalman.path_moments import Observation, PathMoments
+from aolink.estimation.kalman.path_moments import Observation, PathMoments, SecondOrderMoments
 from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.model.exposure_model import exposure_model
@@ -149,6 +149,12 @@ def _paper(*orders: int) -> Callable[[Rig, Options], Filter]:
             return BlurFilter(
                 rig.plant, theirs, process_noise=options.process_noise, gate=options.gate, predictor=theirs.predict
             )
+        if options.second_order and 2 in orders:
+            if rig.plant.n_outputs > 2:
+                raise EstimatorError(
+                    f"second_order is for plants of one spot, {rig.name} has {rig.plant.n_outputs // 2}: use moments"
+                )
+            return _blur_filter(rig, options, SecondOrderMoments(rig.plant, orders, flux=options.flux))
         moments = PathMoments(rig.plant, orders, gain, flux=options.flux)
         if orders == (1, 2) and TwoStateFilter.suits(rig.plant):
             return TwoStateFilter(rig.plant, moments, process_noise=options.process_noise, gate=options.gate)

@@ -11,7 +11,12 @@ from aolink.estimation.estimate import Status
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.filter import BlurFilter
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.kalman.path_moments import PathMoments, many_moments, predicted_moments
+from aolink.estimation.kalman.path_moments import (
+    PathMoments,
+    SecondOrderMoments,
+    many_moments,
+    predicted_moments,
+)
 from aolink.estimation.kalman.steady_gain import steady_gain
 from aolink.estimation.kalman.update import blocked_update, joseph_update
 from aolink.estimation.model.exposure_model import exposure_model
@@ -352,6 +357,27 @@ def test_written_out_it_is_the_correction_in_matrices(gain):
     np.testing.assert_allclose(ours.posterior.covariance, theirs.posterior.covariance, rtol=1e-7, atol=1e-11)
     np.testing.assert_allclose(ours.innovation_covariance, theirs.innovation_covariance, rtol=1e-9)
     np.testing.assert_allclose(ours.nis, theirs.nis, rtol=1e-7)
+
+
+@pytest.mark.parametrize("orders", [(2,), (1, 2)])
+@pytest.mark.parametrize("name", ["section-vi", "tip-tilt"])
+def test_of_second_order_the_predicted_moments_have_the_mean_and_covariance_of_samples(name, orders):
+    plant = dataclasses.replace(load_rig(name).plant, axes=1)
+    rng, n, model = np.random.default_rng(5), plant.n_states, exposure_model(plant, 40)
+    root = np.linalg.cholesky(plant.initial_covariance + 1e-12 * np.eye(n))
+    prior = Gaussian((root @ rng.standard_normal(n))[None], 0.5 * plant.initial_covariance[None])
+    response = model.response(0.01 * rng.standard_normal((40, plant.n_inputs)))
+    m = len(orders) * plant.n_outputs
+    x = prior.mean + np.sqrt(0.5) * rng.standard_normal((200_000, n)) @ root.T
+    samples = np.concatenate([predicted_moments(model, response, each, orders)[0] for each in np.split(x, 200)])
+    noise = 1e-9 * np.eye(m)[None]
+    zero = Measurement(value=np.zeros((1, m)), covariance=noise)
+    update = SecondOrderMoments(plant, orders).update(model, response, prior, zero)
+    spread = np.cov(samples, rowvar=False).reshape(m, m)
+    sd = np.sqrt(np.diag(spread))
+    np.testing.assert_allclose(-update.innovation[0] / sd, samples.mean(0) / sd, atol=0.01)
+    apart = (update.innovation_covariance[0] - noise[0] - spread) / np.outer(sd, sd)
+    np.testing.assert_allclose(apart, np.zeros((m, m)), atol=0.03)
 
 
 @pytest.mark.parametrize(
