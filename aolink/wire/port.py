@@ -116,8 +116,11 @@ class SerialPort:
         return self._serial.fileno()
 
     def close(self) -> None:
+        socket = getattr(self._serial, "_socket", None)  # pyserial leaves it open where the other end has closed it
         with contextlib.suppress(OSError):
             self._serial.close()
+        if socket is not None:
+            socket.close()
 
 
 class Reopening:

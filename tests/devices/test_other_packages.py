@@ -221,7 +221,7 @@ def test_a_driver_that_fails_ends_the_session_in_good_order(
             4,
             "the driver of the camera failed when it was opened: TypeError",
         ),
-        ('driver = "native"\nbaud = 9600', 2, "devices.camera: the driver native takes one key, port, a text"),
+        ('driver = "native"\nbaud = 9600', 2, "devices.camera: the driver native takes port, a text, and key"),
         ("port = 3", 2, "devices.camera.driver is missing"),
     ],
 )

@@ -182,7 +182,8 @@ def test_an_index_that_lies_costs_no_memory(recorded: Session, tmp_path: Path) -
     tracemalloc.start()
     recording = Recording(path)
     assert list(recording.exposures()) == []
-    assert len(recording.losses) == len(summary.chunk_indexes)
+    # Places that overlap are one loss.
+    assert len(summary.chunk_indexes) / 2 < len(recording.losses) <= len(summary.chunk_indexes)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 20 << 20

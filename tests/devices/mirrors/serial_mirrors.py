@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,11 +97,10 @@ MIRRORS = {
 
 
 def with_each(check: Callable[[str], None], names: Iterable[str] = MIRRORS) -> None:
-    """Do something with each of these mirrors, with all at once: most of the time they wait for their lines."""
-    with ThreadPoolExecutor(len(MIRRORS)) as pool:
-        for name, done in [(name, pool.submit(check, name)) for name in names]:
-            try:
-                done.result()
-            except BaseException as error:
-                error.add_note(f"with {name}")
-                raise
+    """Do something with each of these mirrors, one after the other: a simulator that waits for others is late."""
+    for name in names:
+        try:
+            check(name)
+        except BaseException as error:
+            error.add_note(f"with {name}")
+            raise

@@ -42,7 +42,7 @@ def test_a_camera_that_fails(tmp_path: Path) -> None:
             rig = load_rig(file)
             with pytest.raises(DeviceError, match=r"film\.npy has ended after 6 pictures"):
                 record(rig, None, None, tmp_path / f"{name}.mcap", report=(report := Report()))
-            assert device.moves > UNDER_WAY
+            assert device.moves > 1
             assert MIRRORS[name].is_parked(device)
         bench.check_ended(report, tmp_path / f"{name}.mcap")
 
