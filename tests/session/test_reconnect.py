@@ -145,12 +145,8 @@ def test_with_a_slew_limit_the_mirror_goes_slowly_from_the_safe_input_to_what_is
             rig, camera, line.port, path, estimators=["o3"], exposures=11, inputs=inputs, reconnect_s=20,
             progress=pulling(line, after=3),
         )  # fmt: skip
-        closed = record(
-            rig, camera, line.port, tmp_path / "b.mcap", exposures=9, control="integrator", reconnect_s=20,
-            progress=pulling(line, after=3),
-        )  # fmt: skip
     check_whole(path, report, 11)
-    assert (report.ports_vanished, closed.ports_vanished, closed.ended) == (1, 1, "complete")
+    assert report.ports_vanished == 1
     sent = messages_of(pb.CommandBlock, Recording(path), topics.COMMAND)
     steps = np.array([(each.first_step + k, u) for each in sent for k, u in enumerate(each.u)])
     jump = int(np.argmax(np.diff(steps[:, 0])))
