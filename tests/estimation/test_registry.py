@@ -32,6 +32,7 @@ def test_the_demo_runs_what_is_fast_on_the_rig():
     assert possible_estimators(load_rig("tip-tilt")) == ("open-loop", "o1", "o2", "o3", "moments")
 
 
+@pytest.mark.long
 def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     """In a session, when it is estimated again, in the list of all, and in the viewer's palette."""
     with simulated_rig("section-vi-lively") as (camera, mirror):
@@ -63,6 +64,7 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     assert "there is no estimator 'threshold'" in alone.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("value", "why"),
     [

@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 PROGRAM = """
 import hashlib
 import dataclasses
@@ -54,5 +56,6 @@ def digest(threads: int) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 def test_one_thread_and_two_give_the_same_bits():
     assert digest(1) == digest(2) != ""

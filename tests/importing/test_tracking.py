@@ -37,6 +37,7 @@ SETTINGS = Settings(
 )
 
 
+@pytest.mark.long
 def test_objects_are_found_and_followed_to_a_tenth_of_a_pixel(walkers: SpotFilm) -> None:
     film = array_film(walkers.frames, "walkers")
     objects = find_objects(film, SETTINGS)
@@ -86,6 +87,7 @@ def imported_film(film: SpotFilm, path: Path) -> tuple[Rig, Recording]:
     return rig, Recording(path)
 
 
+@pytest.mark.long
 def test_the_path_of_walkers_is_found_and_its_intervals_hold(walkers: SpotFilm, tmp_path: Path) -> None:
     rig, recording = imported_film(walkers, tmp_path / "walkers.mcap")
     exposures = list(recording.exposures())
@@ -110,6 +112,7 @@ def test_the_path_of_walkers_is_found_and_its_intervals_hold(walkers: SpotFilm, 
     assert 0.9 < np.mean(np.abs(errors) < 1.96 * spread) < 0.98
 
 
+@pytest.mark.long
 def test_a_resonance_inside_the_exposure_is_found_with_its_plant(tmp_path: Path) -> None:
     """A user who knows the resonance puts it into [plant]: half of what the path's own mean leaves, or less."""
     rng = np.random.default_rng(11)
@@ -144,6 +147,7 @@ initial_covariance = [[{variance}, 0.0, 0.0], [0.0, {variance}, 0.0], [0.0, 0.0,
     assert 0.88 < np.mean(np.abs(errors) < 1.96 * spread) < 0.99
 
 
+@pytest.mark.long
 def test_a_rig_whose_inputs_do_not_shift_its_spots_keeps_its_windows(walkers: SpotFilm, tmp_path: Path) -> None:
     text = first_rig(array_film(walkers.frames, "film"), SETTINGS, "film").replace("B = [[1.0]]", "B = [[0.0]]")
     rig = parse_rig(text)

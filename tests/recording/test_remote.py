@@ -117,6 +117,7 @@ def test_so_do_a_web_server_and_memory(web: tuple[str, type[_Ranges]], tmp_path:
     same_as_from_the_file("memory://lab/s.mcap", source, tmp_path / "memory")
 
 
+@pytest.mark.long
 def test_no_more_is_read_than_is_needed(s3: S3Server, tmp_path: Path) -> None:
     """All of it is needed once to estimate it; to look at its index, little. No request is for more than a megabyte."""
     source = write_small(tmp_path / "s.mcap", 1500, truth=True)
@@ -173,6 +174,7 @@ def test_a_server_that_gives_no_ranges_is_refused(web: tuple[str, type[_Ranges]]
         Recording(f"{web[0]}/s.mcap")
 
 
+@pytest.mark.long
 def test_the_commands_take_urls(s3: S3Server, aolink: Run, tmp_path: Path) -> None:
     source = write_small(tmp_path / "s.mcap", 4)
     s3fs.S3FileSystem().put(str(source), "lab/s.mcap")

@@ -109,6 +109,7 @@ def stationary(rig: Rig) -> NDArray[np.float64]:
 # Figures
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_is_there_and_not_blank(out: Path, name: str) -> None:
     image = needed("PIL.Image").open(out / name).convert("RGB")

@@ -291,6 +291,7 @@ def test_a_rerun_file_is_shown_as_it_is(rrd: Path, start_aolink: Callable[..., s
     assert serving.returncode == 130
 
 
+@pytest.mark.long
 def test_what_is_no_rerun_file_is_one_clear_error(aolink: Callable[..., Any], rrd: Path, tmp_path: Path) -> None:
     (tmp_path / "text.rrd").write_text("hello")
     for name, message in (("text.rrd", "text.rrd is not a Rerun file"), ("none.rrd", "there is no file none.rrd")):

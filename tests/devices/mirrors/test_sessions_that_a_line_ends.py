@@ -16,6 +16,7 @@ from tests.devices.simulators.serial_device import Faults
 Session = Callable[..., Path]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("faults", "what"),
     [

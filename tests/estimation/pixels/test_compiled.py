@@ -251,6 +251,7 @@ def test_the_innovation_is_that_of_the_twin(pair):
     np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=5e-3, atol=1e-3)
 
 
+@pytest.mark.long
 def test_importance_sampling_with_the_same_points(pair):
     view, in_numpy, state = pair
     some = slice(1, 7)  # not the one beyond the sensor, where no point counts
@@ -399,6 +400,7 @@ def first_session(rig, name, noise, exposures):
     return map(int, out.split())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["profile", "mixture"])
 def test_nothing_is_compiled_in_a_session(name):
     before, after, several = first_session("section-vi-lively", name, 0.003, 30)
@@ -406,6 +408,7 @@ def test_nothing_is_compiled_in_a_session(name):
     assert several
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "name"), [("membrane-12x12", "profile"), ("membrane-12x12", "moments"), ("single-lenslet", "mixture")]
 )

@@ -75,6 +75,7 @@ def test_a_spot_that_windowed_moments_find_is_not_tempered(monkeypatch):
     assert not any("tempered" in estimator.step(exposure).reason for exposure in simulate(LIVELY, 4, seed=1))
 
 
+@pytest.mark.long
 def test_several_vibrations_are_within_their_intervals():
     """With modes alone 95 % intervals held 80 % of the path, and the end state's normalised error was five.
 
