@@ -223,7 +223,9 @@ def test_how_late_inputs_are_taken_is_recorded_and_enters_the_estimates(session:
     for exposure, without in zip(exposures, known, strict=True):
         doubted, sure = (estimator.step(each) for estimator, each in zip(estimators, (exposure, without), strict=True))
         assert np.array_equal(doubted.path, sure.path)
-        if exposure.alignment_sigma_ns:
+        if (
+            exposure.alignment_sigma_ns > 0.02 * step_ns
+        ):  # of the first exposure little may be doubted: that is left out
             assert doubted.alignment is not None
             assert doubted.alignment.steps == exposure.alignment_sigma_ns / step_ns
         assert sure.alignment is None
