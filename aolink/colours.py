@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import zlib
 
+from aolink import estimation
 from aolink.errors import EstimatorError
-from aolink.estimation import estimator_row
+from aolink.estimation.looks import LOOKS
 
 Colour = tuple[int, int, int]
 
@@ -16,7 +17,7 @@ _OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120)
 def estimator_colour(name: str) -> Colour:
     """Colour of an estimator; one that is not installed here gets one by its name, the same each time."""
     try:
-        return estimator_row(name).colour
+        return (LOOKS.get(name) or estimation.estimator_row(name)).colour
     except EstimatorError:
         return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
 
@@ -26,7 +27,7 @@ def by_rank(names: list[str]) -> list[str]:
 
     def rank(name: str) -> float:
         try:
-            return estimator_row(name).rank
+            return (LOOKS.get(name) or estimation.estimator_row(name)).rank
         except EstimatorError:
             return math.inf
 
