@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -241,6 +242,12 @@ class Sender:
         if any(each.spots is not None for each in restored):
             self._known.add(scene.RESTORED_SPOTS)
 
+    @cached_property
+    def _ends(self) -> tuple[Exposure, Exposure]:
+        """The first and the last exposure of a part of the recording."""
+        first = self._recording[self._numbers[0]]
+        return first, first if len(self._numbers) == 1 else self._recording[self._numbers[-1]]
+
     def _messages(self, wanted: Sequence[str]) -> Iterator[RecordedMessage]:
         """Messages of some topics: of a part of the recording those that belong to it."""
         recording = self._recording
@@ -250,7 +257,7 @@ class Sender:
         if self._look.exposures is None:
             yield from recording.messages(*there)
             return
-        first, last = (self._recording[self._numbers[k]] for k in (0, -1))
+        first, last = self._ends
         period = self._rig.timing.frame_period_steps * self._rig.timing.fast_step_ns
         low, high = first.host_start_ns - _BESIDE_NS, last.host_start_ns + period + _BESIDE_NS
         if high < recording.start_ns or low > recording.end_ns:  # the log has other times than its frames
