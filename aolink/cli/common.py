@@ -37,7 +37,11 @@ RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a r
 FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
 EstimatorOption = Annotated[
     list[str] | None,
-    typer.Option("--estimator", "-e", help="Estimator to run, such as o3 or moments; may be given several times."),
+    typer.Option(
+        "--estimator",
+        "-e",
+        help="Estimator to run, such as o3, moments or, with options, o3:second_order; may be given several times.",
+    ),
 ]
 KeyOption = Annotated[
     Path | None,
