@@ -14,11 +14,12 @@ _OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120)
 
 
 def estimator_colour(name: str) -> Colour:
-    """Colour of an estimator; one that is not installed here gets one by its name, the same each time."""
+    """Colour of an estimator; one that has options, or is not installed here, gets one by its name, always the same."""
     try:
-        return estimator_row(name).colour
+        row = estimator_row(name)
     except EstimatorError:
-        return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
+        row = None
+    return row.colour if row is not None and row.name == name else _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
 
 
 def by_rank(names: list[str]) -> list[str]:

@@ -160,3 +160,22 @@ def test_with_a_slew_limit_the_mirror_goes_slowly_from_the_safe_input_to_what_is
     assert 0 < after[0] <= 1.001 * most
     assert np.abs(np.diff(after)).max() <= 1.001 * most
     np.testing.assert_allclose(np.diff(after)[after[1:] < 0.01], most)
+
+
+@pytest.mark.long
+def test_a_closed_loop_with_a_slew_limit_goes_on_after_a_gap(tmp_path: Path) -> None:
+    path, slew = tmp_path / "a.mcap", 0.05
+    (tmp_path / "rig.toml").write_text(RIG.toml.replace("dac_bits = 16", f"dac_bits = 16\nslew_max_per_s = {slew}"))
+    rig = load_rig(tmp_path / "rig.toml")
+    with (
+        simulated_rig(tmp_path / "rig.toml", "--real-time") as (camera, mirror),
+        pulled_line(mirror, tmp_path / "mirror", once_latched) as line,
+    ):
+        report = record(
+            rig, camera, line.port, path, estimators=["o3"], exposures=11, control="integrator", reconnect_s=20,
+            progress=pulling(line, after=3),
+        )  # fmt: skip
+    check_whole(path, report, 11)
+    assert report.ports_vanished == 1
+    for block in messages_of(pb.CommandBlock, Recording(path), topics.COMMAND):
+        assert np.abs(np.diff(block.u)).max(initial=0.0) <= 1.001 * slew * rig.timing.fast_step_s
