@@ -35,7 +35,15 @@ RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a r
 FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
 EstimatorOption = Annotated[
     list[str] | None,
-    typer.Option("--estimator", "-e", help="Estimator to run, such as o3 or moments; may be given several times."),
+    typer.Option(
+        "--estimator",
+        "-e",
+        help="Estimator to run, such as o3, moments or, with options, o3:second_order; may be given several times.",
+    ),
+]
+KeyOption = Annotated[
+    Path | None,
+    typer.Option("--key", metavar="FILE", help="Sign packets with the key in this file, which both ends need."),
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -71,6 +79,17 @@ def load_checked(path_or_name: str) -> "Rig":
         if finding.severity == "warning":
             warn(f"{finding.key}: {finding.message}")
     return loaded
+
+
+def with_key(
+    rig: "Rig", camera: str | None, mirror: str | None, key: Path | None
+) -> "tuple[Rig, str | None, str | None]":  # fmt: skip
+    """The rig and the ports of a session whose packets --key signs: the ports are in the rig's table then."""
+    if key is None:
+        return rig, camera, mirror
+    from aolink.devices.opening import signed
+
+    return signed(rig, camera, mirror, key), None, None
 
 
 def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequence[Path | Url]" = ()) -> "Recording":

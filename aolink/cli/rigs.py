@@ -18,6 +18,7 @@ from aolink.cli.common import (
     EstimatorOption,
     FileArgument,
     JsonOption,
+    KeyOption,
     OutputOption,
     OverwriteOption,
     RigArgument,
@@ -31,6 +32,7 @@ from aolink.cli.common import (
     stderr,
     stdout,
     warn,
+    with_key,
 )
 from aolink.cli.films import (
     AtOption,
@@ -59,10 +61,6 @@ if TYPE_CHECKING:
     from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
-KeyOption = Annotated[
-    Path | None,
-    typer.Option("--key", metavar="FILE", help="Sign packets with the key in this file, which both ends need."),
-]
 
 
 class Light(StrEnum):
@@ -345,7 +343,6 @@ def record(
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
     """
     from aolink import session
-    from aolink.devices.opening import signed
     from aolink.recording.mcap_file import WriteOptions
 
     options = WriteOptions(
@@ -362,9 +359,7 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    if key:
-        loaded = signed(loaded, camera, mirror, key)
-        camera = mirror = None  # they are in its table now
+    loaded, camera, mirror = with_key(loaded, camera, mirror, key)
     played = None
     if inputs:
         from aolink.session.excitation import excitation
@@ -472,6 +467,7 @@ def replay(
     ] = False,
     camera: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the camera, with --to-rig.")] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, with --to-rig.")] = None,
+    key: KeyOption = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="The new recording, with --to-rig.")
     ] = None,
@@ -494,10 +490,11 @@ def replay(
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
             )
-        _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
+        to = with_key(recording.rig, camera, mirror, key)
+        _replay_to_rig(recording, names, *to, output, overwrite=overwrite, as_json=as_json)
         return
-    if camera or mirror or output:
-        raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
+    if camera or mirror or key or output:
+        raise typer.BadParameter("--camera, --mirror, --key and -o are for --to-rig")
     if control:
         if view or rate or start or end is not None:
             raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
@@ -551,6 +548,7 @@ def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
 def _replay_to_rig(
     recording: "Recording",
     names: list[str],
+    rig: "Rig",
     camera: str | None,
     mirror: str | None,
     output: Path,
@@ -569,7 +567,7 @@ def _replay_to_rig(
     commands = RecordedCommands(recording)
     with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
         report = session.record(
-            recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
+            rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
             inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
             progress=tell,
         )  # fmt: skip

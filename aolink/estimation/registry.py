@@ -35,7 +35,7 @@ from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
-from aolink.estimation.options import Engine, Options, checked_options
+from aolink.estimation.options import Engine, Options, checked_options, with_options
 from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.extensions import described, installed, loaded
 from aolink.optics.sensor import Sensor, SpotSensor
@@ -73,7 +73,9 @@ class EstimatorRow:
 
 
 def estimator_row(name: str) -> EstimatorRow:
-    """The row of an estimator. Raises EstimatorError: there is none, or the package that has it is broken."""
+    """The row of an estimator, whose name may have its options. Raises EstimatorError: there is none, or the package
+    that has it is broken."""
+    name = name.partition(":")[0]
     if name in _OURS:
         return _OURS[name]
     if name in _others():
@@ -111,16 +113,17 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     Parameters
     ----------
     name:
-        One of `ESTIMATOR_NAMES`.
+        One of `ESTIMATOR_NAMES`; its options may follow, as in ``o3:second_order`` (`options.with_options`). The
+        estimates bear the whole text as their estimator's name.
     options:
-        Fields of `Options`.
+        Fields of `Options`; those in the name come first.
 
     Raises
     ------
     EstimatorError
         There is no such estimator or option, or it cannot work on this rig.
     """
-    row, chosen = estimator_row(name), checked_options(**options)
+    row, chosen = estimator_row(name), checked_options(**options | with_options(name)[1])
     if reason := row.refusal(rig):
         raise EstimatorError(reason)
     if chosen.engine not in row.engines or (chosen.engine == "filterpy" and rig.plant.axes != 1):
