@@ -145,6 +145,7 @@ class Estimator:
             innovation=posterior.innovation,
             innovation_covariance=posterior.innovation_covariance,
             nis=posterior.nis,
+            components=posterior.components,
         )
 
     def _bridge(self, exposure: Exposure) -> list[str]:
