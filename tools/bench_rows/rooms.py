@@ -27,5 +27,10 @@ ROWS = {
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
 
-LONG = frozenset({"soak"})
-"""Those that take minutes each, or hours: they are measured where they are named, or with `--long`."""
+LONG = frozenset(
+    {
+        "soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "moving_scene", "residual_slopes",
+        "coverage",
+    }
+)  # fmt: skip
+"""Those that take two minutes or more each, `soak` forty: they are measured where they are named, or with `--long`."""
