@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from aolink.control.controller import Controller, ControllerRow, Seen
+from aolink.control.drift import TOLERATED_RATIO, Fit
 from aolink.control.integrator import Integrator
 from aolink.control.modes import reached
 from aolink.estimation import Estimate, Needs
@@ -46,7 +47,9 @@ _SETTLING = 5
 _LEAST_GAIN = 0.04
 """Share of the slopes' mean square that must be gained: 2 % of their root mean square."""
 _SIGMAS = 2.0
-"""How many standard errors the gain must be above that, and the slope b^2 is taken as less than it was found."""
+"""How many standard errors the gain must be above that, and the slope b^2 is taken as less than it was found, ..."""
+_SIGMAS_WHERE_IT_FITS = 3.5
+"""... where the model is not known to be wrong: the blur of some exposures may follow the mirror by chance."""
 _LAGS = 8
 """Exposures over which what is compared is correlated, as the disturbance is."""
 _FEW = 1.5
@@ -174,10 +177,10 @@ class FallBack:
         """The loop is open, or exposures are missing: who does not act is followed anew from what the mirror holds."""
         self._rivals = {}
 
-    def see(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None, *, fits: bool) -> Change | None:
+    def see(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None, fit: Fit | None) -> Change | None:
         """Take the next exposure with its centroids, (n_outputs,); says where another controller is to act.
 
-        ``fits`` says whether the asked-for controller's model is known to predict the measurements as well as it says.
+        ``fit`` says how well the asked-for controller's model fits, as far as that is known.
         """
         held = np.concatenate([exposure.lead_inputs, exposure.inputs])
         end = exposure.first_step + exposure.n_steps
@@ -206,7 +209,7 @@ class FallBack:
             mean = inside.mean(axis=0)
             means = float(np.nansum((slopes + mean) ** 2 - slopes**2))
             self._judged[name].append(_Judged(means, float(inside.var(axis=0).sum())))
-        return self._verdict(tried=fits and self._since >= self._wait)
+        return self._verdict(fit)
 
     def _begin(self) -> None:
         """Judge from now on."""
@@ -216,22 +219,27 @@ class FallBack:
         self._power: deque[float] = deque(maxlen=WINDOW)
         self._judged: dict[str, deque[_Judged]] = {name: deque(maxlen=WINDOW) for name in self._rows}
 
-    def _verdict(self, *, tried: bool) -> Change | None:
-        """Who is to act; the asked-for controller only if it is to be ``tried``, where it does not act."""
+    def _verdict(self, fit: Fit | None) -> Change | None:
+        """Who is to act, where that changes; the asked-for controller once it is time to try it."""
         if len(self._power) < _FEWEST:
             return None
         power, blur = float(np.mean(self._power)), np.array(self._blur)
-        best, least = "", -_LEAST_GAIN * power
+        sigmas = _SIGMAS_WHERE_IT_FITS if fit is None or fit.fits else _SIGMAS
+        is_time = fit is not None and fit.nis_ratio <= TOLERATED_RATIO and self._since >= self._wait
+        best, least, gained = "", -_LEAST_GAIN * power, 0.0
         for name in self._rivals:
-            if name == self._preferred and not tried:
+            judged = np.array(self._judged[name])
+            if name != self._preferred:
+                mean, error = _difference(judged, _share(judged, blur, sigmas))
+            elif is_time:
+                mean, error = _difference(judged, 1.0)
+            else:
                 continue
-            mean, error = _difference(np.array(self._judged[name]), None if name == self._preferred else blur)
             if mean + _SIGMAS * error < least:
-                best, least = name, mean + _SIGMAS * error
+                best, least, gained = name, mean + _SIGMAS * error, -mean
         if not best:
             return None
-        before = power + max(float(np.mean(blur)), 0.0)
-        mean, _ = _difference(np.array(self._judged[best]), None if best == self._preferred else blur)
+        before = power + max(float(np.nanmean(blur)), 0.0) if np.isfinite(blur).any() else power
         if self.acting == self._preferred:
             self._wait = 2 * self._wait if self._tries and self._since < self._wait else _WAIT
         self._tries += best == self._preferred
@@ -239,7 +247,7 @@ class FallBack:
             self._since = 0
         self.acting = best
         self._begin()
-        return Change(acting=best, gained=1 - math.sqrt(max(1 + mean / before, 0.0)))
+        return Change(acting=best, gained=1 - math.sqrt(max(1 - gained / before, 0.0)))
 
 
 def _blur(rig: Rig, exposure: Exposure) -> float:
@@ -256,22 +264,25 @@ def _blur(rig: Rig, exposure: Exposure) -> float:
     return float((second - first**2).sum())
 
 
-def _difference(judged: FloatArray, blur: FloatArray | None) -> tuple[float, float]:
-    """What a rival would have left less what was left, mean square, and the standard error of that.
+def _share(judged: FloatArray, blur: FloatArray, sigmas: float) -> float:
+    """b of the module's text, from the variances inside the exposures; so many standard errors of b^2 on the safe side:
+    the benefit of the doubt is with the controller that acts."""
+    known = np.isfinite(blur)
+    within = judged[known, 1]
+    if len(within) < _FEWEST or (spread := float(within.var())) == 0:
+        return 0.0
+    x, y = within - within.mean(), blur[known] - blur[known].mean()
+    slope = float((x * y).mean()) / spread
+    error = _mean_and_error(x * (y - slope * x) / spread)[1]
+    return min(math.sqrt(max(slope - sigmas * error, 0.0)), 1.0)
 
-    ``judged`` are the rows of `_Judged`, ``blur`` the variances inside the exposures. Of b, as in the module's text,
-    the least value is taken that these allow: the benefit of the doubt is with who acts. None: it is 1.
+
+def _difference(judged: FloatArray, share: float) -> tuple[float, float]:
+    """What a rival would have left less what was left, mean square, and the standard error of that, for b = ``share``.
+
+    ``judged`` are the rows of `_Judged`.
     """
     means, within = judged.T
-    if blur is None:
-        return _mean_and_error(means - within)
-    known = np.isfinite(blur)
-    share = 0.0
-    if known.sum() >= _FEWEST and (spread := float(within[known].var())) > 0:
-        x, y = within[known] - within[known].mean(), blur[known] - blur[known].mean()
-        slope = float((x * y).mean()) / spread
-        error = _mean_and_error(x * (y - slope * x) / spread)[1]
-        share = min(math.sqrt(max(slope - _SIGMAS * error, 0.0)), 1.0)
     return _mean_and_error(means + (1 - 2 * share) * within)
 
 

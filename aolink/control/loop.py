@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from aolink.control.controller import Controller, ControllerRow, Seen
-from aolink.control.drift import TOLERATED_RATIO, Fit, FitMonitor
+from aolink.control.drift import Fit, FitMonitor
 from aolink.control.fall_back import Change, FallBack
 from aolink.control.registry import find_controller
 from aolink.errors import AolinkError, ControlError
@@ -225,9 +225,8 @@ class ControlLoop:
         if self.state is not State.CLOSED or not self._seen_any:
             self._fall_back.interrupt()
             return None
-        fits = self.fit is not None and self.fit.nis_ratio <= TOLERATED_RATIO
         fall_back = self._fall_back
-        change: Change | None = self._ask(lambda: fall_back.see(exposure, slopes, estimate, fits=fits))
+        change: Change | None = self._ask(lambda: fall_back.see(exposure, slopes, estimate, self.fit))
         if change is not None:
             self._controller = self._fall_back.controller()
         return change
