@@ -36,6 +36,7 @@ from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Engine, Options, checked_options
 from aolink.estimation.pixels.joint_pixels import JointProfile
+from aolink.estimation.wandering import WanderingEstimator
 from aolink.extensions import described, installed, loaded
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.plant.alike import MANY_STATES, alike_systems
@@ -67,6 +68,8 @@ class EstimatorRow:
     """Why it cannot work on a rig, and what to use instead; None where it can."""
     engines: tuple[Engine, ...] = ("aolink",)
     """Engines that it can run on."""
+    wanders: bool = False
+    """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
     in_demo: Callable[[Rig], bool] = lambda rig: True
     """Whether it is fast enough on a rig for `aolink demo`."""
 
@@ -128,7 +131,11 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f"engine {chosen.engine!r} runs {able} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
-    return Estimator(rig, name, row.build(rig, chosen))
+
+    def made(rig: Rig) -> Estimator:
+        return Estimator(rig, name, row.build(rig, chosen))
+
+    return WanderingEstimator(rig, made) if rig.plant.wandering is not None and row.wanders else made(rig)
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None) -> BlurFilter:
@@ -286,18 +293,21 @@ _OURS = {
         EstimatorRow(name="o1", rank=10, colour=(86, 180, 233), build=_paper(1), engines=_PAPER_ENGINES),
         EstimatorRow(name="o2", rank=20, colour=(120, 130, 255), build=_paper(2), engines=_PAPER_ENGINES),
         EstimatorRow(name="o3", rank=30, colour=(240, 110, 50), build=_paper(1, 2), engines=_PAPER_ENGINES),
-        EstimatorRow(name="moments", rank=40, colour=(0, 175, 125), build=_moments, refusal=_moments_refusal),
+        EstimatorRow(
+            name="moments", rank=40, colour=(0, 175, 125), build=_moments, refusal=_moments_refusal,
+            wanders=True,
+        ),
         EstimatorRow(
             name="profile", rank=50, colour=(140, 210, 80), build=_profile, refusal=_pixels_refusal("profile"),
-            in_demo=_is_line,
+            wanders=True, in_demo=_is_line,
         ),
         EstimatorRow(
             name="mixture", rank=60, colour=(240, 80, 140), build=_mixture, refusal=_pixels_refusal("mixture"),
-            in_demo=_is_line,
+            wanders=True, in_demo=_is_line,
         ),
         EstimatorRow(
             name="sampled", rank=70, colour=(190, 130, 80), build=_sampled, refusal=_pixels_refusal("sampled"),
-            in_demo=lambda rig: False,
+            wanders=True, in_demo=lambda rig: False,
         ),
     )
 }  # fmt: skip
