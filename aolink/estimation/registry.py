@@ -36,7 +36,6 @@ from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Engine, Options, checked_options
 from aolink.estimation.pixels.joint_pixels import JointProfile
-from aolink.estimation.wandering import WanderingEstimator
 from aolink.extensions import described, installed, loaded
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.plant.alike import MANY_STATES, alike_systems
@@ -135,7 +134,11 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     def made(rig: Rig) -> Estimator:
         return Estimator(rig, name, row.build(rig, chosen))
 
-    return WanderingEstimator(rig, made) if rig.plant.wandering is not None and row.wanders else made(rig)
+    if rig.plant.wandering is None or not row.wanders:
+        return made(rig)
+    from aolink.estimation.wandering import WanderingEstimator  # its imports take long
+
+    return WanderingEstimator(rig, made)
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None) -> BlurFilter:
