@@ -20,8 +20,6 @@ from tests.commands import TIMEOUT_S, CommandServer
 
 ESTIMATORS = ("open-loop", "o1", "o2", "o3")
 EXPOSURES = 12
-os.environ["COLUMNS"] = "500"
-"""Of a terminal that the tests' commands write to: a message is looked for as one line, however long its paths are."""
 
 
 @dataclass(frozen=True)

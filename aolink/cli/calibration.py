@@ -1,8 +1,7 @@
 """The command that measures a camera, or the interaction matrix of a mirror."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,15 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, progress, stderr, stdout
+from aolink.cli.common import JsonOption, KeyOption, OverwriteOption, app, progress, stderr, stdout, with_key
 from aolink.cli.terminal import ask, progress_bar
 from aolink.errors import AolinkError, CalibrationError
 from aolink.files import check_target, writing
 from aolink.signals import stop_after
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from aolink.rig import Rig
 
 
@@ -45,6 +42,7 @@ def calibrate(
         str | None, typer.Option(metavar="PORT", help="Port of the camera, to record the frames now.")
     ] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror.")] = None,
+    key: KeyOption = None,
     frames: Annotated[int, typer.Option(help="How many frames of each light to record.")] = 100,
     interaction: Annotated[
         bool, typer.Option("--interaction", help="Poke the mirror, and measure its interaction matrix instead.")
@@ -80,6 +78,9 @@ def calibrate(
     loaded = load_rig(rig)
     if (files and (camera or mirror)) or not (files or camera or "camera" in loaded.devices):
         raise typer.BadParameter("give recordings, or --camera, or [devices.camera] in the rig file")
+    if files and key:
+        raise typer.BadParameter("--key is for the devices' packets: leave it out with recordings")
+    to_record, camera, mirror = with_key(loaded, camera, mirror, key)
     if interaction:
         check_target(output, overwrite=overwrite, sources=files or [], suffix=".npz", error=CalibrationError)
     else:
@@ -93,12 +94,12 @@ def calibrate(
             folder.mkdir(parents=True, exist_ok=True)
             with stop_after() as stop, progress("exposures", None) as tell:
                 calibrate.record_pokes(
-                    loaded, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
+                    to_record, camera, mirror, paths[0], share=poke, repeats=repeats, overwrite=overwrite, stop=stop,
                     progress=tell, hold_s=hold,
                 )  # fmt: skip
         else:
             paths = calibrate.record_frames(
-                loaded, camera, mirror, folder, frames=frames, overwrite=overwrite,
+                to_record, camera, mirror, folder, frames=frames, overwrite=overwrite,
                 ask=partial(ask, stderr), stoppable=stop_after, progress=partial(progress_bar, stderr, frames),
             )  # fmt: skip
         if interaction:
@@ -119,7 +120,7 @@ def calibrate(
 
 
 def _write_calibrated(
-    loaded: Rig, rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool
+    loaded: "Rig", rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool
 ) -> None:  # fmt: skip
     from aolink.cli.tables import rigs as tables
     from aolink.jobs.calibrate import calibrate_recordings, rig_text
@@ -136,7 +137,7 @@ def _write_calibrated(
 
 
 def _write_interaction(
-    loaded: Rig, paths: Sequence[Path], output: Path, *, hold_s: float, overwrite: bool, as_json: bool
+    loaded: "Rig", paths: Sequence[Path], output: Path, *, hold_s: float, overwrite: bool, as_json: bool
 ) -> None:  # fmt: skip
     import numpy as np
 

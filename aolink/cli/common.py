@@ -1,7 +1,5 @@
 """What the commands share: the consoles, common options, opening files."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys
@@ -37,7 +35,15 @@ RigArgument = Annotated[str, typer.Argument(help="A rig file, or the name of a r
 FileArgument = Annotated[Path, typer.Argument(help="A recording.", metavar="FILE")]
 EstimatorOption = Annotated[
     list[str] | None,
-    typer.Option("--estimator", "-e", help="Estimator to run, such as o3 or moments; may be given several times."),
+    typer.Option(
+        "--estimator",
+        "-e",
+        help="Estimator to run, such as o3, moments or, with options, o3:second_order; may be given several times.",
+    ),
+]
+KeyOption = Annotated[
+    Path | None,
+    typer.Option("--key", metavar="FILE", help="Sign packets with the key in this file, which both ends need."),
 ]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace the target file if it exists.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON for scripts.")]
@@ -61,7 +67,7 @@ def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
         yield partial(tell, what)
 
 
-def load_checked(path_or_name: str) -> Rig:
+def load_checked(path_or_name: str) -> "Rig":
     """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
     from aolink.jobs.check_rig import check_rig
     from aolink.rig import load_rig
@@ -75,7 +81,18 @@ def load_checked(path_or_name: str) -> Rig:
     return loaded
 
 
-def open_recording(file: str | Path | Url, *, check: bool = False, side: Sequence[Path | Url] = ()) -> Recording:
+def with_key(
+    rig: "Rig", camera: str | None, mirror: str | None, key: Path | None
+) -> "tuple[Rig, str | None, str | None]":  # fmt: skip
+    """The rig and the ports of a session whose packets --key signs: the ports are in the rig's table then."""
+    if key is None:
+        return rig, camera, mirror
+    from aolink.devices.opening import signed
+
+    return signed(rig, camera, mirror, key), None, None
+
+
+def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequence[Path | Url]" = ()) -> "Recording":
     """Open a recording with its side files, and say so where it is not whole."""
     from aolink.recording.reader import Recording
 
@@ -107,7 +124,7 @@ def spot_of(sensor: object, lenslet: str) -> int:
     return int(found[0])
 
 
-def check_measured(file: Path | Url, scores: Mapping[str, Score]) -> None:
+def check_measured(file: "Path | Url", scores: "Mapping[str, Score]") -> None:
     """Raise EstimatorError if an estimator that takes measurements could not use a single exposure."""
     for name, score in scores.items():
         if score.nothing_measured:
@@ -119,7 +136,7 @@ def program() -> str:
     return "aolink" if shutil.which("aolink") else str(Path(sys.executable).with_name("aolink"))
 
 
-def get_ready(rig: Rig, estimators: Sequence[str]) -> None:
+def get_ready(rig: "Rig", estimators: Sequence[str]) -> None:
     """Compile the loops of these estimators before anything waits for them, and say so on a terminal."""
     from aolink.estimation import make_estimator
 

@@ -1,10 +1,9 @@
 """Commands that run with devices: rig, devices, record, replay, demo."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from enum import StrEnum
@@ -19,6 +18,7 @@ from aolink.cli.common import (
     EstimatorOption,
     FileArgument,
     JsonOption,
+    KeyOption,
     OutputOption,
     OverwriteOption,
     RigArgument,
@@ -32,6 +32,7 @@ from aolink.cli.common import (
     stderr,
     stdout,
     warn,
+    with_key,
 )
 from aolink.cli.films import (
     AtOption,
@@ -49,8 +50,6 @@ from aolink.files import check_target, writing
 from aolink.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import numpy as np
     from numpy.typing import NDArray
 
@@ -62,10 +61,6 @@ if TYPE_CHECKING:
     from aolink.viewing import LiveView
 
 MOST_EXPOSURES = 2**32 - 1
-KeyOption = Annotated[
-    Path | None,
-    typer.Option("--key", metavar="FILE", help="Sign packets with the key in this file, which both ends need."),
-]
 
 
 class Light(StrEnum):
@@ -180,7 +175,7 @@ def rig(
     stop.raise_if_asked()
 
 
-def _write_first_rig(path: Path, source: Path, topic: str | None, settings: Settings, overwrite: bool) -> None:
+def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "Settings", overwrite: bool) -> None:
     from aolink.importing.first_rig import first_rig
     from aolink.importing.readers import open_film
 
@@ -193,7 +188,7 @@ def _write_first_rig(path: Path, source: Path, topic: str | None, settings: Sett
     stdout.print(f"{path}: written from {film.name}; read it, then: {program()} rig {path} --check", markup=False)
 
 
-def _print_scan(loaded: Rig, as_json: bool) -> None:
+def _print_scan(loaded: "Rig", as_json: bool) -> None:
     from aolink.cli.tables.rigs import exposure_scan as scan_table
     from aolink.estimation.exposure_scan import best, exposure_scan
 
@@ -206,7 +201,7 @@ def _print_scan(loaded: Rig, as_json: bool) -> None:
     stdout.print(f"least error of the path: timing.exposure_steps = {steps}, {steps * loaded.timing.fast_step_s:g} s")
 
 
-def _print_findings(loaded: Rig, as_json: bool) -> None:
+def _print_findings(loaded: "Rig", as_json: bool) -> None:
     from aolink.jobs.check_rig import check_devices, check_rig
 
     findings = [*check_devices(loaded), *check_rig(loaded)]
@@ -348,7 +343,6 @@ def record(
     Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
     """
     from aolink import session
-    from aolink.devices.opening import signed
     from aolink.recording.mcap_file import WriteOptions
 
     options = WriteOptions(
@@ -365,9 +359,7 @@ def record(
         if not 0 < periods <= MOST_EXPOSURES:
             raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
         exposures = math.ceil(periods)
-    if key:
-        loaded = signed(loaded, camera, mirror, key)
-        camera = mirror = None  # they are in its table now
+    loaded, camera, mirror = with_key(loaded, camera, mirror, key)
     played = None
     if inputs:
         from aolink.session.excitation import excitation
@@ -410,7 +402,7 @@ def record(
         raise typer.Exit(EstimatorError.exit_code)
 
 
-def _print_dry_run(found: DryRun, as_json: bool) -> None:
+def _print_dry_run(found: "DryRun", as_json: bool) -> None:
     for warning in found.warnings:
         warn(warning)
     if as_json:
@@ -423,7 +415,7 @@ def _print_dry_run(found: DryRun, as_json: bool) -> None:
     )
 
 
-def _print_session(report: Report, output: Path, as_json: bool) -> None:
+def _print_session(report: "Report", output: Path, as_json: bool) -> None:
     from aolink.cli.tables import sessions as tables
 
     for warning in report.warnings:
@@ -439,8 +431,8 @@ def _print_session(report: Report, output: Path, as_json: bool) -> None:
 
 
 def _live_view(
-    rig: Rig, estimators: Sequence[str], true_scene: NDArray[np.uint16] | None = None, *, shown: bool
-) -> AbstractContextManager[LiveView | None]:
+    rig: "Rig", estimators: Sequence[str], true_scene: "NDArray[np.uint16] | None" = None, *, shown: bool
+) -> "AbstractContextManager[LiveView | None]":
     """What shows exposures in the viewer, or None."""
     if not shown:
         return nullcontext()
@@ -475,6 +467,7 @@ def replay(
     ] = False,
     camera: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the camera, with --to-rig.")] = None,
     mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, with --to-rig.")] = None,
+    key: KeyOption = None,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", metavar="FILE", help="The new recording, with --to-rig.")
     ] = None,
@@ -497,10 +490,11 @@ def replay(
             raise typer.BadParameter(
                 "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
             )
-        _replay_to_rig(recording, names, camera, mirror, output, overwrite=overwrite, as_json=as_json)
+        to = with_key(recording.rig, camera, mirror, key)
+        _replay_to_rig(recording, names, *to, output, overwrite=overwrite, as_json=as_json)
         return
-    if camera or mirror or output:
-        raise typer.BadParameter("--camera, --mirror and -o are for --to-rig")
+    if camera or mirror or key or output:
+        raise typer.BadParameter("--camera, --mirror, --key and -o are for --to-rig")
     if control:
         if view or rate or start or end is not None:
             raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
@@ -533,7 +527,7 @@ def replay(
     check_measured(file, scores)
 
 
-def _replay_control(recording: Recording, controller: str, estimator: str, *, as_json: bool) -> None:
+def _replay_control(recording: "Recording", controller: str, estimator: str, *, as_json: bool) -> None:
     from aolink.cli.tables import control as tables
     from aolink.jobs.closed_loop import replayed
 
@@ -546,14 +540,15 @@ def _replay_control(recording: Recording, controller: str, estimator: str, *, as
         stdout.print(tables.replayed(result))
 
 
-def _are_driven(rig: Rig, camera: str | None, mirror: str | None) -> bool:
+def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
     """Whether a port or the rig file says what drives each of the devices."""
     return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
 
 
 def _replay_to_rig(
-    recording: Recording,
+    recording: "Recording",
     names: list[str],
+    rig: "Rig",
     camera: str | None,
     mirror: str | None,
     output: Path,
@@ -572,7 +567,7 @@ def _replay_to_rig(
     commands = RecordedCommands(recording)
     with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
         report = session.record(
-            recording.rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
+            rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
             inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
             progress=tell,
         )  # fmt: skip

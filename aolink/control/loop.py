@@ -135,6 +135,17 @@ class ControlLoop:
             raise ValueError(f"fast step {first_step} is before {self._oldest}: its input is forgotten")
         return np.array(self._sent[start : start + n_steps]).reshape(n_steps, len(self._park))
 
+    def commanded(self, first_step: int, u: FloatArray) -> None:
+        """What the mirror was sent from ``first_step`` on, (k, n_inputs), where that may differ from `inputs`: it goes
+        on from there. Raises ControlError as `inputs` does."""
+        for step, row in enumerate(u, first_step):
+            if step < self._oldest:
+                continue
+            while self.next_step <= step:
+                self._go_on()
+            if not np.array_equal(self._sent[step - self._oldest], row):
+                self._sent[step - self._oldest], self._held[step - self._oldest] = row, self._rig.mirror.quantise(row)
+
     def applied(self, first_step: int, u: FloatArray) -> None:
         """What the mirror reports that it held from ``first_step`` on, (k, n_inputs)."""
         for step, row in enumerate(u, first_step):

@@ -107,7 +107,7 @@ class AdaptedMirror(Adapted):
         return self.since_zero_ns(now_ns) // self._step_ns
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
-        self._limits.check(first_step, u)
+        u = self._limits.take(first_step, u)
         block = pb.CommandBlock(
             block_id=next(self._block_ids), first_step=first_step, n_steps=len(u), u=u.ravel(),
             cause_frame_id=cause_frame_id,
@@ -132,6 +132,9 @@ class AdaptedMirror(Adapted):
 
     def withdraw(self, step: int) -> int:
         return step  # each block is taken or refused when it is sent
+
+    def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
+        return self._limits.go_on_from(first_step, step)
 
     def poll(self) -> list[Event]:
         """What has happened since the last call."""
@@ -219,6 +222,7 @@ class AdaptedMirror(Adapted):
         with self._call("when it was asked for the time"):
             step = int(self._driver.time_ns()) // self._step_ns + 1
         self._safe, self._left_ns = (self._safe[0], step), None
+        self._limits.parked()
         return step
 
     def close(self) -> None:

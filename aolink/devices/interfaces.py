@@ -170,7 +170,15 @@ class Mirror(Device, Protocol):
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
         """Send inputs (n_steps, n_inputs) for the fast steps from ``first_step``; gives the block as sent.
 
-        Raises DeviceError for an input beyond the limits: it is refused, never clamped.
+        Raises DeviceError for an input beyond the limits: it is refused, never clamped. The exception: with a slew
+        limit, a mirror that was parked, or whose steps were left out, goes from what it holds to ``u`` as fast as that
+        allows, and the block says how.
+        """
+
+    def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
+        """Leave out the fast steps from ``first_step`` to the one before ``step``, which have gone by.
+
+        Gives what the mirror holds in them by what it was sent, (step - first_step, n_inputs).
         """
 
     def withdraw(self, step: int) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -10,25 +11,31 @@ from numpy.typing import NDArray
 from aolink.errors import DeviceError
 from aolink.rig import Rig
 
+_ROUNDING = 1e-9
 _REMEMBERED_INPUTS = 64
 """Blocks among which the one is found that a later block, sent anew, goes on from."""
 
 
 class CommandLimits:
-    """The limits of a mirror's inputs and of their change from step to step; what is beyond them is not sent."""
+    """The limits of a mirror's inputs and of their change from step to step; what is beyond them is not sent.
+
+    The change counts from what the mirror holds in the step before, as far as that is known here: what it was sent for
+    that step, and its safe input where it was sent nothing, or was parked since.
+    """
 
     def __init__(self, rig: Rig) -> None:
         self._min, self._max, self._slew = rig.mirror.input_min, rig.mirror.input_max, rig.mirror.slew_max_per_s
-        self._most_change = self._slew * rig.timing.fast_step_s * (1 + 1e-9)
+        self._most_change = self._slew * rig.timing.fast_step_s * (1 + _ROUNDING)
         self._sent: deque[tuple[int, NDArray[np.float64]]] = deque(maxlen=_REMEMBERED_INPUTS)
         """First fast steps and inputs of the newest blocks that were sent."""
         self._park = rig.mirror.park
+        self._joined = -math.inf
+        """The first fast step in which the mirror holds what was wanted again, after it was left out or parked."""
 
     def check(self, first_step: int, u: NDArray[np.float64]) -> None:
         """Check inputs (n_steps, n_inputs) for the fast steps from ``first_step``, then take them as sent.
 
-        The change to their first step counts from the input that was sent last for a step before it, at first from the
-        safe input. Raises DeviceError.
+        Raises DeviceError for what is beyond the limits.
         """
         if u.ndim != 2 or u.shape[1] != len(self._min):
             raise DeviceError(
@@ -42,7 +49,7 @@ class CommandLimits:
                 f" {self._min[channel]:g} .. {self._max[channel]:g}: it was not sent"
             )
         if self._slew:
-            change = np.abs(np.diff(u, axis=0, prepend=self._sent_before(first_step)[None]))
+            change = np.abs(np.diff(u, axis=0, prepend=self.held(first_step - 1)[None]))
             if (change > self._most_change).any():
                 step, channel = np.argwhere(change > self._most_change)[0]
                 raise DeviceError(
@@ -52,27 +59,44 @@ class CommandLimits:
                 )
         self._sent.append((first_step, u))
 
-    def begin_anew(self) -> None:
-        """What was sent is forgotten, and the mirror holds its safe input."""
-        self._sent.clear()
+    def take(self, first_step: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Check inputs and take them as sent, as `check` does; gives what to send.
 
-    def approach(self, first_step: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Inputs (n_steps, n_inputs), or what comes as near to them as the limit of their change allows."""
-        if not self._slew:
-            return u
-        near, before, most = np.array(u), self._sent_before(first_step), self._most_change / (1 + 1e-9)
+        That is ``u``; or, after `parked` and `go_on_from`, what comes as near to it as the limit of the change allows.
+        """
+        wanted = u
+        if self._slew and first_step <= self._joined:
+            u = self._approached(first_step, wanted)
+            on_the_way = np.flatnonzero((u != wanted).any(axis=1))
+            last = on_the_way[-1] + 1 if len(on_the_way) else 0
+            self._joined = first_step + last if last < len(u) else math.inf
+        self.check(first_step, u)
+        return u
+
+    def parked(self) -> None:
+        """What was sent is forgotten: the mirror holds its safe input, and goes from there to what it is sent next."""
+        self._sent.clear()
+        self._joined = math.inf
+
+    def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
+        """Steps from ``first_step`` to the one before ``step`` are left out: nothing more is sent for them.
+
+        The mirror goes from what it holds by then to what it is sent next. Gives what it holds in the steps that are
+        left out, (step - first_step, n_inputs).
+        """
+        self._joined = max(self._joined, step)
+        return np.array([self.held(each) for each in range(first_step, step)]).reshape(-1, len(self._park))
+
+    def held(self, step: int) -> NDArray[np.float64]:
+        """What the mirror holds in a fast step by what it was sent, (n_inputs,)."""
+        for first, u in reversed(self._sent):
+            if first <= step < first + len(u):
+                return np.asarray(u[step - first])
+        return self._park
+
+    def _approached(self, first_step: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        near, before, most = np.array(u), self.held(first_step - 1), self._most_change / (1 + _ROUNDING)
         for row in near:
             row[:] = before + np.clip(row - before, -most, most)
             before = row
         return near
-
-    def _sent_before(self, step: int) -> NDArray[np.float64]:
-        """The input that was sent last for the newest step before this one."""
-        best, row = -1, self._park
-        for first, u in reversed(self._sent):
-            newest = min(step, first + len(u)) - 1
-            if newest > best and first <= newest:
-                best, row = newest, u[newest - first]
-            if best == step - 1:
-                break
-        return row

@@ -230,8 +230,6 @@ class NativeMirror(_NativeDevice):
         self.queue_end_step = 0
         self.latched = identity.mirror.latched
         self.outage_s = 0.0
-        self._approaching = False
-        """Whether the mirror is on its way from the safe input, where it had returned, to what is commanded."""
         self._watchdog_s = identity.mirror.watchdog_s
         self._full_s = (
             identity.mirror.queue_steps * identity.fast_step_ns / 1e9 + _PATIENCE_WATCHDOGS * self._watchdog_s
@@ -276,10 +274,7 @@ class NativeMirror(_NativeDevice):
         return len(self._flights)
 
     def send_block(self, first_step: int, u: NDArray[np.float64], cause_frame_id: int, now_ns: int) -> pb.CommandBlock:
-        if self._approaching:
-            wanted, u = u, self._gate.limits.approach(first_step, u)
-            self._approaching = not np.array_equal(u[-1], wanted[-1])
-        self._gate.limits.check(first_step, u)
+        u = self._gate.limits.take(first_step, u)
         block = pb.CommandBlock(
             block_id=next(self._block_ids),
             first_step=first_step,
@@ -304,6 +299,9 @@ class NativeMirror(_NativeDevice):
         while len(self._withdrawn) > _MOST_WITHDRAWN:  # their answers were lost
             del self._withdrawn[next(iter(self._withdrawn))]
         return min([step, *(flight.block.first_step for flight in replaced)])
+
+    def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
+        return self._gate.limits.go_on_from(first_step, step)
 
     def _begins_ns(self, step: int) -> float:
         """Host time at which a fast step begins; infinite on virtual time, where the rig waits for its commands."""
@@ -359,6 +357,7 @@ class NativeMirror(_NativeDevice):
     def rearm(self) -> int:
         self._flights.clear()  # whoever re-arms sends anew what is still to come
         step = self._request(pb.Rearm(), "end the latch of its watchdog", self._answer_s()).step
+        self._gate.limits.parked()
         self.latched = False
         return step
 
@@ -368,8 +367,7 @@ class NativeMirror(_NativeDevice):
 
     def _begin_anew(self, now_ns: int) -> None:
         self.withdraw(0)
-        self._gate.limits.begin_anew()
-        self._approaching = True
+        self._gate.limits.parked()
         self._reports.ask_anew(now_ns)
         self.latched, self.outage_s, self._answered_ns = self.identity.mirror.latched, 0.0, None
 

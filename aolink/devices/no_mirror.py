@@ -75,6 +75,9 @@ class NoMirror:
     def withdraw(self, step: int) -> int:
         return step
 
+    def go_on_from(self, first_step: int, step: int) -> NDArray[np.float64]:
+        return np.tile(self._rig.mirror.park, (step - first_step, 1))
+
     def next_due_ns(self) -> int | None:
         return None
 

@@ -161,7 +161,7 @@ def signed(rig: Rig, camera_port: str | None, mirror_port: str | None, key: str 
     return replace(
         rig,
         devices={
-            kind: replace(table, options={**table.options, "key": str(Path(key).absolute())})
+            kind: replace(table, options={**table.options, "key": Path(key).absolute()})
             if table.driver == NATIVE
             else table
             for kind, table in given.items()
@@ -173,12 +173,14 @@ def signed(rig: Rig, camera_port: str | None, mirror_port: str | None, key: str 
 def _port_and_key(kind: Kind, table: DeviceTable, rig: Rig) -> tuple[str, bytes | None]:
     others = dict(table.options)
     port, key = others.pop("port", None), others.pop("key", None)
-    if not isinstance(port, str) or not isinstance(key, str | None) or others or table.delay:
+    if not isinstance(port, str) or not isinstance(key, str | Path | None) or others or table.delay:
         raise RigError(
             f"devices.{kind}: the driver {NATIVE} takes port, a text, and key, a file's name; found {table.options}"
             f"{' and a delay' if table.delay else ''}"
         )
-    return port, read_key(rig.path_of(key, f"devices.{kind}.key")) if key else None
+    if isinstance(key, str):  # of the rig file; not one that the user has given beside it
+        key = rig.path_of(key, f"devices.{kind}.key") if key else None
+    return port, read_key(key) if key else None
 
 
 def _open_native(

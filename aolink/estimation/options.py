@@ -47,12 +47,45 @@ class Options:
     """Seed of `sampled`: the same one gives the same estimates, bit for bit."""
 
 
+_NAMES = tuple(Options.__dataclass_fields__)
+
+
+def with_options(text: str) -> tuple[str, dict[str, Any]]:
+    """An estimator's name and options out of a text such as ``o3:second_order`` or ``sampled:particles=500,seed=2``.
+
+    ``orders`` are digits, ``orders=012``; an option without a value is switched on. Raises EstimatorError.
+    """
+    name, colon, listed = text.partition(":")
+    if colon and not listed:
+        raise EstimatorError(f"there is no estimator {text!r}: after the colon come options, as in o3:second_order")
+    options: dict[str, Any] = {}
+    for each in listed.split(",") if listed else []:
+        key, given, value = each.partition("=")
+        field = Options.__dataclass_fields__.get(key)
+        if field is None:
+            raise EstimatorError(f"{text}: estimators have no option {key!r}: use {', '.join(_NAMES)}")
+        options[key] = _read(text, key, field.default, value if given else "true")
+    return name, options
+
+
+def _read(text: str, key: str, default: object, value: str) -> object:
+    if isinstance(default, bool):
+        if value not in ("true", "false"):
+            raise EstimatorError(f"{text}: {key} = {value!r}, expected true or false")
+        return value == "true"
+    if isinstance(default, str):
+        return value
+    if not value.isdecimal():
+        expected = "digits, such as 012" if key == "orders" else "a whole number"
+        raise EstimatorError(f"{text}: {key} = {value!r}, expected {expected}")
+    return tuple(map(int, value)) if key == "orders" else int(value)
+
+
 def checked_options(**options: Any) -> Options:
     """Options by their names. Raises EstimatorError: there is no such option, or it cannot have this value."""
-    known = Options.__dataclass_fields__
     for key in options:
-        if key not in known:
-            raise EstimatorError(f"estimators have no option {key!r}: use {', '.join(known)}")
+        if key not in _NAMES:
+            raise EstimatorError(f"estimators have no option {key!r}: use {', '.join(_NAMES)}")
     chosen = Options(**options)
     choices = {
         "gain": ("steady-state", "time-varying"),

@@ -30,11 +30,12 @@ from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
 from aolink.estimation.kalman.path_moments import Observation, PathMoments, SecondOrderMoments
 from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
+from aolink.estimation.looks import LOOKS
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
-from aolink.estimation.options import Engine, Options, checked_options
+from aolink.estimation.options import Engine, Options, checked_options, with_options
 from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.extensions import described, installed, loaded
 from aolink.optics.sensor import Sensor, SpotSensor
@@ -74,7 +75,9 @@ class EstimatorRow:
 
 
 def estimator_row(name: str) -> EstimatorRow:
-    """The row of an estimator. Raises EstimatorError: there is none, or the package that has it is broken."""
+    """The row of an estimator, whose name may have its options. Raises EstimatorError: there is none, or the package
+    that has it is broken."""
+    name = name.partition(":")[0]
     if name in _OURS:
         return _OURS[name]
     if name in _others():
@@ -112,16 +115,17 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     Parameters
     ----------
     name:
-        One of `ESTIMATOR_NAMES`.
+        One of `ESTIMATOR_NAMES`; its options may follow, as in ``o3:second_order`` (`options.with_options`). The
+        estimates bear the whole text as their estimator's name.
     options:
-        Fields of `Options`.
+        Fields of `Options`; those in the name come first.
 
     Raises
     ------
     EstimatorError
         There is no such estimator or option, or it cannot work on this rig.
     """
-    row, chosen = estimator_row(name), checked_options(**options)
+    row, chosen = estimator_row(name), checked_options(**options | with_options(name)[1])
     if reason := row.refusal(rig):
         raise EstimatorError(reason)
     if chosen.engine not in row.engines or (chosen.engine == "filterpy" and rig.plant.axes != 1):
@@ -288,29 +292,21 @@ def _is_line(rig: Rig) -> bool:
     return isinstance(rig.sensor, Sensor)
 
 
+def _row(name: str, **rest: Any) -> EstimatorRow:
+    return EstimatorRow(name=name, **LOOKS[name]._asdict(), **rest)
+
+
 _PAPER_ENGINES: tuple[Engine, ...] = ("aolink", "filterpy")
 _OURS = {
     row.name: row
     for row in (
-        EstimatorRow(name="open-loop", rank=0, colour=(204, 121, 167), build=_open_loop),
-        EstimatorRow(name="o1", rank=10, colour=(86, 180, 233), build=_paper(1), engines=_PAPER_ENGINES),
-        EstimatorRow(name="o2", rank=20, colour=(120, 130, 255), build=_paper(2), engines=_PAPER_ENGINES),
-        EstimatorRow(name="o3", rank=30, colour=(240, 110, 50), build=_paper(1, 2), engines=_PAPER_ENGINES),
-        EstimatorRow(
-            name="moments", rank=40, colour=(0, 175, 125), build=_moments, refusal=_moments_refusal,
-            wanders=True,
-        ),
-        EstimatorRow(
-            name="profile", rank=50, colour=(140, 210, 80), build=_profile, refusal=_pixels_refusal("profile"),
-            wanders=True, in_demo=_is_line,
-        ),
-        EstimatorRow(
-            name="mixture", rank=60, colour=(240, 80, 140), build=_mixture, refusal=_pixels_refusal("mixture"),
-            wanders=True, in_demo=_is_line,
-        ),
-        EstimatorRow(
-            name="sampled", rank=70, colour=(190, 130, 80), build=_sampled, refusal=_pixels_refusal("sampled"),
-            wanders=True, in_demo=lambda rig: False,
-        ),
+        _row("open-loop", build=_open_loop),
+        _row("o1", build=_paper(1), engines=_PAPER_ENGINES),
+        _row("o2", build=_paper(2), engines=_PAPER_ENGINES),
+        _row("o3", build=_paper(1, 2), engines=_PAPER_ENGINES),
+        _row("moments", build=_moments, refusal=_moments_refusal, wanders=True),
+        _row("profile", build=_profile, refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_line),
+        _row("mixture", build=_mixture, refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_line),
+        _row("sampled", build=_sampled, refusal=_pixels_refusal("sampled"), wanders=True, in_demo=lambda rig: False),
     )
-}  # fmt: skip
+}

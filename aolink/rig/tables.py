@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from aolink.errors import RigError
 from aolink.numerics.block_diagonal import stationary_covariance
@@ -142,7 +142,7 @@ def with_disturbance(plant: Plant, model: DisturbanceModel) -> Plant:
 
 
 def _beside(first: FloatArray, second: FloatArray) -> FloatArray:
-    return np.asarray(linalg.block_diag(first, second))
+    return np.asarray(scipy.linalg.block_diag(first, second))
 
 
 def _covariance(table: Table, name: str, size: int, why: str) -> FloatArray:

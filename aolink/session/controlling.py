@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aolink.control import Act, ControlLoop, State
+from aolink.control import Act, ControllerRow, ControlLoop, State
 from aolink.errors import ControlError
 from aolink.estimation import Estimate
 from aolink.exposure import Exposure
@@ -41,12 +41,12 @@ class Controlling:
         There is no such controller, it cannot work on this rig, or it needs an estimator and has none.
     """
 
-    def __init__(self, rig: Rig, controller: str, estimators: Sequence[str]) -> None:
+    def __init__(self, rig: Rig, controller: str | ControllerRow, estimators: Sequence[str]) -> None:
         self.loop = ControlLoop(rig, controller)
         self.estimator = estimators[0] if estimators and self.loop.needs_state else ""
         if self.loop.needs_state and not estimators:
-            raise ControlError(f"the controller {controller} needs an estimator's state: give one, such as moments")
-        self.report = ControlReport(controller=controller, estimator=self.estimator)
+            raise ControlError(f"the controller {self.loop.name} needs an estimator's state: give one, such as moments")
+        self.report = ControlReport(controller=self.loop.name, estimator=self.estimator)
         self.cause_frame = 0
         """The newest exposure that the inputs know."""
         self._step_s, self._period = rig.timing.fast_step_s, rig.timing.frame_period_steps
@@ -66,6 +66,10 @@ class Controlling:
         """
         ended = max(0, (device_step - self._first_step - self._steps) // self._period + 1)
         return self._first_step + ended * self._period + self._steps + self.loop.delay_steps
+
+    def commanded(self, block: wire.CommandBlock) -> None:
+        """Take a block as it was sent."""
+        self.loop.commanded(block.first_step, np.array(block.u).reshape(block.n_steps, self._n_inputs))
 
     def applied(self, applied: wire.Applied) -> None:
         """Take a report of what the mirror held."""

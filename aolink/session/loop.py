@@ -251,6 +251,11 @@ class SessionLoop:
             return self._queued_until
         return self._mirror.since_zero_ns(self._time.now_ns()) // self._step_ns
 
+    def _reached_step(self) -> int:
+        """The first fast step that a command which is sent now reaches in time."""
+        margin = 0 if self._time.virtual else round(MARGIN_S * 1e9) // self._step_ns + 1
+        return self._device_step() + margin
+
     def _send_due(self) -> float:
         """Send what is due; gives the time until something is due again, s."""
         time = self._time
@@ -359,17 +364,31 @@ class SessionLoop:
         if control is not None and self._time.virtual:
             horizon = control.horizon(device_step)
             end_step = horizon if end_step is None else min(end_step, horizon)
+        elif self._rig.mirror.slew_max_per_s and self._queued_until <= device_step and not self._time.virtual:
+            self._leave_out()
         while self._queued_until < horizon and (end_step is None or self._queued_until < end_step):
             first = self._queued_until
             n_steps = block_steps if end_step is None else min(block_steps, end_step - first)
             u = control.loop.inputs(first, n_steps) if control else self._inputs(first - self._first_step, n_steps)
             now = self._time.now_ns()
             block = self._mirror.send_block(first, u, cause, now)
+            if control is not None:
+                control.commanded(block)
             self._account.commanded(block)
             self._assembler.add_command(block)
             self._record(topics.COMMAND, block, now)
             self._latencies.sent(block, self._time.now_ns())
             self._queued_until += n_steps
+
+    def _leave_out(self) -> None:
+        """Leave out what would come too late, so that the slew limit holds from what the mirror has come to hold."""
+        first, step = self._queued_until, self._reached_step()
+        step = step if self._end_step is None else min(step, self._end_step)
+        if step <= first:
+            return
+        held, self._queued_until = self._mirror.go_on_from(first, step), step
+        if self._controlling is not None:
+            self._controlling.loop.commanded(first, held)
 
     def _is_over(self, exposures: int) -> bool:
         if self._time.virtual:
@@ -539,10 +558,10 @@ class SessionLoop:
         """Let the controller change the inputs that are not due yet: they are sent anew, and supersede the queued."""
         if self._controlling is None or self._is_safe:
             return
-        margin = 0 if self._time.virtual else round(MARGIN_S * 1e9) // self._step_ns + 1
-        change = self._controlling.see(exposure, estimate, self._device_step() + margin)
-        if change.first_step < self._queued_until:
-            self._queued_until = max(self._device_step() + 1, self._mirror.withdraw(change.first_step))
+        change = self._controlling.see(exposure, estimate, self._reached_step())
+        if (first_step := change.first_step) < self._queued_until:
+            # No later than what was changed: the limits count from what the controller goes on from.
+            self._queued_until = min(first_step, max(self._device_step() + 1, self._mirror.withdraw(first_step)))
         self._record(topics.CONTROL, change.message, log_time_ns)
         if change.warning:
             self.report.warnings.append(change.warning)

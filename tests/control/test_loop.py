@@ -67,6 +67,21 @@ def test_what_is_queued_and_due_stays_and_the_rest_is_changed() -> None:
     assert u[75:].all()
 
 
+def test_the_loop_goes_on_from_what_the_mirror_was_sent() -> None:
+    """A mirror that was parked is on its way: what it was sent is not what the loop had meant."""
+    rig = small_rig(DRIFT, mirror="slew_max_per_s = 1.0")
+    loop = ControlLoop(rig, "integrator")
+    (exposure,) = simulate(rig, 1)
+    loop.inputs(0, 60)
+    loop.see(seen_at(exposure, -0.8), None, earliest_step=60)
+    assert loop.inputs(60, 60)[-1] > 0.04
+    sent = np.array([[0.001], [0.002], [0.003], [0.004], [0.005]])
+    loop.commanded(110, sent)
+    loop.see(seen_at(replace(exposure, first_step=60), -0.8), None, earliest_step=115)
+    np.testing.assert_array_equal(loop.inputs(110, 5), sent)
+    np.testing.assert_allclose(loop.inputs(115, 1), [[0.006]])
+
+
 def test_nothing_beyond_limits_and_slew_is_given_and_nothing_winds_up() -> None:
     """A spot that stays beyond the mirror's reach for a while must not keep it at its limit afterwards."""
     rig = small_rig(control="gain = 0.8\nleak = 0.0", mirror="slew_max_per_s = 20.0")

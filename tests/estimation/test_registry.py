@@ -1,15 +1,20 @@
 """Rows of the registry: ours, one of a package that is really installed, one that is broken."""
 
 import json
+import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from aolink.colours import by_rank, estimator_colour
 from aolink.errors import EstimatorError
 from aolink.estimation import ESTIMATOR_NAMES, estimator_rows, make_estimator
+from aolink.estimation.options import with_options
 from aolink.jobs.demo import possible_estimators, simulated_rig
 from aolink.rig import load_rig
+from aolink.simulation.model import simulate
 
 
 def test_names_come_by_rank():
@@ -25,6 +30,55 @@ def test_a_row_refuses_what_making_the_estimator_refuses():
         with pytest.raises(EstimatorError) as raised:
             make_estimator(rig, name)
         assert str(raised.value) == reason
+
+
+def test_options_may_follow_the_name():
+    rig = load_rig("section-vi-lively")
+    named = make_estimator(rig, "o3:second_order,flux=measured")
+    given = make_estimator(rig, "o3", second_order=True, flux="measured")
+    for exposure in simulate(rig, 4):
+        ours, theirs = named.step(exposure), given.step(exposure)
+        assert ours.estimator == "o3:second_order,flux=measured"
+        assert np.array_equal(ours.end_state, theirs.end_state)
+    assert with_options("sampled:particles=500,seed=2") == ("sampled", {"particles": 500, "seed": 2})
+    assert with_options("moments:orders=012,gate=false") == ("moments", {"orders": (0, 1, 2), "gate": False})
+    assert by_rank(["moments", "o3:second_order", "o3", "o1"]) == ["o1", "o3", "o3:second_order", "moments"]
+    assert estimator_colour("o3:second_order") != estimator_colour("o3")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("o3:tuning=3", "o3:tuning=3: estimators have no option 'tuning': use gain, process_noise"),
+        ("o3:", "no estimator 'o3:': after the colon"),
+        ("o3:second_order=maybe", "second_order = 'maybe', expected true or false"),
+        ("sampled:particles=many", "particles = 'many', expected a whole number"),
+        ("moments:orders=0-2", "orders = '0-2', expected digits, such as 012"),
+        ("o3:flux=some", "flux = 'some' is not known"),
+        ("o4:second_order", "no estimator 'o4': use one of open-loop, o1"),
+    ],
+)
+def test_an_option_that_makes_no_sense_is_named(text, message):
+    with pytest.raises(EstimatorError, match=re.escape(message)):
+        make_estimator(load_rig("section-vi-lively"), text)
+
+
+@pytest.mark.long
+def test_options_of_a_session_go_with_the_recording(aolink, tmp_path):
+    """Beside the loop in real time; and all that reads the recording has the same estimator."""
+    names = ("-e", "o3:second_order", "-e", "o3")
+    with simulated_rig("loop", "--real-time") as (camera, mirror):
+        recorded = aolink(
+            "record", "--camera", camera, "--mirror", mirror, "--rig", "loop", *names, "--control", "lqg",
+            "--exposures", "20", "-o", "a.mcap",
+        )  # fmt: skip
+    assert recorded.returncode == 0, recorded.stderr
+    again = aolink("estimate", "a.mcap", "--json")
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout)["differs_from_recorded"] == {"o3:second_order": None, "o3": None}
+    for command in (("view", "--save", "a.rrd"), ("export", "-o", "a.npz"), ("report", "-o", "a.html")):
+        made = aolink(command[0], "a.mcap", *command[1:])
+        assert made.returncode == 0, made.stderr
 
 
 def test_the_demo_runs_what_is_fast_on_the_rig():
@@ -54,8 +108,6 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     told = subprocess.run([sys.executable, "-c", asked], env=with_example, capture_output=True, text=True, check=True)
     assert told.stdout == "('open-loop', 'o1', 'threshold') (250, 250, 120) ['o1', 'threshold', 'o3']\n"
     # Without the package the recording is there, and its estimates have a colour and come last.
-    from aolink.colours import by_rank, estimator_colour
-
     assert by_rank(["threshold", "o3"]) == ["o3", "threshold"]
     assert estimator_colour("threshold") != (250, 250, 120)
     assert aolink("info", "a.mcap").returncode == 0

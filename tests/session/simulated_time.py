@@ -6,16 +6,22 @@ Session, protocol and rig are the real ones, bytes and packets too; only the clo
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from aolink.control import ControllerRow
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
 from aolink.devices.identity import identify
 from aolink.devices.native import NativeCamera, NativeMirror
+from aolink.errors import PortError
 from aolink.estimation import Driver
 from aolink.exposure import Exposure
 from aolink.recording import topics
@@ -84,9 +90,15 @@ class End:
 
     def __init__(self, name: str, incoming: Way, outgoing: Way) -> None:
         self.name = name
-        self.read = self.read_some = incoming.read
-        self._outgoing = outgoing
+        self.read, self._outgoing = incoming.read, outgoing
         self.unsent = outgoing.unsent
+        self.gone = False
+        """Whether the port has vanished; it can be opened again at once, whoever hears it."""
+
+    def read_some(self) -> bytes:
+        if self.gone:
+            raise PortError(f"the {self.name} was pulled out")
+        return self.read()
 
     def write(self, data: bytes) -> Any:
         """Of a device it is how much was taken, of a host nothing is asked."""
@@ -96,7 +108,12 @@ class End:
         raise AssertionError("nobody waits on a simulated line")
 
     def reopen(self) -> None:
-        raise AssertionError("this port does not vanish")
+        self.gone = False
+
+    def opened(self) -> End:
+        """The same port, opened again."""
+        self.reopen()
+        return self
 
     def close(self) -> None:
         pass
@@ -111,13 +128,16 @@ class SimulatedTimeHub(Host):
         self.at: list[tuple[int, Callable[[], object]]] = []
         """What is to happen when, on the clock."""
         self.held: dict[int, tuple[int, int]] = {}
-        """What the mirror really held: the command's block and the source, by fast step."""
+        """What the mirror really held: the command's block and the source, by fast step, ..."""
+        self.held_inputs: dict[int, list[float]] = {}
+        """... and the inputs."""
         names: tuple[Line, Line] = ("camera", "mirror")
         self.to_device, self.to_host = ({name: Way(self) for name in names} for _ in range(2))
         streams: dict[Line, Stream] = {name: End(name, self.to_device[name], self.to_host[name]) for name in names}
         self.server = RigServer(rig, streams, seed=seed, real_time=True, clock_ns=lambda: self.clock_ns)
-        for name in names:
-            self.links.append(Link(name, End(name, self.to_host[name], self.to_device[name]), self.now_ns))
+        self.ends = {name: End(name, self.to_host[name], self.to_device[name]) for name in names}
+        """The host's."""
+        self.links += [Link(name, end, self.now_ns) for name, end in self.ends.items()]
 
     def now_ns(self) -> int:
         return _EPOCH_NS + self.clock_ns
@@ -126,8 +146,18 @@ class SimulatedTimeHub(Host):
         """Cut or mend the mirror's line."""
         self.to_device["mirror"].cut, self.to_host["mirror"].cut = to_device, to_host
 
+    def pull(self, seconds: float) -> None:
+        """Pull out the mirror's line, and plug it in again after so long."""
+        self.cut()
+        self.ends["mirror"].gone = True
+        self.at.append((self.clock_ns + round(seconds * 1e9), lambda: self.cut(to_device=False, to_host=False)))
+        self.at.sort(key=itemgetter(0))
+
     def wait(self, timeout_s: float) -> list[tuple[Link, Received]]:
         pending, self._pending = self._pending, []
+        for thread in threading.enumerate():
+            if thread.name == "aolink-reopening":  # which takes no time on the simulated clock
+                thread.join()
         self.clock_ns += _TURN_NS
         end_ns = self.clock_ns + math.ceil(max(0.0, min(timeout_s, 0.1)) * 1e9)
         while True:
@@ -152,8 +182,8 @@ class SimulatedTimeHub(Host):
             answer = devices.outbox.pop().message
             assert isinstance(answer, pb.Applied)
             assert answer.source != pb.Applied.NOT_REPORTED
-            for _ in range(answer.n_steps):
-                self.held[step] = (answer.block_id, answer.source)
+            for u in np.array(answer.u).reshape(answer.n_steps, -1):
+                self.held[step], self.held_inputs[step] = (answer.block_id, answer.source), list(u)
                 step += 1
         return self.held
 
@@ -204,10 +234,11 @@ def run_session(
     exposures: int,
     *,
     inputs: Inputs | None = None,
-    controller: str = "",
+    controller: str | ControllerRow = "",
     estimators: Sequence[str] = (),
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda exposures: None,
+    reconnect_s: float = 0.0,
 ) -> Run:
     """A session from Identify to the end of its account, as `aolink.session.record` makes it; errors are kept."""
     live: list[Exposure] = []
@@ -218,6 +249,8 @@ def run_session(
     camera = NativeCamera(hub, camera_link, camera_identity, gate)
     mirror = NativeMirror(hub, mirror_link, mirror_identity, gate)
     hub.native = [camera, mirror]
+    if reconnect_s:
+        mirror.port.allow(hub.ends["mirror"].opened, reconnect_s)
     for link in hub.links:
         link.reset_counts()
     with RecordingWriter(path, rig, {}, hub.now_ns(), deterministic=True) as writer:

@@ -139,6 +139,23 @@ def test_a_serial_line_may_be_signed(aolink: Run, keys: tuple[Path, Path]) -> No
     assert found.returncode == 0, found.stderr
 
 
+def test_every_command_that_opens_devices_takes_their_key(aolink: Run, keys: tuple[Path, Path], tmp_path: Path) -> None:
+    with simulated_rig("tip-tilt", "--key", str(keys[0])) as (camera, mirror):
+        devices = ("--camera", camera, "--mirror", mirror, "--key", keys[0])
+        first = aolink("record", *devices, "--rig", "tip-tilt", "--exposures", "3", "-o", tmp_path / "a.mcap")
+        assert first.returncode == 0, first.stderr
+        again = aolink("replay", tmp_path / "a.mcap", "--to-rig", *devices, "-e", "o1", "-o", tmp_path / "b.mcap")
+        assert again.returncode == 0, again.stderr
+        poked = aolink(
+            "calibrate", "--interaction", *devices, "--rig", "tip-tilt", "--repeats", "1", "-o", tmp_path / "c.npz"
+        )
+        assert poked.returncode == 0, poked.stderr
+        without = aolink("replay", tmp_path / "a.mcap", "--to-rig", *devices[:4], "-o", tmp_path / "d.mcap")
+        assert "takes signed packets only: give its key" in without.stderr
+    alone = aolink("replay", tmp_path / "a.mcap", "--key", keys[0])
+    assert "--key and -o are for --to-rig" in alone.stderr
+
+
 def test_a_device_that_trickles_is_given_up(aolink: Run) -> None:
     """It sends a byte now and then, never a packet; the host asks three times."""
     over = threading.Event()

@@ -315,7 +315,7 @@ def rrd_of_ten_minutes(effort: Effort) -> Row:
     )
 
 
-def _hour(folder: Path, effort: Effort) -> Recording:
+def hour(folder: Path, effort: Effort) -> Recording:
     """An hour of a session at 5 exposures a second, with o3."""
     from aolink.recording.reestimate import write_reestimated
 
@@ -329,7 +329,7 @@ def rrd_size(effort: Effort) -> Row:
     from aolink.viewing import save_rrd
 
     with tempfile.TemporaryDirectory() as name:
-        recording = _hour(Path(name), effort)
+        recording = hour(Path(name), effort)
         grown: list[float] = []
         saved = save_rrd(recording, Path(name) / "a.rrd", progress=lambda done: grown.append(resident_mb()))
         ratio = saved.stat().st_size / recording.size
@@ -343,12 +343,12 @@ def view_first(effort: Effort) -> Row:
     import rerun as rr
 
     from aolink.viewing import Look
+    from aolink.viewing.process import free_port, running_rerun, wait_for_server
     from aolink.viewing.save import sent_parts
-    from aolink.viewing.viewer import free_port, running_rerun, wait_for_server
 
     times = []
     with tempfile.TemporaryDirectory() as name:
-        path = _hour(Path(name), effort).path
+        path = hour(Path(name), effort).path
         for _ in range(effort.of(5)):
             start, port = time.perf_counter(), free_port()
             with (

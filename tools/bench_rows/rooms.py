@@ -18,6 +18,7 @@ ROWS = {
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes", "rrd_size", "view_first",
     ),
+    "start": ("command_start", "view_start"),
     "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "moving_scene": ("moving_scene",),
@@ -25,3 +26,6 @@ ROWS = {
     "identification": ("coverage",),
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
+
+LONG = frozenset({"soak"})
+"""Those that take minutes each, or hours: they are measured where they are named, or with `--long`."""
