@@ -55,6 +55,16 @@ class AlignmentError:
 
 
 @dataclass(frozen=True, eq=False)
+class WanderingFrequency:
+    """The plant's frequency, in the frequency of its matrices."""
+
+    mean: FloatArray
+    """(axes,)"""
+    sd: FloatArray
+    """(axes,)"""
+
+
+@dataclass(frozen=True, eq=False)
 class Components:
     """The posterior of an exposure as a Gaussian mixture for each axis, of few coefficients t: z = expand t + a rest.
 
@@ -127,6 +137,8 @@ class Estimate:
     """Where camera and mirror count by different clocks."""
     components: Components | None = field(default=None, compare=False, repr=False)
     """Where the estimator carries a mixture; recordings do not have them. `smooth` uses them."""
+    frequency: WanderingFrequency | None = field(default=None, compare=False)
+    """Where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have it."""
 
     @property
     def path(self) -> FloatArray:

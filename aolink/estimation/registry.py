@@ -68,6 +68,8 @@ class EstimatorRow:
     """Why it cannot work on a rig, and what to use instead; None where it can."""
     engines: tuple[Engine, ...] = ("aolink",)
     """Engines that it can run on."""
+    wanders: bool = False
+    """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
     in_demo: Callable[[Rig], bool] = lambda rig: True
     """Whether it is fast enough on a rig for `aolink demo`."""
 
@@ -132,7 +134,15 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f"engine {chosen.engine!r} runs {able} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
-    return Estimator(rig, name, row.build(rig, chosen))
+
+    def made(rig: Rig) -> Estimator:
+        return Estimator(rig, name, row.build(rig, chosen))
+
+    if rig.plant.wandering is None or not row.wanders:
+        return made(rig)
+    from aolink.estimation.wandering import WanderingEstimator  # its imports take long
+
+    return WanderingEstimator(rig, made)
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None) -> BlurFilter:
@@ -294,9 +304,9 @@ _OURS = {
         _row("o1", build=_paper(1), engines=_PAPER_ENGINES),
         _row("o2", build=_paper(2), engines=_PAPER_ENGINES),
         _row("o3", build=_paper(1, 2), engines=_PAPER_ENGINES),
-        _row("moments", build=_moments, refusal=_moments_refusal),
-        _row("profile", build=_profile, refusal=_pixels_refusal("profile"), in_demo=_is_line),
-        _row("mixture", build=_mixture, refusal=_pixels_refusal("mixture"), in_demo=_is_line),
-        _row("sampled", build=_sampled, refusal=_pixels_refusal("sampled"), in_demo=lambda rig: False),
+        _row("moments", build=_moments, refusal=_moments_refusal, wanders=True),
+        _row("profile", build=_profile, refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_line),
+        _row("mixture", build=_mixture, refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_line),
+        _row("sampled", build=_sampled, refusal=_pixels_refusal("sampled"), wanders=True, in_demo=lambda rig: False),
     )
 }

@@ -52,6 +52,9 @@ class Posterior:
     """What the filter had to do on some axes, for the estimate's reason; otherwise empty."""
     components: Components | None = None
     """Where the posterior is a mixture."""
+    log_evidence: FloatArray | None = None
+    """Log-likelihood of what was measured, up to what is the same for all plants, (axes,), NaN where nothing was; None
+    where innovation and covariance say it."""
 
     @property
     def start(self) -> Gaussian:

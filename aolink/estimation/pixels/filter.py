@@ -61,6 +61,8 @@ class MixtureUpdate:
     end: GaussianMixture
     """The posterior of the state at the exposure's end, without the response to the inputs."""
     innovation: Innovation
+    log_evidence: FloatArray
+    """Log-likelihood of the pixels by Laplace's method, (axes,)."""
     several: BoolArray
     """Whether the posterior has several modes (the blur has more than one reading), (axes,)."""
     poor: BoolArray
@@ -149,6 +151,7 @@ class MixtureFilter(Filter):
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
         new = _spread([], np.zeros(0, dtype=np.intp), axes)
         several, poor = np.zeros(axes, dtype=bool), np.zeros(axes, dtype=bool)
+        log_evidence = np.full(axes, np.nan)
         done: list[MixtureUpdate] = []
         components: list[tuple[Indices, FloatArray, FloatArray, FloatArray]] = []
         took = np.zeros(0, dtype=np.intp)
@@ -173,6 +176,7 @@ class MixtureFilter(Filter):
             done = in_threads(updated, parts)
             components = [(p, *each.posterior.arrays) for p, each in zip(parts, done, strict=True)]
             new = _spread([each.innovation for each in done], seen, axes)
+            log_evidence[seen] = np.concatenate([log_evidence[:0], *(each.log_evidence for each in done)])
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
             status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
@@ -201,6 +205,7 @@ class MixtureFilter(Filter):
         return Posterior(
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several, remark=self._remark(poor, reduced),
+            log_evidence=log_evidence,
             components=Components(
                 components, reduced.expand, reduced.left_out, (unseen.mean, unseen.covariance)
             ),

@@ -178,3 +178,13 @@ def test_where_the_state_was_lost_the_past_stays():
     together, apart_ = smooth(rig.plant, exposures, estimates), smooth(rig.plant, exposures[:5], estimates[:5])
     for a, b in zip(together[:5], apart_, strict=True):
         assert np.abs((a.path - b.path) / b.path_sd).max() < 1
+
+
+def test_several_axes_are_smoothed_side_by_side():
+    rig = load_rig("single-lenslet")
+    exposures = simulate(rig, 8, seed=2)
+    estimates = run(rig, exposures, ["profile"])["profile"]
+    smoothed = smooth(rig.plant, exposures, estimates)
+    before, after = (score(exposures, each, 0).path_rmse for each in (estimates, smoothed))
+    assert after < before
+    assert [e.path.shape for e in smoothed] == [e.path.shape for e in estimates]
