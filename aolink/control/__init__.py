@@ -2,6 +2,7 @@
 
 from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
+from aolink.control.fall_back import FallBack
 from aolink.control.loop import Act, ControlLoop, State, delay_steps
 from aolink.control.modes import Modes, response_at_rest
 from aolink.control.registry import controller_names, find_controller
@@ -12,6 +13,7 @@ __all__ = [
     "ControlLoop",
     "Controller",
     "ControllerRow",
+    "FallBack",
     "Fit",
     "FitMonitor",
     "Modes",

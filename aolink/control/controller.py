@@ -51,3 +51,6 @@ class ControllerRow:
     """Whether it needs an estimator's state, or the centroids alone."""
     refusal: Callable[[Rig], str | None] = lambda rig: None
     """Why it cannot work on a rig, and what to do; None where it can."""
+    believes_a_model: bool = False
+    """Whether it is as good as the rig file's model of the disturbance: it is then left where that does not pay
+    (``control.fall_back``)."""

@@ -14,7 +14,7 @@ from aolink.numerics.arrays import FloatArray
 
 WINDOW = 60
 """Exposures that are judged together."""
-_TOLERATED_RATIO = 2.0
+TOLERATED_RATIO = 2.0
 """No model is exact: a mean NIS within this factor of its expectation is no drift, however significant."""
 _TOLERATED_CORRELATION = 0.3
 _SIGMAS = 5.0
@@ -73,7 +73,7 @@ class FitMonitor:
             return None
         nis, count, product, square = (sum(each) for each in zip(*self._window, strict=True))
         ratio, whiteness = nis / count, product / square
-        off = max(ratio, 1 / ratio) > max(_TOLERATED_RATIO, 1 + _SIGMAS * math.sqrt(2 / count))
+        off = max(ratio, 1 / ratio) > max(TOLERATED_RATIO, 1 + _SIGMAS * math.sqrt(2 / count))
         coloured = abs(whiteness) > max(_TOLERATED_CORRELATION, _SIGMAS / math.sqrt(count))
         return Fit(nis_ratio=ratio, whiteness=whiteness, fits=not (off or coloured))
 

@@ -6,11 +6,13 @@ import enum
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from aolink.control.controller import Controller, ControllerRow, Seen
 from aolink.control.drift import Fit, FitMonitor
+from aolink.control.fall_back import Change, FallBack
 from aolink.control.registry import find_controller
 from aolink.errors import AolinkError, ControlError
 from aolink.estimation import Estimate, Needs, Status
@@ -58,6 +60,11 @@ class Act:
     """Fast steps from the exposure before to this one whose wanted input limits or slew have changed."""
     fit: Fit | None
     """How well the model fits; None while that is not known."""
+    acting: str
+    """The controller that acts: another one while the loop's own does not pay (`FallBack`)."""
+    gained: float
+    """Where that has changed with this exposure: how much less the slopes would have been with it, as a share of their
+    root mean square; NaN otherwise."""
 
 
 def centroids(rig: Rig, exposure: Exposure) -> FloatArray:
@@ -94,6 +101,9 @@ class ControlLoop:
         self.state, self.reason = State.CLOSED, ""
         self.fit: Fit | None = None
         self._rig, self._controller = rig, _made(row, rig)
+        self._fall_back: FallBack | None = None
+        if row.believes_a_model and rig.control.fall_back:
+            self._fall_back = FallBack(rig, row, self.delay_steps)
         mirror = rig.mirror
         self._low, self._high, self._park = mirror.input_min, mirror.input_max, mirror.park
         self._most_change = mirror.slew_max_per_s * rig.timing.fast_step_s or math.inf
@@ -172,12 +182,13 @@ class ControlLoop:
             self.lose(f"frame {exposure.frame_id} came {first - end} fast steps late")
         self._forget_from(first)
         pending = np.array(self._held[end - self._oldest : first - self._oldest]).reshape(-1, len(self._park))
+        if estimate is not None:
+            self.fit = self._monitor.add(estimate)
+        change = self._compare(exposure, slopes, estimate)
         if self.state is State.CLOSED and len(pending):
             state = None if estimate is None else estimate.end_state
             self._ask(lambda: self._controller.see(Seen(slopes=slopes, state=state, pending=pending)))
             self._seen_any = True
-        if estimate is not None:
-            self.fit = self._monitor.add(estimate)
         self._drop_before(exposure.first_step)
         clipped, self._clipped = self._clipped, 0
         return Act(
@@ -191,7 +202,14 @@ class ControlLoop:
             path_rms=math.nan if estimate is None else _rms(estimate.path),
             clipped_steps=clipped,
             fit=self.fit,
+            acting=self.acting,
+            gained=math.nan if change is None else change.gained,
         )
+
+    @property
+    def acting(self) -> str:
+        """The controller that acts."""
+        return self.name if self._fall_back is None else self._fall_back.acting
 
     def lose(self, reason: str) -> None:
         """Open the loop: hold or park the mirror, as the rig file says, until exposures can be trusted again."""
@@ -199,6 +217,19 @@ class ControlLoop:
             self.state = State.PARKED if self._rig.control.when_lost == "park" else State.HELD
             self._trusted = 0
         self.reason = reason
+
+    def _compare(self, exposure: Exposure, slopes: FloatArray, estimate: Estimate | None) -> Change | None:
+        """Let another controller act where this one does not pay, or this one again."""
+        if self._fall_back is None:
+            return None
+        if self.state is not State.CLOSED or not self._seen_any:
+            self._fall_back.interrupt()
+            return None
+        fall_back = self._fall_back
+        change: Change | None = self._ask(lambda: fall_back.see(exposure, slopes, estimate, self.fit))
+        if change is not None:
+            self._controller = self._fall_back.controller()
+        return change
 
     def _judge(self, slopes: FloatArray, estimate: Estimate | None, end: int) -> None:
         """Decide whether the loop is closed, from what this exposure is worth."""
@@ -244,9 +275,9 @@ class ControlLoop:
             )
         return u
 
-    def _ask(self, call: Callable[[], FloatArray | None]) -> FloatArray:
+    def _ask(self, call: Callable[[], Any]) -> Any:
         try:
-            return call()  # type: ignore[return-value] # `see` gives nothing, and nobody looks
+            return call()
         except AolinkError:
             raise
         except Exception as error:  # whatever another package does wrong

@@ -9,7 +9,7 @@ Another package adds one with an entry point in its pyproject.toml, whose name i
 from __future__ import annotations
 
 from aolink.control.controller import ControllerRow
-from aolink.control.integrator import Integrator
+from aolink.control.fall_back import INTEGRATOR
 from aolink.control.lqg import LQG
 from aolink.errors import ControlError
 from aolink.extensions import described, installed, loaded
@@ -19,12 +19,13 @@ GROUP = "aolink.controllers"
 _OURS = {
     row.name: row
     for row in (
+        INTEGRATOR,
         ControllerRow(
-            name="integrator", summary="leaky integrator on the centroids, modal", build=Integrator, needs_state=False
+            name="lqg", summary="predicts the estimator's state, and cancels it at the fast rate", build=LQG,
+            believes_a_model=True,
         ),
-        ControllerRow(name="lqg", summary="predicts the estimator's state, and cancels it at the fast rate", build=LQG),
     )
-}
+}  # fmt: skip
 
 
 def controller_names() -> tuple[str, ...]:

@@ -97,3 +97,7 @@ __all__ = [
     "score",
     "smooth",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -55,3 +55,7 @@ __all__ = [
     "save_figure",
     "write_report",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

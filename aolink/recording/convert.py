@@ -34,7 +34,7 @@ _OF_FRAME = (
     "exposure_offset_ns",
 )  # fmt: skip
 _OF_ACT = (
-    "frame_id", "first_step", "delay_steps", "late", "reason", "slope_rms", "path_rms", "clipped_steps",
+    "frame_id", "first_step", "delay_steps", "late", "reason", "slope_rms", "path_rms", "clipped_steps", "acting",
 )  # fmt: skip
 _OF_RESTORATION = ("frame_id", "estimator", "method", "scene_noise_sd", "path_noise_sd", "reason")
 _OF_ESTIMATE = ("estimator", "frame_id", "first_step", "n_steps", "reason")

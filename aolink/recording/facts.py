@@ -19,7 +19,7 @@ _LOSSES = (
     "frames_lost", "frames_incomplete", "scenes_lost", "scenes_incomplete", "packets_missing", "packets_bad_crc",
     "packets_bad_framing", "packets_bad_payload", "chunks_refused", "steps_late", "steps_refused", "steps_not_reported",
     "steps_clipped", "steps_parked", "ports_vanished", "control_open_exposures", "control_late_exposures",
-    "control_misfit_exposures",
+    "control_misfit_exposures", "control_fall_back_exposures",
 )  # fmt: skip
 """What a session counts of what went wrong."""
 _ENDS = ("commanded", "applied", "superseded", "late", "refused", "not_reported")

@@ -190,6 +190,8 @@ class Control:
     integrator."""
     effort: float = 1e-3
     """Weight of the inputs in the cost of ``lqg``, relative to the slopes that they make at rest."""
+    fall_back: bool = True
+    """Whether the integrator, or a mirror that holds still, acts in the place of ``lqg`` while that does not pay."""
 
 
 @dataclass(frozen=True, kw_only=True)

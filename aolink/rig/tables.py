@@ -242,6 +242,7 @@ def read_control(table: Table, timing: Timing) -> Control:
         leak=table.rate("leak", default.leak),
         least_singular_value=table.rate("least_singular_value", default.least_singular_value),
         effort=table.number("effort", default.effort, above=0.0),
+        fall_back=table.flag("fall_back", default.fall_back),
     )
     if control.delay_s >= frame_s:
         raise RigError(

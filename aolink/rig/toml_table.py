@@ -21,7 +21,7 @@ _KEYS = """
 A actuators amplitude axes B B_w bias_v bit_depth black_level black_level_sd block_steps C calibration camera
 clock_drift_ppm clock_offset_s coefficients control correlation_s counts_per_density counts_per_density_sd
 counts_per_intensity coupling dac_bits damping dark_frames delay_s delay_sd_s devices disturbance drift_s drive driver
-effort exposure_offset exposure_steps fast_step_s faults field flat_frames focal_length_m footprint_m
+effort exposure_offset exposure_steps fall_back fast_step_s faults field flat_frames focal_length_m footprint_m
 frame_period_steps frequency frequency_hz gain gamma grid initial_covariance initial_mean input_max input_min kernel
 kernel_sigma_sd kind latency_s layers leak least_light least_singular_value lenslets light max_v mirror model modes
 name noise_density noise_density_sd noise_sd obstruction offset outer_scale_m pad_radius_m park period_s

@@ -53,6 +53,7 @@ class Controlling:
         self._steps, self._n_inputs = rig.timing.exposure_steps, rig.n_inputs
         self._first_step = 0
         self._state, self._fits = State.CLOSED, True
+        self._acting = self.loop.acting
 
     def begin(self, first_step: int) -> None:
         """The session begins with this fast step."""
@@ -95,7 +96,10 @@ class Controlling:
             self._fits = act.fit.fits
             fits = "fits again" if act.fit.fits else "no longer fits what is seen"
             news.append(f"the rig file's model {fits} (frame {frame}): {act.fit.text()}")
-        self._state = act.state
+        if act.acting != self._acting:
+            pays = f"{act.acting} would have left {100 * act.gained:.0f} % less of the slopes (rms) than {self._acting}"
+            news.append(f"{pays}, and acts from frame {frame} on")
+        self._state, self._acting = act.state, act.acting
         return "; ".join(news)
 
 
@@ -104,7 +108,7 @@ def facts(rig: Rig, controlling: Controlling, stability: str) -> dict[str, str]:
     control = rig.control
     numbers = {
         "delay_s": control.delay_s, "when_lost": control.when_lost, "gain": control.gain, "leak": control.leak,
-        "least_singular_value": control.least_singular_value, "effort": control.effort,
+        "least_singular_value": control.least_singular_value, "effort": control.effort, "fall_back": control.fall_back,
     }  # fmt: skip
     return {
         "controller": controlling.loop.name,

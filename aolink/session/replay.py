@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -94,7 +94,8 @@ def would_command(
     """What a controller would have commanded, exposure by exposure, had it been asked in the session.
 
     Each exposure, and the inputs that were pending at its end, are those of the recording: the answer is to what
-    happened, not to what would have come of it.
+    happened, not to what would have come of it. Another controller than the session's does not fall back, because
+    whether it pays cannot be seen where it did not act.
 
     Raises
     ------
@@ -102,6 +103,8 @@ def would_command(
         There is no such controller or estimator, or it cannot work on this rig.
     """
     rig = recording.rig
+    if recording.metadata.get("controller") != controller:
+        rig = replace(rig, control=replace(rig.control, fall_back=False))
     loop = ControlLoop(rig, controller)
     driver = Driver(rig, [estimator] if loop.needs_state else [])
     before: Exposure | None = None

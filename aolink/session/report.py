@@ -53,6 +53,8 @@ class ControlReport:
     """Of them, those that changed the inputs later than the rig file's ``control.delay_s``."""
     misfit_exposures: int = 0
     """Of them, those at which the model no longer fitted."""
+    fall_back_exposures: int = 0
+    """Of them, those after which another controller acted, because this one did not pay."""
     clipped_steps: int = 0
     """Fast steps whose wanted input the limits have changed."""
     slope_rms: float = float("nan")
@@ -69,6 +71,7 @@ class ControlReport:
         self.open_exposures += act.state is not State.CLOSED
         self.late_exposures += act.late
         self.misfit_exposures += act.fit is not None and not act.fit.fits
+        self.fall_back_exposures += act.acting != self.controller
         self.clipped_steps += act.clipped_steps
         if not math.isnan(act.slope_rms):
             total, count = self._squares
@@ -80,10 +83,15 @@ class ControlReport:
         self.note = f"slopes {act.slope_rms:.3g} rms, delay {self.delay_ms[-1]:.3g} ms{state}"
         if act.fit is not None and not act.fit.fits:
             self.note += ", the model does not fit"
+        if act.acting != self.controller:
+            self.note += f", fallen back to {act.acting}"
 
     def counts(self) -> dict[str, Any]:
         """Everything but the single delays, of which it gives the median and the longest."""
-        names = ("exposures", "open_exposures", "late_exposures", "misfit_exposures", "clipped_steps", "slope_rms")
+        names = (
+            "exposures", "open_exposures", "late_exposures", "misfit_exposures", "fall_back_exposures", "clipped_steps",
+            "slope_rms",
+        )  # fmt: skip
         delays = sorted(self.delay_ms)
         delay = {"delay_ms": delays[len(delays) // 2], "longest_delay_ms": delays[-1]} if delays else {}
         return {name: getattr(self, name) for name in names} | delay

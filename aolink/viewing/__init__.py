@@ -40,3 +40,7 @@ __all__ = [
     "serve_web",
     "show",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -164,6 +164,7 @@ def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
         send_line(drawing, f"control/{name}", times, values, Style(label, series_colour(k)))
     states = [
         f"{schemas_pb2.Control.State.Name(m.state)}{' LATE' if m.late else ''}"
+        f"{f' {m.acting.upper()}' if m.acting not in ('', m.controller) else ''}"
         if m.state in schemas_pb2.Control.State.values()
         else f"UNKNOWN {m.state}"
         for m in changes

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
 from aolink.numerics.chi_square import chi_square_quantile
 
 
-@settings(deadline=None)
 @given(st.floats(1e-4, 1 - 1e-4), st.one_of(st.integers(1, 50), st.integers(50, 1_000_000)))
 def test_a_quantile_is_scipys(share: float, degrees: int) -> None:
     assert chi_square_quantile(share, degrees) == pytest.approx(float(stats.chi2.ppf(share, degrees)), rel=1e-8)

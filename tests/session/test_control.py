@@ -23,6 +23,7 @@ from aolink.session import Report, record
 from aolink.session.replay import would_command
 from aolink.wire import messages_pb2 as wire
 from tests.control.rigs import DRIFT, LINE, small_rig
+from tests.control.test_fall_back import line, played
 from tests.kinds import must_be
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 
@@ -187,6 +188,27 @@ def test_a_model_that_no_longer_fits_is_said(tmp_path: Path) -> None:
     assert not acts(tmp_path)[-1].model_fits
     assert report.control is not None
     assert report.control.misfit_exposures > 0
+
+
+def test_a_controller_that_does_not_pay_is_left_and_the_recording_says_so(tmp_path: Path) -> None:
+    """The line is not where the model has it; and the same is decided offline."""
+    rig = played(tmp_path, line(10.5, 50), DRIFT, LINE)
+    with simulated_rig(tmp_path / "played.toml") as ports:
+        report = record(rig, *ports, tmp_path / "a.mcap", estimators=["o1"], exposures=50, control="lqg")
+    acting = [act.acting for act in acts(tmp_path)]
+    first = acting.index("still")
+    assert acting[:first] == ["lqg"] * first
+    assert report.control is not None
+    assert report.control.fall_back_exposures == 50 - acting.count("lqg")
+    recording = Recording(tmp_path / "a.mcap")
+    assert recording.metadata["control_fall_back_exposures"] == str(report.control.fall_back_exposures)
+    assert "fall_back True" in recording.metadata["control"]
+    said = f"% less of the slopes (rms) than lqg, and acts from frame {first + 1} on"
+    logged = [str(each.message.message) for each in recording.messages(topics.LOG)]  # type: ignore[attr-defined]
+    for texts in (report.warnings, logged):
+        assert any("still would have left" in text and said in text for text in texts)
+    assert [each.act.acting for each in would_command(recording, "lqg", "o1")] == acting
+    assert {each.act.acting for each in would_command(recording, "integrator", "")} == {"integrator"}
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from tests.needs import needed
+
 TOOLS = Path(__file__).parents[2] / "tools"
 
 
@@ -34,7 +36,7 @@ def result(results: Any) -> Any:
 
 def bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, TOOLS / "bench", *arguments]
-    return subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=120, cwd=TOOLS.parent)
+    return subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=300, cwd=TOOLS.parent)
 
 
 def test_a_run_is_written_with_its_machine_and_compared_with_the_next(tmp_path: Path) -> None:
@@ -91,3 +93,32 @@ def test_rows_that_take_minutes_are_rows(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.syspath_prepend(str(TOOLS))
     rooms = importlib.import_module("bench_rows.rooms")
     assert {name for names in rooms.ROWS.values() for name in names} >= rooms.LONG
+
+
+def test_a_curve_knows_its_power_and_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(TOOLS))
+    plots = importlib.import_module("bench_rows.plots")
+    sizes = [1.0, 3.0, 10.0, 30.0, 100.0, 300.0]
+    curve = plots.Curve("spots", "an exposure (ms)", sizes, [max(7.0, 0.5 * size**1.5) for size in sizes])
+    assert curve.slope == pytest.approx(1.5)
+    assert str(curve).endswith("grows with the power 1.50 in the larger half")
+    needed("matplotlib")
+    drawn = plots.draw([curve] * 4, tmp_path / "page")
+    assert drawn.read_bytes().count(b'id="axes_') == 4
+
+
+@pytest.mark.long
+def test_costs_are_measured_and_drawn(tmp_path: Path) -> None:
+    done = bench("--plots", tmp_path, "--short")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[-1] == f"written: {tmp_path / 'cost.svg'}"
+    assert all("grows with the power" in line for line in lines[:-1])
+    for what in (
+        "lenslets, 1 to 2500",
+        "fast steps, 50 to 1000",
+        "pixels",
+        "exposures of a recording",
+        "exposures a second",
+    ):
+        assert any(what in line for line in lines)

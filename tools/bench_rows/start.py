@@ -67,12 +67,12 @@ def view_start(effort: Effort) -> list[Row]:
         saved = Path(name) / "one.rrd"
         command = (*_COMMAND, "view", _RECORDING, "--exposure", "3", "--save", saved, "--overwrite")
         one = _row("aolink view --exposure 3 --save, from its start", command, peer, 2.0, effort)
-        path = hour(Path(name), effort).path
-        with _compiled():
-            _until_first_part(path)
-            pairs = [
-                (_until_first_part(path), timed(lambda: _run(sys.executable, "-c", peer))) for _ in range(effort.of(5))
-            ]
+    path = hour(effort)
+    with _compiled():
+        _until_first_part(path)
+        pairs = [
+            (_until_first_part(path), timed(lambda: _run(sys.executable, "-c", peer))) for _ in range(effort.of(5))
+        ]
     ours, theirs = (statistics.median(each) for each in zip(*pairs, strict=True))
     what = "aolink view of an hour, from its start until the first part is with the viewer"
     return [one, Row(what, f"{ours:.2f} s", f"limit 2 s; `{peer}` {theirs:.2f} s", 2 / ours, 1.0)]

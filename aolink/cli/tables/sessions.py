@@ -101,8 +101,8 @@ def _control(report: ControlReport) -> str:
         text += f"; delay p50 {counts:.3g} ms, longest {report.counts()['longest_delay_ms']:.3g} ms"
     text += f", {report.late_exposures} later than control.delay_s"
     return text + (
-        f"; loop open for {report.open_exposures} exposures, model off for {report.misfit_exposures}; limits changed"
-        f" {report.clipped_steps} steps"
+        f"; loop open for {report.open_exposures} exposures, model off for {report.misfit_exposures}, fallen back for"
+        f" {report.fall_back_exposures}; limits changed {report.clipped_steps} steps"
     )
 
 

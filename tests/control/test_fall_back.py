@@ -1,0 +1,104 @@
+"""A controller whose model does not pay leaves the mirror to another one, and takes it back when it does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aolink.control import delay_steps
+from aolink.control.fall_back import INTEGRATOR, Rival
+from aolink.control.loop import centroids
+from aolink.exposure import residual_rms
+from aolink.jobs.closed_loop import Closed, closed_loop
+from aolink.numerics.arrays import FloatArray
+from aolink.rig import Rig, load_rig
+from tests.control.rigs import DRIFT, LINE, small_rig
+
+STEPS = 40
+"""Of an exposure."""
+
+
+def played(folder: Path, slopes: FloatArray, *parts: str) -> Rig:
+    """A small rig that believes in these parts of a model, while other slopes disturb it."""
+    np.save(folder / "slopes.npy", slopes[:, None])
+    path = folder / "played.toml"
+    text = small_rig(*parts).toml
+    path.write_text(text + '\n[disturbance]\nplant_noise = false\nrecorded = "slopes.npy"\n')
+    return load_rig(path)
+
+
+def line(frequency_hz: float, exposures: int, amplitude: float = 0.14) -> FloatArray:
+    """A vibration, slope units at each fast step."""
+    return np.asarray(amplitude * np.sin(2 * math.pi * frequency_hz * 0.001 * np.arange(exposures * STEPS) + 1))
+
+
+def run(rig: Rig, exposures: int, *, fall_back: bool = True, seed: int = 3) -> list[Closed]:
+    rig = replace(rig, control=replace(rig.control, fall_back=fall_back))
+    return list(closed_loop(rig, "lqg", "o1", exposures, seed=seed))
+
+
+def acting(series: list[Closed]) -> list[str]:
+    return [each.act.acting for each in series if each.act is not None]
+
+
+def residual(series: list[Closed], first: int) -> float:
+    return residual_rms(each.exposure for each in series[first:])
+
+
+def test_what_the_integrator_would_have_left_is_what_it_leaves() -> None:
+    """It is followed on exposures of a mirror that holds still; and really closes the loop, from the same seed."""
+    rig = small_rig(DRIFT)
+    rival = Rival(rig, INTEGRATOR, delay_steps(rig), rig.mirror.park)
+    would, does = [], []
+    for still, closed in zip(
+        closed_loop(rig, "", "", 40), closed_loop(rig, "integrator", "", 40), strict=True
+    ):  # fmt: skip
+        seen = centroids(rig, still.exposure)
+        held = np.concatenate([still.exposure.lead_inputs, still.exposure.inputs])
+        would.append(seen + rival.see(held, seen, None)[-STEPS:].mean(axis=0))
+        does.append(centroids(rig, closed.exposure))
+    assert np.std(does) < 0.7 * np.std([centroids(rig, each.exposure) for each in closed_loop(rig, "", "", 40)])
+    # Noise of pixels, and a converter of 16 bits.
+    np.testing.assert_allclose(would, does, atol=0.004)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_model_that_is_right_never_falls_back(seed: int) -> None:
+    rig = small_rig(DRIFT, LINE)
+    watched, alone = run(rig, 90, seed=seed), run(rig, 90, fall_back=False, seed=seed)
+    assert set(acting(watched)) == {"lqg"}
+    for ours, theirs in zip(watched, alone, strict=True):
+        assert np.array_equal(ours.exposure.inputs, theirs.exposure.inputs)
+
+
+def test_a_line_at_another_frequency_than_the_model_has_it_is_left_alone(tmp_path: Path) -> None:
+    rig = played(tmp_path, line(10.5, 120), DRIFT, LINE)
+    series, alone = run(rig, 120), run(rig, 120, fall_back=False)
+    which = acting(series)
+    assert which[:20] == ["lqg"] * 20
+    first = next(k for k, name in enumerate(which) if name != "lqg")
+    assert first < 60
+    assert "lqg" not in which[first:]
+    act = series[first].act
+    assert act is not None
+    assert act.gained > 0.02
+    open_rms = residual(list(closed_loop(rig, "", "", 120, seed=3)), 70)
+    assert residual(series, 70) < 1.02 * open_rms < residual(alone, 70)
+
+
+def test_a_controller_whose_model_fits_again_acts_again(tmp_path: Path) -> None:
+    """The line is elsewhere for a while, and comes back to where the model has it."""
+    slopes = np.concatenate([line(10.5, 70), line(15.0, 190)])
+    rig = played(tmp_path, slopes, DRIFT, LINE)
+    which = acting(run(rig, 260))
+    assert "lqg" not in which[60:70]
+    assert which[-1] == "lqg"
+
+
+def test_it_can_be_switched_off() -> None:
+    assert small_rig(control="fall_back = false").control.fall_back is False
+    assert small_rig().control.fall_back is True
