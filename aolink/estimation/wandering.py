@@ -36,7 +36,10 @@ from aolink.rig import Plant, Rig, Wandering
 
 # Neighbours are apart by this many damping ratios of the least damped resonance, as far as the number of copies allows.
 _APART = 2.0
-_FEWEST, _MOST = 5, 21
+_FEWEST, _MOST = 9, 21
+# A frame's evidence is raised to this power: it is approximate, and not quite of the same windows in all copies, and
+# what is wrong in it would add up while a frequency stays where it is.
+_TRUST = 0.5
 # Where another copy's path has no exact coefficients, it is met to this part of the kernel's standard deviation.
 _MET = 0.01
 
@@ -96,7 +99,7 @@ class WanderingEstimator(Estimator):
         beside = np.pad(weight, ((0, 0), (1, 1)), mode="edge")
         weight = (1 - 2 * p) * weight + p * (beside[:, :-2] + beside[:, 2:])
         known = np.isfinite(evidence).all(axis=1, keepdims=True)
-        logs = np.log(np.maximum(weight, 1e-300)) + np.where(known, evidence, 0.0)
+        logs = np.log(np.maximum(weight, 1e-300)) + np.where(known, _TRUST * evidence, 0.0)
         top = logs.max(axis=1, keepdims=True)
         self._log_weight = logs - top - np.log(np.exp(logs - top).sum(axis=1, keepdims=True))
 
