@@ -21,7 +21,7 @@ ROWS = {
     "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "moving_scene": ("moving_scene",),
-    "loop": ("residual_slopes",),
+    "loop": ("residual_slopes", "fall_back"),
     "identification": ("coverage",),
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
