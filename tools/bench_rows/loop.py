@@ -154,11 +154,11 @@ def _turbulence(wind_m_s: float) -> Series:
     def series(steps: int, rng: np.random.Generator) -> NDArray[np.float64]:
         several = [waves(5.0, 0.0, np.random.default_rng(900 + seed))[1] for seed in range(30)]
         scale = 0.14 / math.sqrt(2 * np.mean([np.sum(np.abs(each) ** 2) / 2 for each in several]))
-        slopes, times = np.zeros(steps), 0.001 * np.arange(steps)
+        slopes, times = np.zeros(steps), 0.001 * np.arange(steps, dtype=np.float64)
         for wind in (wind_m_s, 2.2 * wind_m_s):
             flow, tilts = waves(wind, rng.uniform(0, 2 * math.pi), rng)
             for k in range(0, steps, 4096):
-                slopes[k : k + 4096] += (tilts @ flow.blown(times[k : k + 4096])).real
+                slopes[k : k + 4096] += np.real(np.matmul(tilts, flow.blown(times[k : k + 4096])))
         return (scale * slopes)[:, None]
 
     return series
