@@ -147,8 +147,12 @@ def estimate(exposures: Exposures | Series | str | Path, estimator: str) -> list
     return [result for _, (result,) in driver.steps(series)]
 
 
-def smooth(exposures: Exposures | Series | str | Path, estimates: list[Estimate]) -> list[Estimate]:
-    """Rauch-Tung-Striebel smoother: estimates of `estimate`, each corrected by all later exposures. Offline only.
+def smooth(
+    exposures: Exposures | Series | str | Path, estimates: list[Estimate], lag: int | None = None
+) -> list[Estimate]:
+    """Estimates of `estimate`, each corrected by later exposures. Offline only.
+
+    It is the Rauch-Tung-Striebel smoother, or backward simulation for estimators that carry a Gaussian mixture.
 
     Parameters
     ----------
@@ -156,11 +160,13 @@ def smooth(exposures: Exposures | Series | str | Path, estimates: list[Estimate]
         The exposures that `estimate` was given.
     estimates:
         Its result for them.
+    lag:
+        Number of later exposures that correct each; None: all of them.
 
     Raises
     ------
     EstimatorError
-        The estimates are not those of the exposures.
+        The estimates are not those of the exposures, or the lag is negative.
     """
     from aolink.estimation import smooth as smooth_estimates
     from aolink.exposure import Exposures
@@ -168,4 +174,4 @@ def smooth(exposures: Exposures | Series | str | Path, estimates: list[Estimate]
     if isinstance(exposures, str | Path):
         exposures = read(exposures)
     series = exposures if isinstance(exposures, Exposures) else list(exposures.exposures())
-    return smooth_estimates(exposures.rig.plant, series, estimates)
+    return smooth_estimates(exposures.rig.plant, series, estimates, lag)

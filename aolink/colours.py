@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 import zlib
+from contextlib import suppress
 
+from aolink import estimation
 from aolink.errors import EstimatorError
-from aolink.estimation import estimator_row
+from aolink.estimation.looks import LOOKS, Look
 
 Colour = tuple[int, int, int]
 
@@ -15,11 +17,10 @@ _OTHERS: tuple[Colour, ...] = ((100, 220, 220), (220, 160, 240), (200, 220, 120)
 
 def estimator_colour(name: str) -> Colour:
     """Colour of an estimator; one that has options, or is not installed here, gets one by its name, always the same."""
-    try:
-        row = estimator_row(name)
-    except EstimatorError:
-        row = None
-    return row.colour if row is not None and row.name == name else _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
+    if ":" not in name:
+        with suppress(EstimatorError):
+            return _look(name).colour
+    return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
 
 
 def by_rank(names: list[str]) -> list[str]:
@@ -27,8 +28,13 @@ def by_rank(names: list[str]) -> list[str]:
 
     def rank(name: str) -> float:
         try:
-            return estimator_row(name).rank
+            return _look(name).rank
         except EstimatorError:
             return math.inf
 
     return sorted(names, key=lambda name: (rank(name), name))
+
+
+def _look(name: str) -> Look | estimation.EstimatorRow:
+    """Place and colour of an estimator, whose name may have its options; aolink's own need not be loaded for that."""
+    return LOOKS.get(name.partition(":")[0]) or estimation.estimator_row(name)

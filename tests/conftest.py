@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings
 
 from aolink.jobs.demo import simulated_rig
 from aolink.rig import Rig, load_rig, parse_rig
@@ -20,8 +21,11 @@ from tests.commands import TIMEOUT_S, CommandServer
 
 ESTIMATORS = ("open-loop", "o1", "o2", "o3")
 EXPOSURES = 12
-os.environ["COLUMNS"] = "500"
-"""Of a terminal that the tests' commands write to: a message is looked for as one line, however long its paths are."""
+settings.register_profile("aolink", deadline=None)  # a machine that is held up proves nothing
+settings.load_profile("aolink")
+for each, heard in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+    if signal.getsignal(each) == signal.SIG_IGN:  # as under nohup: the commands of the tests would inherit it
+        signal.signal(each, heard)
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,12 @@
 """The command line: parse, call, print; nothing else."""
 
-from __future__ import annotations
-
 import sys
-from importlib.metadata import version
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
+import aolink
 from aolink.cli import (  # noqa: F401  their commands
     calibration,
     exchange,
@@ -27,7 +25,7 @@ from aolink.signals import ending_the_command
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"aolink {version('aolink')}")
+        print(f"aolink {aolink.__version__}")
         raise typer.Exit
 
 

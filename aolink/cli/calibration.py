@@ -1,8 +1,7 @@
 """The command that measures a camera, or the interaction matrix of a mirror."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,8 +16,6 @@ from aolink.files import check_target, writing
 from aolink.signals import stop_after
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from aolink.rig import Rig
 
 
@@ -123,7 +120,7 @@ def calibrate(
 
 
 def _write_calibrated(
-    loaded: Rig, rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool
+    loaded: "Rig", rig: str, paths: Sequence[Path], output: Path, *, overwrite: bool, as_json: bool
 ) -> None:  # fmt: skip
     from aolink.cli.tables import rigs as tables
     from aolink.jobs.calibrate import calibrate_recordings, rig_text
@@ -140,7 +137,7 @@ def _write_calibrated(
 
 
 def _write_interaction(
-    loaded: Rig, paths: Sequence[Path], output: Path, *, hold_s: float, overwrite: bool, as_json: bool
+    loaded: "Rig", paths: Sequence[Path], output: Path, *, hold_s: float, overwrite: bool, as_json: bool
 ) -> None:  # fmt: skip
     import numpy as np
 

@@ -1,7 +1,5 @@
 """What the commands share: the consoles, common options, opening files."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys
@@ -69,7 +67,7 @@ def progress(what: str, total: int | None) -> Iterator[Callable[..., None]]:
         yield partial(tell, what)
 
 
-def load_checked(path_or_name: str) -> Rig:
+def load_checked(path_or_name: str) -> "Rig":
     """Load a rig file that something is about to run on: refuse what cannot work, print what is doubtful."""
     from aolink.jobs.check_rig import check_rig
     from aolink.rig import load_rig
@@ -84,8 +82,8 @@ def load_checked(path_or_name: str) -> Rig:
 
 
 def with_key(
-    rig: Rig, camera: str | None, mirror: str | None, key: Path | None
-) -> tuple[Rig, str | None, str | None]:  # fmt: skip
+    rig: "Rig", camera: str | None, mirror: str | None, key: Path | None
+) -> "tuple[Rig, str | None, str | None]":  # fmt: skip
     """The rig and the ports of a session whose packets --key signs: the ports are in the rig's table then."""
     if key is None:
         return rig, camera, mirror
@@ -94,7 +92,7 @@ def with_key(
     return signed(rig, camera, mirror, key), None, None
 
 
-def open_recording(file: str | Path | Url, *, check: bool = False, side: Sequence[Path | Url] = ()) -> Recording:
+def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequence[Path | Url]" = ()) -> "Recording":
     """Open a recording with its side files, and say so where it is not whole."""
     from aolink.recording.reader import Recording
 
@@ -126,7 +124,7 @@ def spot_of(sensor: object, lenslet: str) -> int:
     return int(found[0])
 
 
-def check_measured(file: Path | Url, scores: Mapping[str, Score]) -> None:
+def check_measured(file: "Path | Url", scores: "Mapping[str, Score]") -> None:
     """Raise EstimatorError if an estimator that takes measurements could not use a single exposure."""
     for name, score in scores.items():
         if score.nothing_measured:
@@ -138,7 +136,7 @@ def program() -> str:
     return "aolink" if shutil.which("aolink") else str(Path(sys.executable).with_name("aolink"))
 
 
-def get_ready(rig: Rig, estimators: Sequence[str]) -> None:
+def get_ready(rig: "Rig", estimators: Sequence[str]) -> None:
     """Compile the loops of these estimators before anything waits for them, and say so on a terminal."""
     from aolink.estimation import make_estimator
 

@@ -1,7 +1,5 @@
 """Commands that exchange recordings with other programs: export."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

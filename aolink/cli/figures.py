@@ -1,7 +1,5 @@
 """Commands that draw recordings on paper and on a page: plot, report."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -108,7 +106,7 @@ def report(
     stdout.print(f"written: {output}", markup=False)
 
 
-def _with_sides(files: list[str]) -> list[Recording]:
+def _with_sides(files: list[str]) -> "list[Recording]":
     """The recordings, each with its side files among the others. Raises RecordingError for one of no recording here."""
     from aolink.recording.reader import check_stands_alone
 

@@ -1,7 +1,5 @@
 """Commands that bring other people's data in: import, and the film options that `aolink rig --from` shares."""
 
-from __future__ import annotations
-
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -44,7 +42,7 @@ TopicOption = Annotated[
 
 def film_settings(
     rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
-) -> Settings:
+) -> "Settings":
     """The options of a command as settings. Raises ImportingError for a place that is none."""
     from aolink.importing.exposures import Settings
 

@@ -1,7 +1,5 @@
 """The command identify: recordings of blurred frames into a rig file with a model of what disturbs."""
 
-from __future__ import annotations
-
 import json
 from enum import StrEnum
 from pathlib import Path
@@ -95,7 +93,7 @@ def identify(
     stdout.print(f"wrote {output}", markup=False)
 
 
-def _as_json(found: Found) -> dict[str, Any]:
+def _as_json(found: "Found") -> dict[str, Any]:
     return {
         "output": found.output,
         "model": found.model.name,

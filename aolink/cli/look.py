@@ -1,9 +1,8 @@
 """Commands that show what a camera saw: view, slopes."""
 
-from __future__ import annotations
-
 import json
 import math
+import sys
 from bisect import bisect_left
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -67,6 +66,7 @@ def view(
     """
     import tempfile
 
+    sys.meta_path.insert(0, _WithoutPandas())
     from aolink import viewing
     from aolink.recording.remote import location, only_paths
 
@@ -111,11 +111,19 @@ def view(
             viewing.show(recording, look, progress=tell)
 
 
+class _WithoutPandas:
+    """Lets nobody load pandas: pyarrow would, for 0.3 s, to ask whether the first array that it makes is of pandas."""
+
+    def find_spec(self, name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError("looking at a recording needs no pandas", name=name)
+
+
 def _address(address: str) -> None:
     stdout.print(f"{address}\nCtrl-C stops it.")
 
 
-def _numbers(recording: Recording, exposure: int | None, start: float | None, end: float | None) -> range | None:
+def _numbers(recording: "Recording", exposure: int | None, start: float | None, end: float | None) -> range | None:
     """Which exposures are asked for; None for all. Raises ViewerError where there are none."""
     count = recording.n_frames
     if exposure is not None:
@@ -137,7 +145,7 @@ def _numbers(recording: Recording, exposure: int | None, start: float | None, en
     return numbers
 
 
-def _first_steps(recording: Recording) -> list[int]:
+def _first_steps(recording: "Recording") -> list[int]:
     """The fast steps at which the exposures begin, by the messages that tell of them."""
     from aolink.recording import topics
     from aolink.recording.schemas_pb2 import ExposureInfo

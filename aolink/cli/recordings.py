@@ -1,10 +1,9 @@
 """Commands on recordings: info, estimate, compare, recover, cut, merge."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
@@ -32,8 +31,6 @@ from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
-
     from aolink.estimation import Estimate
     from aolink.exposure import Exposure
     from aolink.jobs.batch import Done, Job, SideJob
@@ -170,7 +167,7 @@ def estimate(
     _estimate_many(todo, output, output / name, jobs, None, side=False, as_json=as_json)
 
 
-def batch_models(rig: str | None, settings: Sequence[str] | None) -> list[Model]:
+def batch_models(rig: str | None, settings: Sequence[str] | None) -> "list[Model]":
     """What --rig and --set ask for."""
     from aolink.jobs import batch
     from aolink.rig import load_rig
@@ -179,7 +176,7 @@ def batch_models(rig: str | None, settings: Sequence[str] | None) -> list[Model]
 
 
 def _estimate_many(
-    todo: Sequence[Job | SideJob], folder: Path, table: Path, workers: int, scheduler: str | None, *, side: bool,
+    todo: "Sequence[Job | SideJob]", folder: Path, table: Path, workers: int, scheduler: str | None, *, side: bool,
     as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import recordings as tables
@@ -224,7 +221,7 @@ def _estimate_many(
 _MOST_ROWS_SHOWN = 40
 
 
-def _told(each_done: Iterable[Done]) -> list[Done]:
+def _told(each_done: "Iterable[Done]") -> "list[Done]":
     """What jobs came to, with what went wrong printed as it comes."""
     done = []
     for each in each_done:
@@ -249,7 +246,7 @@ def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def _estimate_one(
-    file: str, model: Model, estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
+    file: str, model: "Model", estimator: Sequence[str] | None, output: Path | None, engine: Engine, *,
     only: bool, overwrite: bool, as_json: bool,
 ) -> None:  # fmt: skip
     from aolink.cli.tables import scores as tables
@@ -440,7 +437,7 @@ def merge(
     _print_edited(edited, as_json)
 
 
-def _print_edited(edited: Edited, as_json: bool) -> None:
+def _print_edited(edited: "Edited", as_json: bool) -> None:
     if as_json:
         print(json.dumps({**asdict(edited), "path": str(edited.path)}))
         return

@@ -1,7 +1,5 @@
 """Commands that take blur out of pictures: deblur."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

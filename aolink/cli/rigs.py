@@ -1,10 +1,9 @@
 """Commands that run with devices: rig, devices, record, replay, demo."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from enum import StrEnum
@@ -51,8 +50,6 @@ from aolink.files import check_target, writing
 from aolink.signals import Interrupted, StopRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     import numpy as np
     from numpy.typing import NDArray
 
@@ -178,7 +175,7 @@ def rig(
     stop.raise_if_asked()
 
 
-def _write_first_rig(path: Path, source: Path, topic: str | None, settings: Settings, overwrite: bool) -> None:
+def _write_first_rig(path: Path, source: Path, topic: str | None, settings: "Settings", overwrite: bool) -> None:
     from aolink.importing.first_rig import first_rig
     from aolink.importing.readers import open_film
 
@@ -191,7 +188,7 @@ def _write_first_rig(path: Path, source: Path, topic: str | None, settings: Sett
     stdout.print(f"{path}: written from {film.name}; read it, then: {program()} rig {path} --check", markup=False)
 
 
-def _print_scan(loaded: Rig, as_json: bool) -> None:
+def _print_scan(loaded: "Rig", as_json: bool) -> None:
     from aolink.cli.tables.rigs import exposure_scan as scan_table
     from aolink.estimation.exposure_scan import best, exposure_scan
 
@@ -204,7 +201,7 @@ def _print_scan(loaded: Rig, as_json: bool) -> None:
     stdout.print(f"least error of the path: timing.exposure_steps = {steps}, {steps * loaded.timing.fast_step_s:g} s")
 
 
-def _print_findings(loaded: Rig, as_json: bool) -> None:
+def _print_findings(loaded: "Rig", as_json: bool) -> None:
     from aolink.jobs.check_rig import check_devices, check_rig
 
     findings = [*check_devices(loaded), *check_rig(loaded)]
@@ -405,7 +402,7 @@ def record(
         raise typer.Exit(EstimatorError.exit_code)
 
 
-def _print_dry_run(found: DryRun, as_json: bool) -> None:
+def _print_dry_run(found: "DryRun", as_json: bool) -> None:
     for warning in found.warnings:
         warn(warning)
     if as_json:
@@ -418,7 +415,7 @@ def _print_dry_run(found: DryRun, as_json: bool) -> None:
     )
 
 
-def _print_session(report: Report, output: Path, as_json: bool) -> None:
+def _print_session(report: "Report", output: Path, as_json: bool) -> None:
     from aolink.cli.tables import sessions as tables
 
     for warning in report.warnings:
@@ -434,8 +431,8 @@ def _print_session(report: Report, output: Path, as_json: bool) -> None:
 
 
 def _live_view(
-    rig: Rig, estimators: Sequence[str], true_scene: NDArray[np.uint16] | None = None, *, shown: bool
-) -> AbstractContextManager[LiveView | None]:
+    rig: "Rig", estimators: Sequence[str], true_scene: "NDArray[np.uint16] | None" = None, *, shown: bool
+) -> "AbstractContextManager[LiveView | None]":
     """What shows exposures in the viewer, or None."""
     if not shown:
         return nullcontext()
@@ -530,7 +527,7 @@ def replay(
     check_measured(file, scores)
 
 
-def _replay_control(recording: Recording, controller: str, estimator: str, *, as_json: bool) -> None:
+def _replay_control(recording: "Recording", controller: str, estimator: str, *, as_json: bool) -> None:
     from aolink.cli.tables import control as tables
     from aolink.jobs.closed_loop import replayed
 
@@ -543,15 +540,15 @@ def _replay_control(recording: Recording, controller: str, estimator: str, *, as
         stdout.print(tables.replayed(result))
 
 
-def _are_driven(rig: Rig, camera: str | None, mirror: str | None) -> bool:
+def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
     """Whether a port or the rig file says what drives each of the devices."""
     return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
 
 
 def _replay_to_rig(
-    recording: Recording,
+    recording: "Recording",
     names: list[str],
-    rig: Rig,
+    rig: "Rig",
     camera: str | None,
     mirror: str | None,
     output: Path,

@@ -12,7 +12,7 @@ import numpy as np
 
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.model.exposure_model import path_from_coefficients
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import FloatArray, Indices
 from aolink.numerics.covariance import psd_root
 from aolink.plain import plain_data
 
@@ -52,6 +52,43 @@ class AlignmentError:
         """A covariance (axes, n, n) of the first n of these numbers, with this error in it."""
         change = getattr(self, name)[:, : covariance.shape[-1]]
         return np.asarray(covariance + change[:, :, None] * change[:, None, :])
+
+
+@dataclass(frozen=True, eq=False)
+class WanderingFrequency:
+    """The plant's frequency, in the frequency of its matrices."""
+
+    mean: FloatArray
+    """(axes,)"""
+    sd: FloatArray
+    """(axes,)"""
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """The posterior of an exposure as a Gaussian mixture for each axis, of few coefficients t: z = expand t + a rest.
+
+    It has what one mean and one covariance do not tell: that a path may have run one way or the other.
+    """
+
+    parts: Sequence[tuple[Indices, FloatArray, FloatArray, FloatArray]]
+    """Some of the axes, their log-weights (axes, components), means (axes, components, n) and covariances (axes,
+    components, n, n). Of an axis that is in several parts the last one counts."""
+    expand: FloatArray
+    """(n_coefficients, n)"""
+    left_out: FloatArray
+    """Covariance of the rest, (n_coefficients, n_coefficients)."""
+    unseen: tuple[FloatArray, FloatArray]
+    """Mean (axes, n_states) and covariance (axes, n_states, n_states) of the start state, predicted from the inputs
+    without any measurement."""
+
+    def of(self, axis: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Log-weights (components,), means and covariances of one axis."""
+        for axes, *arrays in reversed(self.parts):
+            if len(row := np.flatnonzero(axes == axis)):
+                log_weight, mean, covariance = (each[row[0]] for each in arrays)
+                return log_weight, mean, covariance
+        raise KeyError(axis)
 
 
 @plain_data
@@ -98,6 +135,10 @@ class Estimate:
     """
     alignment: AlignmentError | None = field(default=None, compare=False)
     """Where camera and mirror count by different clocks."""
+    components: Components | None = field(default=None, compare=False, repr=False)
+    """Where the estimator carries a mixture; recordings do not have them. `smooth` uses them."""
+    frequency: WanderingFrequency | None = field(default=None, compare=False)
+    """Where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have it."""
 
     @property
     def path(self) -> FloatArray:

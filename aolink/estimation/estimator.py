@@ -36,9 +36,16 @@ class Estimator:
         self.several: NDArray[np.bool_] | None = None
         """Axes whose last posterior has several modes (the blur has more than one reading), (axes,); None if the filter
         does not look for modes."""
+        self.posterior: Posterior | None = None
+        """The filter's last posterior, of an exposure that it took by itself."""
         self._next_step: int | None = None
         self._last_input = np.zeros(rig.n_inputs)
         self._considering: _Considering | None = None
+
+    @property
+    def shared(self) -> list[object]:
+        """What copies of it have in common."""
+        return [self.rig, self.rig.plant, self.rig.sensor]
 
     def step(self, exposure: Exposure) -> Estimate:
         """The estimate of an exposure, from its frame and all earlier ones."""
@@ -125,6 +132,7 @@ class Estimator:
         taken, remark = measured
         posterior = self.filter.step(model, batch.response_to(k), taken)
         self.several = posterior.several
+        self.posterior = posterior
         reasons = [*([remark] if remark else []), *reasons, *_status_reasons(posterior)]
         coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
         return Estimate(
@@ -145,6 +153,7 @@ class Estimator:
             innovation=posterior.innovation,
             innovation_covariance=posterior.innovation_covariance,
             nis=posterior.nis,
+            components=posterior.components,
         )
 
     def _bridge(self, exposure: Exposure) -> list[str]:
@@ -172,7 +181,7 @@ class _Considering:
         rig = self._rig = estimator.rig
         step_ns = rig.timing.fast_step_ns
         self._share = share_of_shift(first, step_ns)
-        shared = {id(part): part for part in (rig, rig.plant, rig.sensor)}
+        shared = {id(part): part for part in estimator.shared}
         self._copies = [
             (copy.deepcopy(estimator, dict(shared)), Shifted(share, step_ns)) for share in (self._share, -self._share)
         ]

@@ -30,6 +30,7 @@ from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
 from aolink.estimation.kalman.path_moments import Observation, PathMoments, SecondOrderMoments
 from aolink.estimation.kalman.predict import added_noise
 from aolink.estimation.kalman.steady_gain import steady_gain
+from aolink.estimation.looks import LOOKS
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.moments.joint_moments import JointMoments
 from aolink.estimation.moments.spots import WindowedSpots
@@ -67,6 +68,8 @@ class EstimatorRow:
     """Why it cannot work on a rig, and what to use instead; None where it can."""
     engines: tuple[Engine, ...] = ("aolink",)
     """Engines that it can run on."""
+    wanders: bool = False
+    """Whether it follows a plant with ``plant.wandering``; it has to model the noise inside an exposure."""
     in_demo: Callable[[Rig], bool] = lambda rig: True
     """Whether it is fast enough on a rig for `aolink demo`."""
 
@@ -131,7 +134,15 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
             f"engine {chosen.engine!r} runs {able} on a plant of one axis, this is {name} with"
             f" plant.axes = {rig.plant.axes}: use engine 'aolink'"
         )
-    return Estimator(rig, name, row.build(rig, chosen))
+
+    def made(rig: Rig) -> Estimator:
+        return Estimator(rig, name, row.build(rig, chosen))
+
+    if rig.plant.wandering is None or not row.wanders:
+        return made(rig)
+    from aolink.estimation.wandering import WanderingEstimator  # its imports take long
+
+    return WanderingEstimator(rig, made)
 
 
 def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None) -> BlurFilter:
@@ -281,26 +292,21 @@ def _is_line(rig: Rig) -> bool:
     return isinstance(rig.sensor, Sensor)
 
 
+def _row(name: str, **rest: Any) -> EstimatorRow:
+    return EstimatorRow(name=name, **LOOKS[name]._asdict(), **rest)
+
+
 _PAPER_ENGINES: tuple[Engine, ...] = ("aolink", "filterpy")
 _OURS = {
     row.name: row
     for row in (
-        EstimatorRow(name="open-loop", rank=0, colour=(204, 121, 167), build=_open_loop),
-        EstimatorRow(name="o1", rank=10, colour=(86, 180, 233), build=_paper(1), engines=_PAPER_ENGINES),
-        EstimatorRow(name="o2", rank=20, colour=(120, 130, 255), build=_paper(2), engines=_PAPER_ENGINES),
-        EstimatorRow(name="o3", rank=30, colour=(240, 110, 50), build=_paper(1, 2), engines=_PAPER_ENGINES),
-        EstimatorRow(name="moments", rank=40, colour=(0, 175, 125), build=_moments, refusal=_moments_refusal),
-        EstimatorRow(
-            name="profile", rank=50, colour=(140, 210, 80), build=_profile, refusal=_pixels_refusal("profile"),
-            in_demo=_is_line,
-        ),
-        EstimatorRow(
-            name="mixture", rank=60, colour=(240, 80, 140), build=_mixture, refusal=_pixels_refusal("mixture"),
-            in_demo=_is_line,
-        ),
-        EstimatorRow(
-            name="sampled", rank=70, colour=(190, 130, 80), build=_sampled, refusal=_pixels_refusal("sampled"),
-            in_demo=lambda rig: False,
-        ),
+        _row("open-loop", build=_open_loop),
+        _row("o1", build=_paper(1), engines=_PAPER_ENGINES),
+        _row("o2", build=_paper(2), engines=_PAPER_ENGINES),
+        _row("o3", build=_paper(1, 2), engines=_PAPER_ENGINES),
+        _row("moments", build=_moments, refusal=_moments_refusal, wanders=True),
+        _row("profile", build=_profile, refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_line),
+        _row("mixture", build=_mixture, refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_line),
+        _row("sampled", build=_sampled, refusal=_pixels_refusal("sampled"), wanders=True, in_demo=lambda rig: False),
     )
-}  # fmt: skip
+}

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
 from aolink.estimation.estimate import Estimate, Status
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.chi_square import chi_square_quantile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,5 +209,5 @@ def _normalised(error: FloatArray, covariance: FloatArray) -> FloatArray:
 def _consistency(values: _Sum, degrees: int) -> Consistency:
     if not values.count:
         return Consistency(mean=math.nan, low=math.nan, high=math.nan)
-    low, high = (2 * float(special.gammaincinv(degrees / 2, p)) / values.count for p in (0.025, 0.975))
+    low, high = (chi_square_quantile(share, degrees) / values.count for share in (0.025, 0.975))
     return Consistency(mean=values.mean, low=low, high=high)

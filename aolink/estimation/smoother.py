@@ -1,4 +1,4 @@
-"""The Rauch-Tung-Striebel smoother over a whole recording: later exposures correct the estimates of earlier ones.
+"""The smoother: later exposures correct the estimates of earlier ones.
 
 An exposure's coefficients and its end state are jointly Gaussian, cov(z, end) = P E', E the rows of the end state, and
 between exposures the state goes on by the plant's transition A_g over the gap. So Rauch, Tung and Striebel's
@@ -9,6 +9,9 @@ and all that is known of it N(x+, P+),
 
 Rauch, Tung, Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA J. 3 (1965), (3.30) to (3.32).
 The posteriors are taken as the estimator gave them: where it approximated, this does as well.
+
+Estimators that carry a Gaussian mixture give its components with an estimate. Where all estimates have them, which of
+them later exposures speak for is found by backward simulation (`aolink.estimation.pixels.backward`).
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import numpy as np
 
 from aolink.errors import EstimatorError
 from aolink.estimation.estimate import AlignmentError, Estimate, Status
+from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import over_steps
 from aolink.exposure import Exposure
 from aolink.numerics import batched
@@ -28,8 +32,10 @@ from aolink.plant.lifting import lift
 from aolink.rig import Plant
 
 
-def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
-    """Estimates of one estimator, each corrected by all later exposures.
+def smooth(
+    plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate], lag: int | None = None
+) -> list[Estimate]:
+    """Estimates of one estimator, each corrected by later exposures.
 
     Parameters
     ----------
@@ -37,6 +43,8 @@ def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Esti
         The plant of the rig that they are from.
     exposures, estimates:
         One estimate for each exposure, in the order of time.
+    lag:
+        Number of later exposures that correct each (fixed lag); None: all of them (fixed interval).
 
     Returns
     -------
@@ -46,13 +54,25 @@ def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Esti
     Raises
     ------
     EstimatorError
-        The estimates are not those of the exposures.
+        The estimates are not those of the exposures, or the lag is negative.
     """
     if [e.frame_id for e in estimates] != [e.frame_id for e in exposures]:
         raise EstimatorError(
             f"{len(estimates)} estimates for {len(exposures)} exposures, or for other frames of the same number:"
             " give one for each, in their order"
         )
+    if lag is None:
+        return _backward(plant, exposures, estimates)
+    if lag < 0:
+        raise EstimatorError(f"lag = {lag}: give the number of later exposures, 0 or more, or None for all")
+    windows = (slice(k, k + lag + 1) for k in range(len(estimates)))
+    return [_backward(plant, exposures[some], estimates[some])[0] for some in windows]
+
+
+def _backward(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]) -> list[Estimate]:
+    """Each estimate corrected by all later ones of the series."""
+    if estimates and all(each.components is not None for each in estimates):
+        return _through_mixtures(plant, exposures, estimates)
     smoothed: list[Estimate] = []
     for k in reversed(range(len(estimates))):
         estimate = estimates[k]
@@ -60,6 +80,34 @@ def smooth(plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Esti
             estimate = _corrected(plant, exposures[k], estimate, exposures[k + 1], smoothed[-1])
         smoothed.append(estimate)
     return smoothed[::-1]
+
+
+def _through_mixtures(
+    plant: Plant, exposures: Sequence[Exposure], estimates: Sequence[Estimate]
+) -> list[Estimate]:  # fmt: skip
+    """The same by backward simulation, for estimates with components."""
+    from aolink.estimation.pixels.backward import Next, Smoothed, smoothed  # its imports take long
+
+    done: list[Estimate] = []
+    later: Smoothed | None = None
+    after: Next | None = None
+    for k in reversed(range(len(estimates))):
+        estimate, components = estimates[k], estimates[k].components
+        assert components is not None
+        if later is not None:
+            following = estimates[k + 1].components
+            assert following is not None
+            gap = _gap(plant, exposures[k], exposures[k + 1])
+            after = Next(*gap, Gaussian(*following.unseen), later.draws)
+        later = smoothed(estimate, components, after)
+        if after is not None:
+            (z, P), n = (later.joint.mean, later.joint.covariance), plant.n_states
+            estimate = _replaced(
+                estimate, done[-1], after.transition, (z[:, :-n], P[:, :-n, :-n], later.gain[:, :-n]),
+                (z[:, -n:], P[:, -n:, -n:], later.gain[:, -n:]),
+            )  # fmt: skip
+        done.append(estimate)
+    return done[::-1]
 
 
 def _corrected(
@@ -91,6 +139,16 @@ def _corrected(
     end_gain = batched.matmul(batched.matmul(P_end, np.broadcast_to(transition.T, P_end.shape)), inverse)
     z, P = corrected(z, P, gain)
     end, P_end = corrected(end, P_end, end_gain)
+    return _replaced(estimate, later, transition, (z, P, gain), (end, P_end, end_gain))
+
+
+def _replaced(
+    estimate: Estimate, later: Estimate, transition: FloatArray,
+    coefficients: tuple[FloatArray, FloatArray, FloatArray], end_state: tuple[FloatArray, FloatArray, FloatArray],
+) -> Estimate:  # fmt: skip
+    """The estimate with another mean and covariance of its coefficients and its end state, and their gains."""
+    (z, P, gain), (end, P_end, end_gain) = coefficients, end_state
+    n, alignment = end.shape[1], estimate.alignment
     P_start = P[:, :n, :n]
     if alignment is not None and later.alignment is not None:
         moved = later.alignment.coefficients[:, :n] - batched.matvec(transition, alignment.end_state)
@@ -103,7 +161,7 @@ def _corrected(
         P_start, P_end = alignment.added_to(P_start, "coefficients"), alignment.added_to(P_end, "end_state")
     return replace(
         estimate, start_state=z[:, :n], start_covariance=P_start, end_state=end, end_covariance=P_end, coefficients=z,
-        coefficient_covariance=P, alignment=alignment,
+        coefficient_covariance=P, alignment=alignment, components=None,
     )  # fmt: skip
 
 

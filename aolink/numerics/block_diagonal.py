@@ -5,20 +5,31 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from aolink.numerics.arrays import FloatArray, Indices
+
+_MANY = 10
+"""States of which a stationary covariance is not found by solving linear equations for its entries."""
 
 
 def components(*matrices: FloatArray) -> list[Indices]:
     """Connected components: the states that square matrices (n, n) couple, for each block of all of them."""
     linked = np.any([matrix != 0 for matrix in matrices], axis=0)
-    count, of_state = connected_components(csr_array(linked), directed=False)
-    order = np.argsort(of_state, kind="stable")
-    return np.split(order, np.searchsorted(of_state[order], np.arange(1, count)))
+    linked |= linked.T
+    parts: list[Indices] = []
+    seen = np.zeros(len(linked), dtype=bool)
+    for state in range(len(linked)):
+        if seen[state]:
+            continue
+        part, front = np.zeros_like(seen), np.array([state])
+        while len(front):
+            part[front] = True
+            front = np.flatnonzero(linked[front].any(axis=0) & ~part)
+        seen |= part
+        parts.append(np.flatnonzero(part))
+    return parts
 
 
 def blockwise(
@@ -59,10 +70,18 @@ def alike(A: FloatArray, *columns: FloatArray) -> Indices | None:
 
 
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """P with P = A P A' + Q (discrete Lyapunov equation) for a stable A, (n, n)."""
+    """P with P = A P A' + Q (discrete Lyapunov equation) for a stable A, (n, n).
+
+    Of a few states as n^2 linear equations, (I - A (x) A) vec P = vec Q, as SciPy does it for them.
+    """
 
     def solved(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, ...]:
-        return (np.asarray(linalg.solve_discrete_lyapunov(A, Q), dtype=np.float64),)
+        n = len(A)
+        if n < _MANY:
+            P = np.linalg.solve(np.eye(n * n) - np.kron(A, A), Q.ravel()).reshape(n, n)
+        else:
+            P = scipy.linalg.solve_discrete_lyapunov(A, Q)
+        return (np.asarray(P, dtype=np.float64),)
 
     return blockwise(solved, (A, Q), components(A, Q))[0]
 

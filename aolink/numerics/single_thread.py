@@ -12,8 +12,7 @@ from threading import RLock
 from typing import Any
 
 import numpy as np
-from scipy.linalg import lapack
-from scipy.sparse import csr_array
+import scipy
 from threadpoolctl import ThreadpoolController
 
 from aolink.numerics.arrays import FloatArray
@@ -73,13 +72,13 @@ def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
     Rows of ``p`` at its end that are those of the identity cost next to nothing.
     """
     if np.count_nonzero(a) <= _SPARSE * a.size:
-        entries = csr_array(a)
+        entries = scipy.sparse.csr_array(a)
         return np.asarray(entries @ np.ascontiguousarray((entries @ p).T))
     touched = np.flatnonzero((p != np.eye(len(p))).any(axis=1))
     k = int(touched[-1]) + 1 if len(touched) else 0
     own, rest = a[:, :k], a[:, k:]
     few = np.count_nonzero(own, axis=0) <= _SPARSE * len(own)
-    entries, full = csr_array(own[:, few]), own[:, ~few]
+    entries, full = scipy.sparse.csr_array(own[:, few]), own[:, ~few]
     half = entries @ p[:k, :k][few] + full @ p[:k, :k][~few]
     return np.asarray((entries @ half[:, few].T).T + half[:, ~few] @ full.T + rest @ rest.T)
 
@@ -93,14 +92,14 @@ def inverse_root(a: FloatArray) -> FloatArray:
     numpy.linalg.LinAlgError
         It is not positive definite.
     """
-    W, _ = lapack.dtrtri(_root(a), lower=1, overwrite_c=1)
+    W, _ = scipy.linalg.lapack.dtrtri(_root(a), lower=1, overwrite_c=1)
     return np.asarray(W)
 
 
 @by_one_thread
 def inverse(a: FloatArray) -> FloatArray:
     """Inverse of a symmetric positive definite matrix, symmetric to the last bit; raises as `inverse_root`."""
-    lower, _ = lapack.dpotri(_root(a), lower=1, overwrite_c=1)
+    lower, _ = scipy.linalg.lapack.dpotri(_root(a), lower=1, overwrite_c=1)
     whole = lower + lower.T
     np.fill_diagonal(whole, np.diagonal(lower))
     return np.asarray(whole)
@@ -109,13 +108,13 @@ def inverse(a: FloatArray) -> FloatArray:
 @by_one_thread
 def solve(a: FloatArray, x: FloatArray) -> FloatArray:
     """a^-1 x of a symmetric positive definite matrix, (n,); raises as `inverse_root`."""
-    found, _ = lapack.dpotrs(_root(a), x, lower=1)
+    found, _ = scipy.linalg.lapack.dpotrs(_root(a), x, lower=1)
     return np.asarray(found)
 
 
 def _root(a: FloatArray) -> FloatArray:
     """L, zero above its diagonal, in Fortran's order."""
-    L, flaw = lapack.dpotrf(a.T, lower=1, clean=1)
+    L, flaw = scipy.linalg.lapack.dpotrf(a.T, lower=1, clean=1)
     if flaw:
         raise np.linalg.LinAlgError(f"not positive definite: the leading {flaw} rows have no root")
     return np.asarray(L)

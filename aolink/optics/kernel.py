@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import erf
+import scipy
 
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Kernel
@@ -39,7 +39,7 @@ def gaussian_below(
     """
     width = np.sqrt(2 * np.asarray(variance))[..., None]
     u = (edges - np.asarray(positions)[..., None]) / width
-    out = [erf(u) / 2]
+    out = [scipy.special.erf(u) / 2]
     if highest:
         bell = np.exp(-u * u) / (math.sqrt(math.pi) * width)
         out.append(-bell)

@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from aolink.numerics.arrays import FloatArray
 
@@ -115,7 +115,7 @@ def second_order(frequency_hz: float, damping: float, fast_step_s: float) -> tup
     A (2, 2) and B (2, 1) of the state (position, velocity times the fast step), exactly discretised.
     """
     omega = 2 * math.pi * frequency_hz * fast_step_s
-    A = np.asarray(linalg.expm(np.array([[0.0, 1.0], [-(omega**2), -2 * damping * omega]])))
+    A = np.asarray(scipy.linalg.expm(np.array([[0.0, 1.0], [-(omega**2), -2 * damping * omega]])))
     return A, (np.eye(2) - A)[:, :1]
 
 

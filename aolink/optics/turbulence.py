@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from aolink.numerics.arrays import FloatArray
@@ -91,8 +92,7 @@ def _spectrum(layer: Layer, k: FloatArray) -> FloatArray:
 
     0.0229 r0^(-5/3) (f^2 + L0^-2)^(-11/6) over cycles per metre, and (2 pi)^-2 of that over radians per metre.
     """
-    from scipy.special import gamma  # every rig file is read by this module, few of them have turbulence
-
+    gamma = scipy.special.gamma
     exact = gamma(11 / 6) ** 2 / (2 * math.pi ** (11 / 3)) * (24 / 5 * gamma(6 / 5)) ** (5 / 6)  # 0.0229
     cycles = k / (2 * math.pi)
     return np.asarray(

@@ -8,7 +8,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from aolink.colours import by_rank
 from aolink.errors import ExportError
@@ -18,6 +17,7 @@ from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
 from aolink.exporting.series import Series
 from aolink.exposure import Exposure
+from aolink.numerics.chi_square import chi_square_quantile
 from aolink.optics.camera import to_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
 from aolink.plotting.style import FloatArray, TimeUnit, extremes, hides_swings
@@ -308,8 +308,7 @@ def limits_of(line: Sensor, paths: Sequence[FloatArray]) -> tuple[float, float]:
 def nis_bounds(degrees_of_freedom: int) -> tuple[float, float]:
     """Between which a consistent estimator's NIS lies in `NIS_COVERAGE` of the exposures (two-sided)."""
     tail = (1 - NIS_COVERAGE) / 2
-    low, high = 2 * special.gammaincinv(degrees_of_freedom / 2, [tail, 1 - tail])  # of chi-square
-    return float(low), float(high)
+    return chi_square_quantile(tail, degrees_of_freedom), chi_square_quantile(1 - tail, degrees_of_freedom)
 
 
 def _rms(values: FloatArray) -> float:

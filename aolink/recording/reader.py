@@ -6,7 +6,7 @@ import hashlib
 import heapq
 import json
 from collections import deque
-from collections.abc import Collection, Container, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import count, islice
@@ -132,6 +132,7 @@ class Recording(Series):
         self.encodings: dict[str, str] = {}
         """Encoding of the messages by topic, where the file states it."""
         self._index: list[ChunkIndex] | None = None
+        self._index_digest: str | None = None
         self._left_out: frozenset[str] = frozenset()
         """Topics that side files have instead."""
         self._second_rig_text: str | None = None
@@ -189,10 +190,13 @@ class Recording(Series):
     def digest(self) -> str:
         """What side files know the recording by: SHA-256 of its index, which has the place and the length of all that
         is in it. Where there is no index, of what a scan found: rig, session, times and counts."""
-        with open_recording(self.path) as file:
-            summary = read_summary(file)
-        if summary is not None and summary.is_index:
-            return summary.digest
+        if self._index_digest is None:
+            with open_recording(self.path) as file:
+                summary = read_summary(file)
+            if summary is not None and summary.is_index:
+                self._index_digest = summary.digest
+        if self._index_digest is not None:
+            return self._index_digest
         facts = [self._rig_text, self.metadata.get("session"), self.start_ns, self.end_ns, sorted(self.counts.items())]
         return hashlib.sha256(json.dumps(facts).encode()).hexdigest()
 
@@ -500,6 +504,7 @@ class Recording(Series):
         held: dict[int, int] = {}
         """Number of messages by the channel's id."""
         if summary is not None and summary.is_index and (known := summary.statistics) is not None:
+            self._index_digest = summary.digest
             self._index, held = summary.chunks, dict(sorted(known.channel_message_counts.items()))
             self.start_ns, self.end_ns = known.message_start_time, known.message_end_time
             records = self._summarised(summary)
@@ -565,7 +570,7 @@ class Recording(Series):
                 if not self._channels.get(number, ("", ""))[1]:
                     self._channels[number] = (values.get("topic", ""), values.get("schema", ""))
 
-    def _records(self, channels: Container[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
+    def _records(self, channels: Collection[int], low: int, high: int, chunks: slice) -> Iterator[McapRecord]:
         """Records in the order of the file, at least all messages of some channels between two log times."""
         if self._index is None:
             for record, _ in self._scanned():
@@ -575,7 +580,7 @@ class Recording(Series):
             index
             for index in self._index[chunks]
             if not (index.message_end_time < low or index.message_start_time >= high)
-            and (not (held := index.message_index_offsets) or any(channel in channels for channel in held))
+            and (not (held := index.message_index_offsets) or not held.keys().isdisjoint(channels))
         ]
         budget = Budget(str(self.path), self.size)
         with open_recording(self.path, [(each.chunk_start_offset, each.chunk_length) for each in wanted]) as file:

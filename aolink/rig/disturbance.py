@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from aolink.errors import RigError
 from aolink.numerics.block_diagonal import stationary_covariance
@@ -89,7 +89,7 @@ def _sum(parts: Sequence[DisturbanceModel]) -> DisturbanceModel | None:
     if not parts:
         return None
     A, B_w, W, initial = (
-        np.asarray(linalg.block_diag(*(getattr(part, name) for part in parts)))
+        np.asarray(scipy.linalg.block_diag(*(getattr(part, name) for part in parts)))
         for name in ("A", "B_w", "process_noise", "initial_covariance")
     )
     C = np.hstack([part.C for part in parts])

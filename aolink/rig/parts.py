@@ -41,6 +41,16 @@ class UnmodelledSlopes:
         return self.sd**2 * share, self.sd**2 * (1 - share)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Wandering:
+    """How far and how fast the plant's frequencies drift from those of its matrices, all by the same factor."""
+
+    frequency: float
+    """Largest relative change, up or down."""
+    rate_per_minute: float
+    """Standard deviation of the relative change in a minute; it goes on as a random walk."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plant:
     """The fast-rate plant, x(k+1) = A x(k) + B u(k) + B_w w(k), theta(k) = C x(k)  (Mishra & Wen (1)).
@@ -66,6 +76,8 @@ class Plant:
     """Number of independent copies."""
     unmodelled: UnmodelledSlopes | None = None
     """What estimators expect of the outputs beside C x(k); None for nothing."""
+    wandering: Wandering | None = None
+    """Which drift of its frequencies estimators follow; None for none."""
     disturbance_states: int = 0
     """How many states, the last ones, are those of the disturbance's model, which no input reaches."""
 

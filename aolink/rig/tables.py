@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from dataclasses import asdict, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from aolink.errors import RigError
 from aolink.numerics.block_diagonal import stationary_covariance
@@ -25,6 +25,7 @@ from aolink.rig.parts import (
     Simulation,
     Timing,
     UnmodelledSlopes,
+    Wandering,
 )
 from aolink.rig.sensor_tables import read_grid
 from aolink.rig.toml_table import Table, shape_text
@@ -37,6 +38,8 @@ _MOST_INPUTS = 10_000
 # of all coefficients: for 512 it is 2 MB an exposure.
 _MOST_UNMODELLED = 512
 _MOST_FAULT_S = 60.0
+# Of a frequency: a plant that is so unlike its matrices wants to be identified.
+_MOST_WANDERING = 0.2
 
 
 def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing) -> Plant:
@@ -56,10 +59,11 @@ def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing)
     if (W < 0).any():
         raise RigError("plant.process_noise has a variance below zero")
     unmodelled = _read_unmodelled(table, len(model.C), timing)
+    wandering = table.read_any("wandering", _wandering)
     initial = stationary_covariance(model.A, model.B_w @ W @ model.B_w.T)
     return Plant(
         A=model.A, B=model.B, B_w=model.B_w, C=model.C, process_noise=W, initial_mean=np.zeros(len(model.A)),
-        initial_covariance=initial, axes=1, unmodelled=unmodelled,
+        initial_covariance=initial, axes=1, unmodelled=unmodelled, wandering=wandering,
     )  # fmt: skip
 
 
@@ -78,6 +82,13 @@ def _read_unmodelled(table: Table, n_outputs: int, timing: Timing) -> Unmodelled
 def _unmodelled(table: Table, fast_step_s: float) -> UnmodelledSlopes:
     correlation_s = table.number("correlation_s", above=0.0)
     return UnmodelledSlopes(sd=table.number("sd", above=0.0), correlation_steps=correlation_s / fast_step_s)
+
+
+def _wandering(table: Table) -> Wandering:
+    return Wandering(
+        frequency=table.number("frequency", above=0.0, high=_MOST_WANDERING),
+        rate_per_minute=table.number("rate_per_minute", above=0.0, high=_MOST_WANDERING),
+    )
 
 
 def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
@@ -107,9 +118,10 @@ def _plant_by_matrices(table: Table, timing: Timing) -> Plant:
         covariance = _covariance(table, "initial_covariance", n, "states x states")
     axes = table.integer("axes", 1, low=1, high=10_000)
     unmodelled = _read_unmodelled(table, len(C), timing)
+    wandering = table.read_any("wandering", _wandering)
     return Plant(
         A=A, B=B, B_w=B_w, C=C, process_noise=W, initial_mean=mean, initial_covariance=covariance, axes=axes,
-        unmodelled=unmodelled,
+        unmodelled=unmodelled, wandering=wandering,
     )  # fmt: skip
 
 
@@ -130,7 +142,7 @@ def with_disturbance(plant: Plant, model: DisturbanceModel) -> Plant:
 
 
 def _beside(first: FloatArray, second: FloatArray) -> FloatArray:
-    return np.asarray(linalg.block_diag(first, second))
+    return np.asarray(scipy.linalg.block_diag(first, second))
 
 
 def _covariance(table: Table, name: str, size: int, why: str) -> FloatArray:

@@ -4,9 +4,29 @@ Each topic has a function that turns a batch of plain data into Rerun entities o
 calls them with a whole recording, `LiveView` with one exposure after the other.
 """
 
-from aolink.viewing.live import LiveView, live_viewer, serve, show
-from aolink.viewing.save import Look, save_rrd
-from aolink.viewing.viewer import check_display, open_viewer, screenshot, serve_web
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from aolink.viewing.feed import serve, show
+    from aolink.viewing.live import LiveView, live_viewer
+    from aolink.viewing.look import Look
+    from aolink.viewing.process import check_display, open_viewer, serve_web
+    from aolink.viewing.save import save_rrd
+    from aolink.viewing.viewer import screenshot
+else:  # the type checker would believe in any name
+    from aolink.names import at_first_use
+
+    __getattr__ = at_first_use(
+        __name__,
+        {
+            "feed": "serve show",
+            "live": "LiveView live_viewer",
+            "look": "Look",
+            "process": "check_display open_viewer serve_web",
+            "save": "save_rrd",
+            "viewer": "screenshot",
+        },
+    )
 
 __all__ = [
     "LiveView",
@@ -20,3 +40,7 @@ __all__ = [
     "serve_web",
     "show",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -91,8 +91,8 @@ def log_drops(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) ->
 def log_link(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> None:
     """Health of each device's link: faults by cause, command round trip and traffic.
 
-    ``/link/faults/DEVICE`` and ``/link/faults/DEVICE/CAUSE`` (since the start), ``/link/round_trip/DEVICE`` (ms),
-    ``/link/received/DEVICE`` (kB/s).
+    ``/link/faults/DEVICE`` and, of causes that there were, ``/link/faults/DEVICE/CAUSE`` (since the start),
+    ``/link/round_trip/DEVICE`` (ms), ``/link/received/DEVICE`` (kB/s).
     """
     for d, (device, samples) in enumerate(_by_device(records).items()):
         host = np.array([r.log_time_ns for r in samples], dtype=np.int64)
@@ -103,6 +103,8 @@ def log_link(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) -> 
         )
         for i, field in enumerate(LINK_COUNTS):
             counts = [getattr(r.message, field) for r in samples]
+            if not any(counts):
+                continue
             style = Style(f"{device} {field.replace('_', ' ')}", series_colour(i), width=2.5 - d, steps=True)
             send_line(drawing, f"link/faults/{device}/{field}", times, counts, style)
         trip = np.array([r.message.round_trip_s for r in samples]) * 1e3

@@ -1,11 +1,9 @@
-"""A viewer that is fed: by a session as it goes on, exposure by exposure, or by a recording as it is read."""
+"""A viewer that a session feeds as it goes on, exposure by exposure."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
@@ -20,16 +18,11 @@ from aolink.rig import Rig
 from aolink.viewing import incidents, motion, scene
 from aolink.viewing.blueprint import Contents, blueprint
 from aolink.viewing.camera import HISTORY
-from aolink.viewing.save import APPLICATION, Look, identity, send_camera, sent_parts
+from aolink.viewing.feed import fed
+from aolink.viewing.process import has_display, window
+from aolink.viewing.save import send_camera
 from aolink.viewing.series import Chosen, Drawing
 from aolink.viewing.timebase import Timebase
-from aolink.viewing.viewer import Server, has_display, serving, window
-
-if TYPE_CHECKING:
-    from aolink.recording.reader import Recording
-
-_FLUSH_S = 60.0
-"""For what the viewer has not taken yet at the end."""
 
 
 class LiveView:
@@ -136,67 +129,3 @@ def live_viewer(
         raise ViewerError("there is no display for --view: record or replay without it, then `aolink view --web`")
     with window() as server, fed(server) as stream:
         yield LiveView(stream, rig, estimators, true_scene)
-
-
-@contextmanager
-def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.RecordingStream]:
-    """A stream into a viewer, which stays after the block until it is closed.
-
-    Raises `ViewerError` where the viewer takes nothing any more.
-    """
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-    stream.connect_grpc(server.data_address)
-    try:
-        yield stream
-        # Without a bound for it, a viewer that takes nothing would be waited for without end, and no signal heard.
-        flushing = threading.Thread(target=stream.flush, daemon=True)
-        flushing.start()
-        flushing.join(_FLUSH_S)
-        if flushing.is_alive() and server.process.poll() is None:
-            server.process.kill()
-            raise ViewerError(f"the viewer has taken nothing for {_FLUSH_S:g} s, and was ended")
-        server.process.wait()
-    finally:
-        stream.disconnect()
-
-
-def show(recording: Recording, look: Look | None = None, *, progress: Callable[[int], None] | None = None) -> None:
-    """Open a recording in the native viewer while it is read, and wait until the window is closed.
-
-    Parameters
-    ----------
-    look:
-        A part of it, another spot, or another recording beside it; by default all of it alone.
-    progress:
-        Is told how many exposures have been sent.
-
-    Raises
-    ------
-    ViewerError
-        There is no display, the viewer does not start, or the recording has nothing to show.
-    """
-    with window() as server:
-        _feed(server, recording, look or Look(), progress)
-
-
-def serve(
-    recording: Recording, look: Look | None = None, *, port: int | None = None,
-    on_ready: Callable[[str], None] | None = None, progress: Callable[[int], None] | None = None,
-) -> None:  # fmt: skip
-    """Serve a recording with the web viewer on this machine's loopback until interrupted, from when it is being read.
-
-    Parameters are those of `show` and of `serve_web`. Raises `ViewerError`.
-    """
-    with serving((), port) as server:
-        if on_ready is not None:
-            on_ready(server.address)
-        _feed(server, recording, look or Look(), progress)
-
-
-def _feed(server: Server, recording: Recording, look: Look, progress: Callable[[int], None] | None) -> None:
-    with fed(server, identity(recording, look)) as stream:
-        for done in sent_parts(stream, recording, look, at_once=True):
-            if server.process.poll() is not None:
-                return  # its window was closed
-            if progress:
-                progress(done)

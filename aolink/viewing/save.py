@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,10 +20,10 @@ from aolink.optics.sensor import SpotSensor
 from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
 from aolink.recording.reader import check_stands_alone
-from aolink.restoration import RestoredPictures
 from aolink.rig import Rig
 from aolink.viewing import camera, devices, incidents, motion, scene
 from aolink.viewing.blueprint import PATH_WINDOW, Contents, blueprint
+from aolink.viewing.look import APPLICATION, Look, identity
 from aolink.viewing.pupil import log_maps
 from aolink.viewing.rrd_file import new_rrd
 from aolink.viewing.series import POINTS, Chosen, Drawing
@@ -31,9 +31,8 @@ from aolink.viewing.timebase import Timebase
 
 if TYPE_CHECKING:
     from aolink.recording.reader import RecordedMessage, Recording
+    from aolink.restoration import RestoredPictures
 
-APPLICATION = "aolink"
-"""Rerun keeps a user's own layouts by this name."""
 COMPARED = "compared/"
 """Begins the names of what is beside the recording."""
 
@@ -43,18 +42,6 @@ _BYTES_IN_PART = 100e6
 """That its frames, and as many numbers of each estimator's paths, may take."""
 _BESIDE_NS = 1_000_000_000
 """How long before and after its exposures a part's messages may have come."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Look:
-    """What of a recording is shown, and how closely."""
-
-    exposures: range | None = None
-    """Numbers of the exposures, counted from 0; None for all. Of a few, paths are shown at every fast step."""
-    spot: int = 0
-    """Which of many spots has its lines, its profile and its pages."""
-    compared: Recording | None = None
-    """A recording that is shown beside it, from its own first exposure on."""
 
 
 def save_rrd(
@@ -90,15 +77,6 @@ def save_rrd(
             if progress:
                 progress(done)
     return path
-
-
-def identity(recording: Recording, look: Look) -> str:
-    """What Rerun knows a recording by, and this look at it."""
-    if look == Look():
-        return recording.digest
-    exposures, spot, other = look.exposures, look.spot, look.compared
-    part = f"{exposures.start}-{exposures.stop}" if exposures else "all"
-    return f"{recording.digest}/{part}/{spot}/{other.digest if other else ''}"
 
 
 def sent_parts(
@@ -264,6 +242,12 @@ class Sender:
         if any(each.spots is not None for each in restored):
             self._known.add(scene.RESTORED_SPOTS)
 
+    @cached_property
+    def _ends(self) -> tuple[Exposure, Exposure]:
+        """The first and the last exposure of a part of the recording."""
+        first = self._recording[self._numbers[0]]
+        return first, first if len(self._numbers) == 1 else self._recording[self._numbers[-1]]
+
     def _messages(self, wanted: Sequence[str]) -> Iterator[RecordedMessage]:
         """Messages of some topics: of a part of the recording those that belong to it."""
         recording = self._recording
@@ -273,7 +257,7 @@ class Sender:
         if self._look.exposures is None:
             yield from recording.messages(*there)
             return
-        first, last = (self._recording[self._numbers[k]] for k in (0, -1))
+        first, last = self._ends
         period = self._rig.timing.frame_period_steps * self._rig.timing.fast_step_ns
         low, high = first.host_start_ns - _BESIDE_NS, last.host_start_ns + period + _BESIDE_NS
         if high < recording.start_ns or low > recording.end_ns:  # the log has other times than its frames

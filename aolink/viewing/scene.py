@@ -6,6 +6,7 @@ All scenes are drawn alike: black is dark, white an intensity of one.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import rerun as rr
@@ -13,10 +14,12 @@ from numpy.typing import NDArray
 
 from aolink.exposure import Exposure
 from aolink.optics.scene import SceneSensor
-from aolink.restoration import RestoredPictures
 from aolink.viewing.palette import MISSING
 from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import Timebase
+
+if TYPE_CHECKING:
+    from aolink.restoration import RestoredPictures
 
 FloatArray = NDArray[np.float64]
 

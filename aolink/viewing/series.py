@@ -109,7 +109,7 @@ def send_line(
         names=[style.name + label for label in (labels or [""] * lines)],
         colors=[(*style.colour, each) for each in faint],
         widths=[style.width] * lines,
-        interpolation_mode="StepAfter" if style.steps else "Linear",
+        interpolation_mode="StepAfter" if style.steps else None,  # by itself a line is linear
     )
     drawing.log(path, look)
     drawing.send_columns(path, times, rr.Scalars.columns(scalars=columns))

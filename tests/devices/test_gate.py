@@ -152,7 +152,7 @@ def messages(draw: st.DrawFn) -> Message:
     return message
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(st.lists(st.tuples(messages(), st.booleans()), max_size=15))
 def test_any_stream_of_messages_is_taken_or_refused_in_words(hub: Hub, stream: list[tuple[Message, bool]]) -> None:
     host = Host(hub)

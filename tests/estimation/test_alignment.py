@@ -188,11 +188,12 @@ def test_what_an_alignment_does_is_what_its_shift_does(rig: Rig) -> None:
     assert np.abs(change).max() > 0.003
 
 
-def test_the_smoother_and_the_blur_carry_it_on(rig: Rig) -> None:
+@pytest.mark.parametrize("name", ["moments", "profile"])
+def test_the_smoother_and_the_blur_carry_it_on(rig: Rig, name: str) -> None:
     inside = []
     for seed in range(12):
         exposures = list(misaligned(rig, seed, 6))
-        estimator = make_estimator(rig, "moments")
+        estimator = make_estimator(rig, name)
         smoothed = smooth(rig.plant, exposures, [estimator.step(exposure) for exposure in exposures])
         for exposure, estimate in zip(exposures[1:], smoothed[1:], strict=True):
             inside.append((np.abs(estimate.path - truth_of(exposure).path) < 1.96 * estimate.path_sd).mean())

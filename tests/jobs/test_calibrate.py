@@ -342,7 +342,7 @@ def rig_texts(draw: st.DrawFn) -> str:
 
 @pytest.mark.long
 @given(text=rig_texts())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_only_the_values_change(text: str) -> None:
     rig = parse_rig(text)
     new = calibrated_text(text, rig, found(), ["dark dark.mcap sha256:00"])

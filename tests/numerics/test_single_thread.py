@@ -17,7 +17,7 @@ def random(*shape: int) -> np.ndarray:
     return np.random.default_rng(sum(shape)).standard_normal(shape)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(sizes, sizes, sizes)
 def test_products_are_those_of_whole_matrices(n: int, k: int, m: int) -> None:
     a, b = random(n, k), random(k, m)

@@ -35,7 +35,7 @@ def test_a_window_is_the_round_kernel_integrated_over_pixels_and_steps():
 
 
 @given(sigma=st.floats(0.03, 0.4), seed=st.integers(0, 1000), far=st.floats(0, 3))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_the_table_is_as_good_as_the_error_function(sigma, seed, far):
     """Wherever the spot is, off the window too."""
     kernel = Kernel(shape="gaussian", sigma=sigma)

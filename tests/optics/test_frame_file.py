@@ -43,7 +43,7 @@ def whole() -> bytes:
 
 
 @given(cut=st.integers(0, 2880 + 1199), flips=st.lists(st.integers(0, 479), max_size=6))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_a_damaged_file_is_an_error_or_a_picture_and_nothing_else(cut, flips):
     data = bytearray(whole())
     for place in flips:

@@ -32,7 +32,7 @@ def synthetic(pitch=18.3, turn=2.0, shape=(9, 11), missing=0.0, seed=0, noise=5.
 
 @given(pitch=st.floats(12, 24), turn=st.floats(-20, 20), missing=st.floats(0, 0.2), seed=st.integers(0, 99))
 @example(pitch=12, turn=0, missing=0.1875, seed=87)  # what is missing parts the spots in two groups
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_spots_are_found_and_numbered_whatever_is_missing(pitch, turn, missing, seed):
     frame, places, nodes = synthetic(pitch, turn, (7, 8), missing, seed)
     lattice = find_lattice(frame)
@@ -75,7 +75,7 @@ def check(lattice, kind, pitch, turn, nodes, places, most_missed=0.05):
     dtype=st.sampled_from(["uint8", "uint16", "float32", "float64"]),
     seed=st.integers(0, 2**32 - 1),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_lattices_of_any_kind_turn_and_pupil_are_found(
     kind, pitch, turn, width, pupil, missing, brightness, dtype, seed
 ):

@@ -167,7 +167,7 @@ def test_the_commands_write_their_files_and_say_what_is_wrong(aolink: Aolink, tm
         (("plot", source, "exposure", "-o", "x.jpg"), 12, "a figure is a .png, .svg, .pdf file"),
         (("plot", source, "moon", "-o", "x.png"), 2, "moon"),
         (("plot", source, "pupil", "-o", "x.png"), 12, "fewer than 4 lenslets"),
-        (("plot", source, "exposure", "--lenslet", "1,0", "-o", "x.png"), 2, "no light falls on it"),
+        (("plot", source, "exposure", "--lenslet", "1,0", "-o", "x.png"), 2, "the grid has 1 x 1 lenslets"),
         (("plot", source, "exposure", "--exposure", "99", "-o", "x.png"), 12, "there is no exposure 99"),
     ):
         failed = aolink(*arguments)

@@ -108,7 +108,7 @@ def differ(pairs: list[tuple[list[float], list[float]]], relative: float, absolu
     return [not found[f"{topics.ESTIMATE}{k}"].same for k in range(len(pairs))]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.tuples(numbers, numbers), min_size=1, max_size=20))
 @example([([1e308], [-1e308])])  # further apart than a double holds
 def test_numbers_differ_as_numpy_says(pairs: list[tuple[list[float], list[float]]]) -> None:

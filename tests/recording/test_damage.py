@@ -122,7 +122,7 @@ def test_flipped_bits_cost_no_more_than_their_chunks(
 
 
 @pytest.mark.long
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_garbage_anywhere_is_one_error_or_less_to_read(
     many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path, choice: st.DataObject

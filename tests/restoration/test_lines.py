@@ -152,7 +152,7 @@ def test_known_pixels_before_the_line(scanner: Scanner, count: int) -> None:
         assert abs(banded - dense).max() < 1e-10
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(st.floats(0, 1), min_size=1, max_size=8).filter(lambda c: sum(c) > 0.1),
     st.floats(0, 0.99),

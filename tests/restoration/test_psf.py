@@ -127,7 +127,7 @@ def test_no_displacement_stays_in_reach_of_a_path_far_away() -> None:
     assert np.flatnonzero(psf.values > 0.5).tolist() == [20]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(-math.pi / 2 + 0.01, math.pi / 2 - 0.01), st.floats(6, 25))
 def test_a_straight_line_is_found_at_any_angle(angle: float, length: float) -> None:
     path = np.linspace(0, length, 150) * np.array([[math.cos(angle)], [math.sin(angle)]])

@@ -39,7 +39,7 @@ def same(a: CameraFrame, b: CameraFrame) -> bool:
 
 
 @given(cuts=st.lists(st.integers(0, 300), max_size=12), start=st.integers(0, 50))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_frames_do_not_depend_on_how_the_steps_are_cut(cuts, start):
     rig = with_timing(RIG, 20, 33)
     u = rig.drive.inputs(0, 300, 1e-3)

@@ -134,6 +134,7 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
         "parking",
         "devices",
         "recording",
+        "start",
         "batches",
         "restoration",
         "moving_scene",

@@ -23,8 +23,9 @@ from aolink.colours import estimator_colour
 from aolink.errors import RendererError, ViewerError
 from aolink.viewing import open_viewer, screenshot, serve_web
 from aolink.viewing.palette import TRUTH
+from aolink.viewing.process import WEB_PORT, free_port
 from aolink.viewing.save import save_rrd
-from aolink.viewing.viewer import WEB_PORT, free_port, headless_viewer, settled_picture
+from aolink.viewing.viewer import headless_viewer, settled_picture
 from aolink.viewing.vulkan import has_vulkan
 from tests.viewing.stand_in import StandIn, as_recording
 

@@ -14,8 +14,8 @@ import pytest
 
 from aolink.colours import estimator_colour
 from aolink.viewing.palette import APPLIED, TRUTH
+from aolink.viewing.process import Server, serving
 from aolink.viewing.save import save_rrd
-from aolink.viewing.viewer import Server, serving
 from tests.needs import missing
 from tests.viewing import browser
 from tests.viewing.stand_in import StandIn, as_recording
@@ -68,6 +68,7 @@ def lacking(picture: browser.Picture, wanted: Sequence[Wanted]) -> list[Wanted]:
 def full(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     recording = StandIn(n=24, names=("o3", "open-loop"))
     with serving([str(save_rrd(as_recording(recording), tmp_path_factory.mktemp("web") / "full.rrd"))]) as server:
+        server.listen()
         yield server
 
 
@@ -89,6 +90,7 @@ def test_every_view_shows_its_colours_in_a_browser_and_nothing_is_wrong(full: Se
 def test_what_a_recording_lacks_has_no_colour_in_a_browser(tmp_path: Path) -> None:
     bare = StandIn(n=12, names=(), with_truth=False)
     with serving([str(save_rrd(as_recording(bare), tmp_path / "bare.rrd"))]) as server:
+        server.listen()
         picture, _ = asyncio.run(shown(server, [("bare", APPLIED)]))
     assert lacking(picture, [("bare", APPLIED)]) == []
     for colour in (TRUTH, estimator_colour("open-loop")):

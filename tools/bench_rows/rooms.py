@@ -18,6 +18,7 @@ ROWS = {
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes", "rrd_size", "view_first",
     ),
+    "start": ("command_start", "view_start"),
     "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "moving_scene": ("moving_scene",),
@@ -25,3 +26,11 @@ ROWS = {
     "identification": ("coverage",),
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
+
+LONG = frozenset(
+    {
+        "soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "moving_scene", "residual_slopes",
+        "coverage",
+    }
+)  # fmt: skip
+"""Those that take two minutes or more each, `soak` forty: they are measured where they are named, or with `--long`."""

@@ -40,7 +40,7 @@ enum {
     DAC_BITS = 16,     /* mirror.dac_bits */
     BLOCK_STEPS = 50,  /* mirror.block_steps: a report is as long as a block at most */
     QUEUE_STEPS = 400, /* mirror.queue_steps, its default: eight blocks */
-    HISTORY_STEPS = 1647 /* more than the watchdog's time, after which the host gives missing reports up */
+    HISTORY_STEPS = 3695 /* three and a half times the watchdog: an outage of twice its time is survived, what was held then is asked for */
 };
 #define WATCHDOG_NS 1000000000 /* mirror.watchdog_s, its default */
 

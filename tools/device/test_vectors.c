@@ -444,7 +444,7 @@ static void test_history(void)
     CHECK(what, n_answers == 1 && number(0, 1) == 1 && number(0, 2) == 15 && number(0, 3) == 5);
     ask_numbers(&mirror.line, APPLIED_QUERY, mirror.step, 10); /* it has not gone by */
     CHECK(what, n_answers == 0);
-    for (int i = 0; i < 40; i++) {
+    for (int i = 0; i < HISTORY_STEPS / 50 + 8; i++) {
         tick(50);
         ask_numbers(&mirror.line, CLOCK_QUERY, 1, 2);
     }

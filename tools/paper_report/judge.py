@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation import Estimate, make_estimator
+from aolink.estimation import Estimate, make_estimator, smooth
 from aolink.exposure import Exposure
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
@@ -44,6 +44,8 @@ class Size:
     limit_runs: int = 3
     """Runs, the first ones, for `sampled`."""
     particles: int = 2000
+    smoothed: bool = False
+    """Whether estimates are scored after all later exposures of their run have corrected them."""
 
     def runs_of(self, name: str) -> int:
         """Runs for an estimator."""
@@ -98,6 +100,8 @@ def judge(scene: Scene, names: Sequence[str], size: Size) -> Iterator[Row]:
         for exposure in some[1]:
             estimates.append(estimator.step(exposure))
             several.append(0.0 if estimator.several is None else float(estimator.several.mean()))
+        if size.smoothed:
+            estimates = smooth(some[0].plant, some[1], estimates)
         seconds = (time.process_time() - start) / (len(estimates) * runs)
         yield _row(
             scene.seed, name, some[1][size.skip :], estimates[size.skip :], runs, float(np.mean(several)), seconds

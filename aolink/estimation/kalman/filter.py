@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from aolink.estimation.estimate import Status
+from aolink.estimation.estimate import Components, Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
 from aolink.estimation.kalman import two_states
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
@@ -50,6 +50,11 @@ class Posterior:
     are not searched."""
     remark: str = ""
     """What the filter had to do on some axes, for the estimate's reason; otherwise empty."""
+    components: Components | None = None
+    """Where the posterior is a mixture."""
+    log_evidence: FloatArray | None = None
+    """Log-likelihood of what was measured, up to what is the same for all plants, (axes,), NaN where nothing was; None
+    where innovation and covariance say it."""
 
     @property
     def start(self) -> Gaussian:

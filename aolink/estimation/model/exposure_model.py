@@ -18,7 +18,7 @@ def exposure_model(plant: Plant, n_steps: int, offset: float = 0.0) -> ExposureM
     return _made_once(plant, n_steps, float(offset))
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _made_once(plant: Plant, n_steps: int, offset: float) -> ExposureModel:
     if offset:
         return exposure_model(plant, n_steps).starting(offset)

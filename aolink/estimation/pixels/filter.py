@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.estimation.compiled.modes import drop_repeats
-from aolink.estimation.estimate import Status
+from aolink.estimation.estimate import Components, Status
 from aolink.estimation.frames.frame_data import HALF, Needs, Profile, SpotWindows
 from aolink.estimation.kalman.filter import PATIENCE, Filter, Posterior, gate_status
 from aolink.estimation.kalman.gaussian import Gaussian
@@ -54,11 +54,15 @@ class Innovation:
 class MixtureUpdate:
     """The posterior after a frame."""
 
-    coefficients: Gaussian
+    posterior: GaussianMixture
     """The posterior of the reduced coefficients t."""
+    coefficients: Gaussian
+    """Its mean and covariance."""
     end: GaussianMixture
     """The posterior of the state at the exposure's end, without the response to the inputs."""
     innovation: Innovation
+    log_evidence: FloatArray
+    """Log-likelihood of the pixels by Laplace's method, (axes,)."""
     several: BoolArray
     """Whether the posterior has several modes (the blur has more than one reading), (axes,)."""
     poor: BoolArray
@@ -142,11 +146,14 @@ class MixtureFilter(Filter):
         axes = self.plant.axes
         reduced = self._updater.reduction(model, self.sensor)
         lost = self._missed >= PATIENCE
-        prior = _chosen(lost, single(self._unseen), self.prior)
+        unseen = self._unseen
+        prior = _chosen(lost, single(unseen), self.prior)
         status = np.full(axes, int(Status.INPUT_INVALID), dtype=np.int64)
         new = _spread([], np.zeros(0, dtype=np.intp), axes)
         several, poor = np.zeros(axes, dtype=bool), np.zeros(axes, dtype=bool)
+        log_evidence = np.full(axes, np.nan)
         done: list[MixtureUpdate] = []
+        components: list[tuple[Indices, FloatArray, FloatArray, FloatArray]] = []
         took = np.zeros(0, dtype=np.intp)
         if measured is not None:
             usable = np.arange(axes) if measured.usable is None else np.flatnonzero(measured.usable)
@@ -167,13 +174,19 @@ class MixtureFilter(Filter):
                 return replace(u, coefficients=reduced.coefficients(u.coefficients))
 
             done = in_threads(updated, parts)
+            components = [(p, *each.posterior.arrays) for p, each in zip(parts, done, strict=True)]
             new = _spread([each.innovation for each in done], seen, axes)
+            log_evidence[seen] = np.concatenate([log_evidence[:0], *(each.log_evidence for each in done)])
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
             status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
         if not np.array_equal(took, np.arange(axes)):
             coefficients = reduced.coefficients(reduced.prior(prior.gaussian))
             end = _moved(prior, model.transition, model.process_noise, response.end)
+            rest = np.setdiff1d(np.arange(axes), took)
+            before = prior.part(rest)
+            own = reduced.prior(Gaussian(before.mean, before.covariance))
+            components.append((rest, before.log_weight, own.mean, own.covariance))
         if len(took):
             most = max(each.end.mean.shape[1] for each in done)
             after = [np.concatenate(each) for each in zip(*(_arrays(d, most) for d in done), strict=True)]
@@ -192,6 +205,10 @@ class MixtureFilter(Filter):
         return Posterior(
             coefficients=coefficients, end=end.gaussian, status=status, innovation=new.value,
             innovation_covariance=new.covariance, nis=new.nis, several=several, remark=self._remark(poor, reduced),
+            log_evidence=log_evidence,
+            components=Components(
+                components, reduced.expand, reduced.left_out, (unseen.mean, unseen.covariance)
+            ),
         )  # fmt: skip
 
     def _remark(self, poor: BoolArray, reduced: Reduction) -> str:

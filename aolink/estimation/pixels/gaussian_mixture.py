@@ -28,6 +28,11 @@ class GaussianMixture:
     covariance: FloatArray
     """(axes, components, n, n)"""
 
+    @property
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Log-weights, means and covariances."""
+        return self.log_weight, self.mean, self.covariance
+
     def part(self, axes: slice | Indices) -> GaussianMixture:
         """The part of these axes."""
         return GaussianMixture(self.log_weight[axes], self.mean[axes], self.covariance[axes])

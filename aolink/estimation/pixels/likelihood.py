@@ -79,7 +79,7 @@ class Reduction:
         return Gaussian(batched.matvec(self.expand, t.mean), batched.symmetric(spread))
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LEFT_OUT) -> Reduction:
     """The reduction for a sensor, made once.
 
@@ -277,7 +277,7 @@ class PixelView:
         return self.read_noise + self.gain * np.maximum(f, 0.0)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _light_table(variance: float, pixel: float) -> FloatArray:
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 

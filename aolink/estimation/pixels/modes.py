@@ -24,7 +24,7 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
 from aolink.estimation.pixels.filter import Innovation
-from aolink.estimation.pixels.gaussian_mixture import cholesky, lower_inverse
+from aolink.estimation.pixels.gaussian_mixture import cholesky, log_sum, lower_inverse
 from aolink.estimation.pixels.levenberg_marquardt import (
     FIRST_DAMPING,
     FREE_DAMPING,
@@ -80,6 +80,11 @@ class Modes:
     def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """The five, in this order."""
         return self.mean, self.covariance, self.log_evidence, self.distance, self.objective
+
+    @property
+    def total_evidence(self) -> FloatArray:
+        """Log-evidence of all modes together, (axes,)."""
+        return log_sum(self.log_evidence, axis=1)
 
     @property
     def best(self) -> Indices:

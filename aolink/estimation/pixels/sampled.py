@@ -53,7 +53,9 @@ class TemperedUpdater:
         fit = stacked_axes([fitted(points, reduced.end_rows, _COMPONENTS, self.seed) for points in t])
         end = reduced.end(Gaussian(fit.mean, fit.covariance))
         carried = GaussianMixture(fit.log_weight, end.mean, end.covariance)
-        return MixtureUpdate(after, carried, new, has_several(modes), np.zeros(len(mean), dtype=bool))
+        return MixtureUpdate(
+            fit, after, carried, new, modes.total_evidence, has_several(modes), np.zeros(len(mean), dtype=bool)
+        )
 
     def sample(self, view: PixelView, prior: GaussianMixture, number: int) -> FloatArray:
         """Equally likely particles of the posterior, (axes, particles, n).

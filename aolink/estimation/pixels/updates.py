@@ -127,7 +127,7 @@ class ImportanceUpdater:
                 new = innovation(view, own, modes)
             after = after.replaced(few, fit)
         carried = after.mapped(reduced.end_rows, reduced.end_remainder).reduced(self.carried, self.free)
-        return MixtureUpdate(after.gaussian, carried, new, has_several(modes), poor)
+        return MixtureUpdate(after, after.gaussian, carried, new, modes.total_evidence, has_several(modes), poor)
 
 
 PROFILE = ImportanceUpdater(carried=3, free=0.1, share=0.25, points=600)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from aolink.devices.cameras.basler import BaslerCamera, discover, unwrapped
@@ -130,7 +130,6 @@ def test_no_camera_is_said_to_be_none(tmp_path: Path, monkeypatch: pytest.Monkey
         BaslerCamera(rig_of('driver = "basler"', tmp_path))
 
 
-@settings(deadline=None)  # a busy machine says nothing about it
 @given(st.integers(1, 65_535), st.lists(st.integers(0, 30_000), max_size=8))
 def test_block_ids_of_16_bits_count_on_after_they_wrap(first: int, steps: list[int]) -> None:
     """65535 is followed by 1. An id that comes again is that frame again."""

@@ -239,7 +239,7 @@ def test_a_session_says_once_that_its_exposures_are_hardly_aligned(rig_of: RigOf
         toml = rig_of(simulator).toml.replace('driver = "optotune"', 'driver = "optotune"\ndelay_sd_s = 0.03')
         report = record(parse_rig(toml), None, None, tmp_path / "a.mcap", exposures=3)
     (warning,) = [each for each in report.warnings if "of an exposure only" in each]
-    assert re.match(r"it is known to 0\.3 of an exposure only \(sd, frame 1\)", warning)
+    assert re.match(r"it is known to 0\.3\d? of an exposure only \(sd, frame 1\)", warning)
 
 
 def test_a_mirror_without_a_queue_is_poked_no_faster_than_its_rig_file_allows(rig_of: RigOf, tmp_path: Path) -> None:
@@ -261,7 +261,7 @@ def test_a_mirror_that_gets_too_hot_ends_the_session_parked(session: Session, tm
 
     class Overheating(OptotuneSimulator):
         def answer(self, request: bytes) -> bytes:
-            self.status = 4 * (len(self.held) > 30)
+            self.status = 4 * (len(self.held) > 5)
             return super().answer(request)
 
     what = r"says that the mirror is too hot \(STATUS 0x00000004\); the \d exposure.* saved in"
@@ -296,7 +296,7 @@ ON_THE_CIRCLE_RAD = math.atan(TAN_50 / math.sqrt(2))
 
 
 @example((ON_THE_CIRCLE_RAD, ON_THE_CIRCLE_RAD), (0.0, 0.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.tuples(ANGLE_RAD, ANGLE_RAD), st.tuples(ANGLE_RAD, ANGLE_RAD))
 def test_no_input_within_limits_that_were_accepted_is_clamped(
     one: tuple[float, float], other: tuple[float, float]

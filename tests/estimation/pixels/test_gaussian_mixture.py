@@ -43,7 +43,7 @@ def test_moments_are_those_of_samples():
     np.testing.assert_allclose(m.gaussian.covariance[0], np.cov(drawn.T), rtol=0.05, atol=0.1)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000), most=st.integers(1, 5), gone=st.booleans())
 def test_merging_keeps_weight_mean_and_covariance(seed, most, gone):
     m = mixture(seed)

@@ -1,0 +1,95 @@
+"""A viewer that a recording feeds while it is read.
+
+Rerun takes most of a second to load, and its viewer as long to start: the viewer is started first.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from aolink.errors import ViewerError
+from aolink.viewing.look import APPLICATION, Look, identity
+from aolink.viewing.process import Server, serving, window
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+    from aolink.recording.reader import Recording
+
+_FLUSH_S = 60.0
+"""For what the viewer has not taken yet at the end."""
+
+
+@contextmanager
+def fed(server: Server, recording_id: str | None = None) -> Iterator[rr.RecordingStream]:
+    """A stream into a viewer, which stays after the block until it is closed.
+
+    Raises `ViewerError` where the viewer takes nothing any more.
+    """
+    import rerun as rr  # while the viewer starts
+
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
+    server.listen()
+    stream.connect_grpc(server.data_address)
+    try:
+        yield stream
+        # Without a bound for it, a viewer that takes nothing would be waited for without end, and no signal heard.
+        flushing = threading.Thread(target=stream.flush, daemon=True)
+        flushing.start()
+        flushing.join(_FLUSH_S)
+        if flushing.is_alive() and server.process.poll() is None:
+            server.process.kill()
+            raise ViewerError(f"the viewer has taken nothing for {_FLUSH_S:g} s, and was ended")
+        server.process.wait()
+    finally:
+        stream.disconnect()
+
+
+def show(recording: Recording, look: Look | None = None, *, progress: Callable[[int], None] | None = None) -> None:
+    """Open a recording in the native viewer while it is read, and wait until the window is closed.
+
+    Parameters
+    ----------
+    look:
+        A part of it, another spot, or another recording beside it; by default all of it alone.
+    progress:
+        Is told how many exposures have been sent.
+
+    Raises
+    ------
+    ViewerError
+        There is no display, the viewer does not start, or the recording has nothing to show.
+    """
+    with window() as server:
+        _feed(server, recording, look or Look(), progress)
+
+
+def serve(
+    recording: Recording, look: Look | None = None, *, port: int | None = None,
+    on_ready: Callable[[str], None] | None = None, progress: Callable[[int], None] | None = None,
+) -> None:  # fmt: skip
+    """Serve a recording with the web viewer on this machine's loopback until interrupted, from when it is being read.
+
+    Parameters are those of `show` and of `serve_web`. Raises `ViewerError`.
+    """
+    with serving((), port) as server:
+        _feed(server, recording, look or Look(), progress, on_ready)
+
+
+def _feed(
+    server: Server, recording: Recording, look: Look, progress: Callable[[int], None] | None,
+    on_ready: Callable[[str], None] | None = None,
+) -> None:  # fmt: skip
+    from aolink.viewing.save import sent_parts  # and Rerun with it
+
+    with fed(server, identity(recording, look)) as stream:
+        if on_ready is not None:
+            on_ready(server.address)
+        for done in sent_parts(stream, recording, look, at_once=True):
+            if server.process.poll() is not None:
+                return  # its window was closed
+            if progress:
+                progress(done)

@@ -1,0 +1,247 @@
+"""Rerun's program as a process: its viewer on the screen, or the server of its web page.
+
+All of them listen on the loopback interface only (Rerun's own default is every interface), and none outlives
+the call that started it. Nothing here loads Rerun itself, which takes most of a second.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+from urllib.parse import quote
+
+import rerun_cli  # type: ignore[import-untyped] # it has only its program
+
+from aolink.errors import RendererError, ViewerError
+from aolink.viewing.vulkan import has_vulkan
+
+HOST = "127.0.0.1"
+WEB_PORT = 9090
+"""Port of the web viewer's page, where nothing else uses it."""
+POLL_S = 0.05
+
+_START_S = 30.0
+"""How long a viewer may take to answer; a software renderer on a busy machine needs a few seconds."""
+_STOP_S = 5.0
+"""How long it may take to end by itself."""
+_LAST_WORDS_S = 2.0
+"""How long a viewer that has failed may take to end."""
+_MAGIC = b"RRF"
+"""What every Rerun file begins with; the version of the format follows."""
+
+_NO_DRIVER = (
+    "this machine has no Vulkan driver, which the Rerun viewer needs to draw;"
+    " on Debian: apt-get install mesa-vulkan-drivers"
+)
+
+
+def has_display() -> bool:
+    """Whether a window can be opened."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def check_display() -> None:
+    """Raise `ViewerError` where a window cannot be opened."""
+    if not has_display():
+        raise ViewerError("there is no display: use `aolink view --web` for a browser, or --screenshot for a picture")
+
+
+def open_viewer(rrd_path: str | Path) -> None:
+    """Open the native viewer and wait until its window is closed. Raises `ViewerError` where there is no display."""
+    path = existing(rrd_path)
+    check_display()
+    with tempfile.TemporaryFile() as said, running_rerun([str(path), "--port", "auto"], said) as process:
+        if process.wait() != 0:
+            raise why_it_ended(said)
+
+
+def serve_web(
+    rrd_path: str | Path, port: int | None = None, *, on_ready: Callable[[str], None] | None = None
+) -> None:  # fmt: skip
+    """Serve a file with the web viewer on this machine's loopback until interrupted.
+
+    Parameters
+    ----------
+    port:
+        Of the page; by default `WEB_PORT`, or a free one where that is in use. The data goes over a second, free one.
+    on_ready:
+        Called once with the address to open.
+    """
+    with serving([str(existing(rrd_path))], port) as server:
+        server.listen()
+        if on_ready is not None:
+            on_ready(server.address)
+        server.wait()
+
+
+@dataclass(frozen=True)
+class Server:
+    """Rerun's program as it listens for data, and shows it."""
+
+    process: subprocess.Popen[bytes]
+    said: IO[bytes]
+    data_port: int
+    """Where data comes in and, for a web page, goes out."""
+    page_port: int | None = None
+    """Where the web page is."""
+
+    @property
+    def data_address(self) -> str:
+        return f"rerun+http://{HOST}:{self.data_port}/proxy"
+
+    @property
+    def address(self) -> str:
+        """Of the web page."""
+        return f"http://{HOST}:{self.page_port}/?url={quote(self.data_address, safe='')}"
+
+    def listen(self) -> None:
+        """Until it listens, which it does not yet when it has been started. Raises `ViewerError` if it never does."""
+        for port in (self.page_port, self.data_port):
+            if port is not None:
+                wait_for_server(port, self.process, self.said)
+
+    def wait(self) -> None:
+        """Until it ends. Raises `ViewerError` where nobody has ended it."""
+        if self.process.wait() != 0:
+            raise why_it_ended(self.said)
+
+
+@contextmanager
+def serving(files: Sequence[str] = (), port: int | None = None) -> Iterator[Server]:
+    """The web viewer's page on this machine's loopback, which shows files, or what comes to its data's address.
+
+    Raises `ViewerError` where the port that is asked for is in use.
+    """
+    if port is None:
+        port = WEB_PORT if is_free(WEB_PORT) else free_port()
+    elif not is_free(port):
+        raise ViewerError(f"port {port} is in use: stop what uses it or choose another one")
+    data_port = free_port()
+    options = [*files, "--serve-web", "--web-viewer-port", str(port), "--port", str(data_port)]
+    with tempfile.TemporaryFile() as said, running_rerun(options, said) as process:
+        yield Server(process, said, data_port, port)
+
+
+@contextmanager
+def window() -> Iterator[Server]:
+    """The native viewer, empty, on the screen. Raises `ViewerError` where there is none."""
+    check_display()
+    port = free_port()
+    with tempfile.TemporaryFile() as said, running_rerun(["--port", str(port)], said) as process:
+        yield Server(process, said, port)
+
+
+def free_port() -> int:
+    """A port on which nobody listens."""
+    with socket.socket() as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def running_rerun(options: Sequence[str], said: IO[bytes]) -> Iterator[subprocess.Popen[bytes]]:
+    """Rerun's program, ended with the block."""
+    # It leaves its own temporary files behind when it is ended.
+    with tempfile.TemporaryDirectory(prefix="aolink-", ignore_cleanup_errors=True) as temporary:
+        process = subprocess.Popen(
+            [str(_program()), "--bind", HOST, *options],
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            env={**os.environ, "NO_COLOR": "1", "TMPDIR": temporary},
+            start_new_session=True,  # Ctrl-C comes to us alone, and we end it
+            preexec_fn=_end_with_parent,
+        )
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _program() -> Path:
+    """The program itself: the `rerun` command is a wrapper whose child outlives it."""
+    folder = Path(rerun_cli.__file__).parent
+    for name in ("rerun", "Rerun.app/Contents/MacOS/Rerun"):
+        if (folder / name).is_file():
+            return folder / name
+    raise ViewerError("the Rerun viewer is missing: install rerun-sdk again")
+
+
+_LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None
+_PR_SET_PDEATHSIG = 1
+
+
+def _end_with_parent() -> None:
+    """In the child: end when the parent does, however that comes about. Linux only."""
+    if _LIBC is not None:
+        _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def wait_for(ready: Callable[[], bool], process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
+    deadline = time.monotonic() + _START_S
+    while not ready():
+        if process.poll() is not None:
+            raise why_it_ended(said)
+        if time.monotonic() > deadline:
+            raise ViewerError(f"Rerun did not answer within {_START_S:g} s")
+        time.sleep(POLL_S)
+
+
+def wait_for_server(port: int, process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
+    """Wait until a viewer listens. Raises `ViewerError` if it does not."""
+    wait_for(lambda: not is_free(port), process, said)
+
+
+def is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex((HOST, port)) != 0
+
+
+def existing(path: str | Path) -> Path:
+    path = Path(path)
+    if not path.is_file():
+        raise ViewerError(f"there is no file {path}: `aolink view RECORDING --save FILE.rrd` writes one")
+    try:
+        with path.open("rb") as file:
+            magic = file.read(len(_MAGIC))
+    except OSError as error:
+        raise ViewerError(f"cannot read {path}: {(error.strerror or str(error)).lower()}") from None
+    if magic != _MAGIC:
+        raise ViewerError(f"{path} is not a Rerun file: `aolink view RECORDING --save FILE.rrd` writes one")
+    return path.resolve()
+
+
+def ended(process: subprocess.Popen[bytes]) -> bool:
+    """Whether a viewer has ended, or does so now: one that fails writes where it failed before it ends."""
+    try:
+        process.wait(_LAST_WORDS_S)
+    except subprocess.TimeoutExpired:
+        return False
+    return True
+
+
+def why_it_ended(said: IO[bytes]) -> ViewerError:
+    """Why a viewer ended that nobody stopped: the machine's lack of a driver, or else Rerun's own first words."""
+    if sys.platform == "linux" and not has_vulkan():
+        return RendererError(_NO_DRIVER)
+    said.seek(0)
+    lines = [line.strip() for line in said.read().decode(errors="replace").splitlines() if line.strip()]
+    causes = [line for line in lines if "panicked at" in line or "ERROR" in line or line.startswith("Error")]
+    return ViewerError(f"Rerun ended: {(causes or lines)[0]}" if lines else "Rerun ended without saying why")

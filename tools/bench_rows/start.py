@@ -1,0 +1,95 @@
+"""What a command takes from its start on, imports and all: a process of its own each time.
+
+Its files are in the cache, and its modules compiled, as they are wherever a package is installed.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from bench_rows.recording import hour
+from bench_rows.row import Effort, Row, median_s, timed
+
+_RECORDING = Path(__file__).parents[2] / "recordings" / "section-vi.mcap"
+_FIRST_PART = b"32/"
+"""What the progress bar says when the first part of a long recording is with the viewer."""
+_COMMAND = (sys.executable, "-m", "aolink")
+
+
+@contextmanager
+def _compiled() -> Iterator[None]:
+    """The processes that are started here keep what they compile, and find it."""
+    before = dict(os.environ)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        os.environ["PYTHONPYCACHEPREFIX"] = folder
+        try:
+            yield
+        finally:
+            os.environ.clear()
+            os.environ.update(before)
+
+
+def _run(*command: str | Path) -> None:
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _row(what: str, command: Sequence[str | Path], peer: str, limit_s: float, effort: Effort) -> Row:
+    theirs = (sys.executable, "-c", peer)
+    with _compiled():
+        for each in (command, theirs):
+            _run(*each)
+        took, other = median_s(lambda: _run(*command), effort.of(9), lambda: _run(*theirs))
+    return Row(what, f"{took:.2f} s", f"limit {limit_s:g} s; `{peer}` {other:.2f} s", limit_s / took, 1.0)
+
+
+def command_start(effort: Effort) -> list[Row]:
+    """The package and the command alone."""
+    return [
+        _row("import aolink", (sys.executable, "-c", "import aolink"), "pass", 0.3, effort),
+        _row("aolink --help", (*_COMMAND, "--help"), "import typer, rich.console", 0.3, effort),
+    ]
+
+
+def view_start(effort: Effort) -> list[Row]:
+    """From the start of `aolink view` to the file of one exposure, and to the first part of an hour in a web viewer."""
+    peer = "import numpy, rerun"
+    with tempfile.TemporaryDirectory() as name:
+        saved = Path(name) / "one.rrd"
+        command = (*_COMMAND, "view", _RECORDING, "--exposure", "3", "--save", saved, "--overwrite")
+        one = _row("aolink view --exposure 3 --save, from its start", command, peer, 2.0, effort)
+    path = hour(effort)
+    with _compiled():
+        _until_first_part(path)
+        pairs = [
+            (_until_first_part(path), timed(lambda: _run(sys.executable, "-c", peer))) for _ in range(effort.of(5))
+        ]
+    ours, theirs = (statistics.median(each) for each in zip(*pairs, strict=True))
+    what = "aolink view of an hour, from its start until the first part is with the viewer"
+    return [one, Row(what, f"{ours:.2f} s", f"limit 2 s; `{peer}` {theirs:.2f} s", 2 / ours, 1.0)]
+
+
+def _until_first_part(path: Path) -> float:
+    """Time until the command, on a terminal, says that it has sent the first part, s."""
+    terminal, its = pty.openpty()
+    start = time.perf_counter()
+    with subprocess.Popen((*_COMMAND, "view", path, "--web"), stdout=its, stderr=its, stdin=its) as process:
+        os.close(its)
+        said = b""
+        try:
+            while _FIRST_PART not in said:
+                said += os.read(terminal, 4096)
+            return time.perf_counter() - start
+        finally:
+            process.terminate()
+            process.wait()
+            os.close(terminal)
