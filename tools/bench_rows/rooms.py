@@ -30,7 +30,7 @@ ROWS = {
 LONG = frozenset(
     {
         "soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "moving_scene", "residual_slopes",
-        "coverage",
+        "fall_back", "coverage",
     }
 )  # fmt: skip
 """Those that take two minutes or more each, `soak` forty: they are measured where they are named, or with `--long`."""
