@@ -22,7 +22,7 @@ ROWS = {
     "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "moving_scene": ("moving_scene",),
-    "loop": ("residual_slopes",),
+    "loop": ("residual_slopes", "fall_back"),
     "identification": ("coverage",),
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
@@ -30,7 +30,7 @@ ROWS = {
 LONG = frozenset(
     {
         "soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "moving_scene", "residual_slopes",
-        "coverage",
+        "fall_back", "coverage",
     }
 )  # fmt: skip
 """Those that take two minutes or more each, `soak` forty: they are measured where they are named, or with `--long`."""
