@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.rig import Rig
 
@@ -69,7 +70,8 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
             f"the plant moves the spot by {widths:.3g} sds of the kernel (sd), estimators were judged up to"
             f" {MOST_PATH_WIDTHS:g}: beyond, a blur is thin and long, and has more readings than they follow",
         )
-    count, fastest = _modes(rig)
+    count, swings = _modes(rig)
+    fastest = float(swings.max(initial=0.0))
     if count > MOST_MODES:
         yield (
             "plant.A",
@@ -89,9 +91,19 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
             f" were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
         )
 
+    if plant.wandering is not None:
+        between = swings[swings > 0] * timing.frame_period_steps / timing.exposure_steps
+        reach = 0.5 * plant.wandering.frequency * between
+        for each in between[np.abs(between - np.round(2 * between) / 2) < reach]:
+            yield (
+                "plant.wandering",
+                f"a mode of the plant swings {each:.3g} times from frame to frame, nearly a whole or half number: a"
+                " faster plant looks like a slower one there, and the frequency may be lost; leave the table out",
+            )
 
-def _modes(rig: Rig) -> tuple[int, float]:
-    """How many modes move the spot along one axis, an oscillation being one; and the fastest one's swings."""
+
+def _modes(rig: Rig) -> tuple[int, FloatArray]:
+    """How many modes move the spot along one axis, an oscillation being one; and the swings of each in an exposure."""
     plant = rig.plant
     values, vectors = np.linalg.eig(plant.A)
     share = np.ones((plant.n_outputs, len(values)))
@@ -104,4 +116,4 @@ def _modes(rig: Rig) -> tuple[int, float]:
         share = motion / np.maximum(variance, 1e-300)[:, None]
     seen = (values.imag >= 0) & (share > _LEAST_SHARE)
     swings = np.angle(values[seen.any(axis=0)]) / (2 * math.pi) * rig.timing.exposure_steps
-    return int(seen.sum(axis=1).max()), float(swings.max(initial=0.0))
+    return int(seen.sum(axis=1).max()), swings

@@ -33,6 +33,8 @@ _SOAK_S = 600
 _MOST_LATE = 1e-3
 _LATE = {1e-5: 0.0, 1e-4: _MOST_LATE}
 """Share of steps that may be late in real time, by bit error rate."""
+_QUEUE = "queue_steps = 4000\nwatchdog_s = 8"
+"""Of the simulated rig in real time: four seconds, for which a busy machine may hold a program up."""
 _TURN_S = 0.05
 _DEVICE = Path(__file__).parents[1] / "device"
 
@@ -228,7 +230,12 @@ def _soak(device: str, rate: float, seconds: int, seed: int, folder: Path) -> Ro
     from aolink.session import record
 
     rig, path = load_rig("section-vi"), folder / "a.mcap"
-    serve = simulated_rig("section-vi", "--real-time") if device == "simulated rig" else _reference_device(folder)
+    if device == "simulated rig":
+        file = folder / "rig.toml"
+        file.write_text(rig.toml.replace("[mirror]", f"[mirror]\n{_QUEUE}", 1))
+        rig, serve = load_rig(file), simulated_rig(file, "--real-time")
+    else:
+        serve = _reference_device(folder)
     with serve as ports:
         cables = [Cable(port, rate, seed + k) for k, port in enumerate(ports)]
         try:
@@ -255,7 +262,8 @@ def _soak(device: str, rate: float, seconds: int, seed: int, folder: Path) -> Ro
     whole = (report.frames_received - report.frames_incomplete) / (5 * seconds)
     goal, held_up_s = _LATE[rate], max(cable.held_up_s for cable in cables)
     return Row(
-        f"{device}, {seconds} s in real time at {rate:g}: steps late of {report.steps_commanded};"
+        f"{device} with a queue of {rig.mirror.queue_steps * rig.timing.fast_step_s:g} s, {seconds} s in real time at"
+        f" {rate:g}: steps late of {report.steps_commanded};"
         f" {100 * whole:.2f} % of frames whole, {report.blocks_retransmitted} blocks sent again, nothing wrong;"
         f" held up by the machine for {1e3 * held_up_s:.0f} ms at most",
         f"{report.steps_late}, {100 * late:.3f} %", f"goal {100 * goal:g} %", 1.0 if late <= goal else goal / late, 1.0,
