@@ -242,6 +242,11 @@ class InputHistory:
             del blocks[0]
         return True
 
+    @property
+    def first_commanded(self) -> int | None:
+        """First step that any command not yet used is about; None where there is none."""
+        return min((start for start, _ in self._commanded), default=None)
+
     def take(self, first: int, end: int) -> tuple[NDArray[np.float64], int]:
         """Inputs of steps first .. end - 1 and how many are assumed; forgets everything before ``end``.
 
@@ -328,7 +333,9 @@ class Assembler:
         return exposures
 
     def _expose(self, frame: Frame) -> Exposure:
-        lead_start = frame.first_step if self._end is None else min(self._end, frame.first_step)
+        # The mirror rests until its first command; a camera may begin later, or its first frames be lost.
+        begin = self._history.first_commanded if self._end is None else self._end
+        lead_start = frame.first_step if begin is None else min(begin, frame.first_step)
         lead_start = max(lead_start, frame.first_step - _MOST_LEAD_STEPS)
         lead, lead_assumed = self._no_lead, 0
         if lead_start < frame.first_step:

@@ -64,7 +64,8 @@ class Exposure:
     lead_inputs: NDArray[np.float64]
     """Inputs from the end of the exposure before this one to its start, (k, n_inputs).
 
-    Empty where exposures follow each other without a gap; a lost frame or dead time makes it longer.
+    Empty where exposures follow each other without a gap; a lost frame or dead time makes it longer. Of the first one
+    they go back to the mirror's first command, before which it was at rest.
     """
     start_offset: float = 0.0
     """f, how far into its first fast step the exposure starts, in fast steps, 0 <= f < 1.

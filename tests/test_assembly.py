@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -211,6 +212,29 @@ def test_a_lost_frame_lengthens_the_lead_of_the_next() -> None:
     (exposure,) = assembler.add_frame(frame_at(450, frame_id=3))
     assert np.array_equal(exposure.lead_inputs[:, 0], 1e-3 * np.arange(200, 450))
     assert np.array_equal(exposure.inputs[:, 0], 1e-3 * np.arange(450, 650))
+
+
+@pytest.mark.parametrize("first_frame", [0, 60, 450])
+def test_a_first_exposure_is_led_by_all_inputs_since_the_first_command(first_frame: int) -> None:
+    """Its camera may begin later than its mirror, or its first frames may be lost."""
+    assembler = Assembler(RIG)
+    for first in (0, 350):
+        assembler.add_command(commanded(first, first + 350))
+    assembler.add_applied(applied(0, 700))
+    (exposure,) = assembler.add_frame(frame_at(first_frame))
+    assert np.array_equal(exposure.lead_inputs[:, 0], 1e-3 * np.arange(first_frame))
+    assert np.array_equal(exposure.inputs[:, 0], 1e-3 * np.arange(first_frame, first_frame + 200))
+    assert exposure.inputs_assumed == 0
+
+
+def test_a_mirror_that_was_not_commanded_yet_leads_nothing() -> None:
+    """It reports that it rests, and the first command comes with the first exposure or later."""
+    assembler = Assembler(RIG)
+    assembler.add_applied(applied(0, 450))
+    assembler.add_command(commanded(500, 700))
+    assembler.add_applied(applied(450, 700))
+    (exposure,) = assembler.add_frame(frame_at(450))
+    assert exposure.lead_inputs.shape == (0, 1)
 
 
 @given(st.data())

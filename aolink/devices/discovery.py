@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import secrets
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from serial.tools import list_ports as serial_ports
 
 from aolink.devices.drivers import KINDS, NATIVE, Kind, calling, driver_names, load_driver
 from aolink.devices.gate import printable
-from aolink.devices.identity import identify
+from aolink.devices.identity import identify, new_nonce
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.wire import messages_pb2 as pb
@@ -95,7 +94,7 @@ def identify_port(port: str, key: str | Path | None = None) -> Found:
     """Ask the device behind a port who it is, with packets signed by a key file. Raises PortError and DeviceError."""
     hub, secret = Hub(), read_key(key) if key else None
     try:
-        identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port), secret), secrets.randbits(48))
+        identity = identify(hub, hub.connect(f"given ({port})", SerialPort(port), secret), new_nonce())
     finally:
         hub.close()
     camera, mirror = identity.camera, identity.mirror

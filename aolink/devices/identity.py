@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import secrets
+
 from aolink.devices.gate import MOST_STEP, check_times, lie
 from aolink.errors import DeviceError, PortError
 from aolink.rig import Rig
@@ -11,6 +13,14 @@ from aolink.wire.link import Link
 from aolink.wire.packet import PROTOCOL_VERSION, SIGNED_VERSION, schema_hash
 
 _LONGEST_NAME = 200
+
+
+def new_nonce() -> int:
+    """A number that tells the answer to one `identify` from those to others.
+
+    It always has 48 bits: a shorter one makes shorter packets, and two sessions on virtual time would differ.
+    """
+    return secrets.randbits(47) | 1 << 47
 
 
 def identify(hub: Hub, link: Link, nonce: int) -> pb.Identity:

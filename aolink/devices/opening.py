@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import secrets
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -16,7 +15,7 @@ from aolink.devices.adapted_mirror import AdaptedMirror
 from aolink.devices.drivers import KINDS, NATIVE, Kind, calling, driver_names, open_driver
 from aolink.devices.gate import Gate
 from aolink.devices.host import Host
-from aolink.devices.identity import check_against_rig, check_kind, identify
+from aolink.devices.identity import check_against_rig, check_kind, identify, new_nonce
 from aolink.devices.interfaces import Camera, Mirror, Opened
 from aolink.devices.native import NativeCamera, NativeMirror
 from aolink.devices.no_mirror import NoMirror
@@ -193,7 +192,7 @@ def _open_native(
     asked_ns = host.now_ns()
     identities: dict[str, pb.Identity] = {}
     for kind, link in links.items():
-        identities[kind] = identify(host, link, secrets.randbits(48))
+        identities[kind] = identify(host, link, new_nonce())
         check_kind(link, identities[kind], pb.Identity.CAMERA if kind == "camera" else pb.Identity.MIRROR)
     warnings = check_against_rig(rig, identities)
     if "camera" in identities and "mirror" not in identities and identities["camera"].virtual_time:

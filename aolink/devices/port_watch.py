@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Callable
 
 from aolink.devices.gate import MOST_RATE_ERROR
-from aolink.devices.identity import check_identity
+from aolink.devices.identity import check_identity, new_nonce
 from aolink.devices.interfaces import Returned, Vanished
 from aolink.errors import DeviceError, PortError
 from aolink.wire import messages_pb2 as pb
@@ -74,7 +73,7 @@ class PortWatch:
             last = silent if reopening is None else reopening.failed or "it cannot be opened yet"
             raise PortError(f"{self._why}; it did not return within {self._within_s:g} s: {last}")
         if link.lost is None and (self._asked_ns is None or now_ns - self._asked_ns > ANSWER_S * 1e9):
-            self._asked_ns, self._nonce = now_ns, secrets.randbits(48)
+            self._asked_ns, self._nonce = now_ns, new_nonce()
             link.send(pb.Identify(nonce=self._nonce))
 
     def take(self, identity: pb.Identity, now_step: int, now_ns: int) -> Returned | None:

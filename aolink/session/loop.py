@@ -46,7 +46,7 @@ LEAD_BLOCKS = 3
 """Command blocks that are queued on the device ahead of time; all but five in a queue of more than eight."""
 _ROOM_BLOCKS = 5
 _START_DELAY_S = 0.25
-"""Real time: from the first command to its first step."""
+"""Real time: from the first command to its first step, at least; as long as a long queue, so that it is full then."""
 _START_TRIES = 5
 _STATISTICS_PERIOD_S = 1.0
 _ANSWER_NS = 200_000_000
@@ -157,7 +157,9 @@ class SessionLoop:
             self._controlling.begin(self._first_step)
         if exposures:
             self._end_step = self._first_step + (exposures - 1) * timing.frame_period_steps + timing.exposure_steps
-        self._send_commands(self._first_step)  # queued before the first step is due
+        # Queued before the first step is due, as far as the queue reaches.
+        reach = self._rig.mirror.queue_steps - lead_steps(self._rig.mirror)
+        self._send_commands(min(self._first_step, self._device_step() + reach))
         self._receive(0.0)
         self._last_frame_ns = time.now_ns()
         self._log(Log.INFO, f"session of {exposures or 'unlimited'} exposures from fast step {self._first_step}")
@@ -232,7 +234,9 @@ class SessionLoop:
     def _soon(self) -> int:
         """The first fast step of a session that is about to begin."""
         step = self._mirror.start_step(self._time.now_ns())
-        return step if self._time.virtual else step + round(_START_DELAY_S * 1e9) // self._step_ns
+        if self._time.virtual:
+            return step
+        return step + max(round(_START_DELAY_S * 1e9) // self._step_ns, lead_steps(self._rig.mirror))
 
     def _start_camera(self, begin: Callable[[], int], exposures: Callable[[int], int]) -> int:
         """Start the camera at the fast step ``begin()``, for ``exposures`` from that step on; gives the step."""
@@ -241,8 +245,8 @@ class SessionLoop:
             if self._camera.start(first_step, exposures(first_step)):
                 return first_step
         raise DeviceError(
-            f"the camera was asked {_START_TRIES} times to start {_START_DELAY_S:g} s later, and each time the request"
-            " came too late: is the line or this machine so slow, do both devices count the same fast steps?"
+            f"the camera was asked {_START_TRIES} times to start {_START_DELAY_S:g} s later or more, each time it came"
+            " too late: is the line or this machine so slow, do both devices count the same fast steps?"
         )
 
     def _device_step(self) -> int:

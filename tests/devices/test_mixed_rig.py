@@ -90,6 +90,8 @@ def test_a_session_is_aligned_by_the_clocks_recorded_estimated_and_replayed(tmp_
 
     estimates = list(estimate(recording, "moments"))
     assert 0.5 < errors(exposures, estimates, truth) < 1.5
+    # This camera runs freely: the mirror may have moved before its first exposure.
+    assert max(errors([a], [b], truth) for a, b in zip(exposures[:2], estimates[:2], strict=True)) < 3
     assert errors(exposures, estimates, truth, late=1.0) > 2.5  # a step of misalignment would show
     for (_, (again,)), found in zip(replay(recording, ["moments"]), estimates, strict=True):
         assert np.array_equal(again.path, found.path)

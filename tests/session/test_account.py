@@ -160,12 +160,14 @@ def test_a_block_is_sent_again_as_often_as_its_lead_leaves_room_for(loss: float,
     assert run.report.steps_late == run.report.steps_parked
 
 
-def test_a_host_that_is_held_up_for_less_than_the_queue_lasts_is_late_with_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("when", [0, 20_000])
+def test_a_host_that_is_held_up_for_less_than_the_queue_lasts_is_late_with_nothing(when: int, tmp_path: Path) -> None:
+    """At the start, too: the queue has been filled by then."""
     rig = rig_with("queue_steps = 4000\nwatchdog_s = 8")
     hub, left = SimulatedTimeHub(rig), [2.0]
 
     def inputs(first_step: int, n_steps: int) -> np.ndarray:
-        if first_step >= 20_000 and left:
+        if first_step >= when and left:
             hub.hold_up(left.pop())
         return np.zeros((n_steps, 1))
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from aolink.control import State
 from aolink.devices.gate import Gate
@@ -24,7 +25,7 @@ from aolink.session.replay import would_command
 from aolink.wire import messages_pb2 as wire
 from tests.control.rigs import DRIFT, LINE, small_rig
 from tests.control.test_fall_back import line, played
-from tests.kinds import must_be
+from tests.kinds import messages_of, must_be
 from tests.session.simulated_time import Run, SimulatedTimeHub, run_session
 
 FAULTS = """
@@ -173,7 +174,7 @@ def test_a_light_that_goes_out_opens_the_loop(tmp_path: Path, when_lost: str, st
     assert report.ended == "complete"
     assert [int(act.state) for act in acts(tmp_path)][-10:] == [int(state)] * 10
     assert any("the loop is open from frame" in warning for warning in report.warnings)
-    logged = [str(each.message.message) for each in Recording(tmp_path / "a.mcap").messages(topics.LOG)]  # type: ignore[attr-defined]
+    logged = [each.message for each in messages_of(Log, Recording(tmp_path / "a.mcap"), topics.LOG)]
     assert any("the loop is open from frame" in text for text in logged)
 
 
@@ -204,7 +205,7 @@ def test_a_controller_that_does_not_pay_is_left_and_the_recording_says_so(tmp_pa
     assert recording.metadata["control_fall_back_exposures"] == str(report.control.fall_back_exposures)
     assert "fall_back True" in recording.metadata["control"]
     said = f"% less of the slopes (rms) than lqg, and acts from frame {first + 1} on"
-    logged = [str(each.message.message) for each in recording.messages(topics.LOG)]  # type: ignore[attr-defined]
+    logged = [each.message for each in messages_of(Log, recording, topics.LOG)]
     for texts in (report.warnings, logged):
         assert any("still would have left" in text and said in text for text in texts)
     assert [each.act.acting for each in would_command(recording, "lqg", "o1")] == acting

@@ -90,6 +90,8 @@ class Relay:
         self._asking: dict[socket.socket, tuple[str, int]] = {}
         """For each program that asks a socket of its own: the camera obeys one of them alone."""
         self._host, self._port = "", 0
+        self._listening: tuple[str, int] | None = None
+        """The program that has said where pictures go. Another, of a session before, may still be closing its own."""
         self._kept: dict[tuple[int, int], bytes] = {}
         """Packets that were dropped, by frame id and packet id."""
         self._frames = 0
@@ -126,8 +128,9 @@ class Relay:
             register, value = struct.unpack_from(">2I", data, 8)
             if register == STREAM_ADDRESS:
                 self._host, value = socket.inet_ntoa(struct.pack(">I", value)), 0x7F000001
-            elif register == STREAM_PORT:
-                self._port, value = value & 0xFFFF, self._stream.getsockname()[1] if value & 0xFFFF else value
+            elif register == STREAM_PORT and (value & 0xFFFF or sender == self._listening):
+                self._port, self._listening = value & 0xFFFF, sender
+                value = self._stream.getsockname()[1] if self._port else value
             elif register == CLOCK_CONTROL and value == 2 and self._faults.latch:
                 now_ns = self._clock_ns(time.time_ns())
                 self._write_register(CLOCK_VALUE, now_ns >> 32)
