@@ -202,7 +202,7 @@ class RangeFile(io.RawIOBase):
         while self._spans and self._spans[0][1] <= position:
             self._spans.popleft()
         if self._spans and self._spans[0][0] <= position:
-            return position, max(end, min(self._spans[0][1], position + MOST_AHEAD))
+            return position, max(end, min(self._spans[0][1], position + MOST_AHEAD, self._size))
         if position < AHEAD:
             return 0, min(max(end, AHEAD), self._size)
         if position >= self._size - AHEAD:  # the index is at the end, and its length is in the last bytes

@@ -14,7 +14,7 @@ import fsspec
 import numpy as np
 import pytest
 import s3fs
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from aolink.batch import estimate_file
@@ -189,6 +189,7 @@ def test_the_commands_take_urls(s3: S3Server, aolink: Run, tmp_path: Path) -> No
 
 
 @given(st.lists(st.tuples(st.integers(0, 400_000), st.integers(0, 90_000)), max_size=12), st.booleans())
+@example([(210_001, 90_000)], True)  # planned beyond the end
 def test_what_is_read_is_what_is_there(reads: list[tuple[int, int]], planned: bool) -> None:
     data = np.random.default_rng(1).bytes(300_000)
     fsspec.filesystem("memory").pipe("/bytes", data)
