@@ -162,3 +162,19 @@ def test_the_rig_file_says_so():
     assert parse_rig(text).plant.wandering is None
     with pytest.raises(RigError, match=r"plant\.wandering\.frequency"):
         parse_rig(text.replace("[timing]", table.replace("0.05", "0.5") + "\n[timing]"))
+
+
+def test_a_frequency_that_nothing_is_seen_of_becomes_uncertain(off):
+    """By as much as it may wander in the meantime."""
+    _, exposures = off
+    spread = []
+    for minutes in (0, 20):
+        estimator = make_estimator(wandering(JITTER), "moments")
+        for exposure in exposures[:40]:
+            estimator.step(exposure)
+        dark = np.zeros_like(exposures[40].mask)
+        first_step = exposures[40].first_step + round(minutes * 60 / JITTER.timing.fast_step_s)
+        lost = dataclasses.replace(exposures[40], mask=dark, first_step=first_step)
+        spread.append(float(frequency(estimator.step(lost)).sd[0]))
+    assert spread[0] < 0.01
+    assert spread[1] > 2 * spread[0]

@@ -85,15 +85,15 @@ def proposed(modes_weight: FloatArray, modes: Gaussian, wide_weight: FloatArray,
 
 
 def posterior(
-    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float, several: BoolArray
+    view: PixelView, prior: GaussianMixture, proposal: GaussianMixture, share: float
 ) -> tuple[GaussianMixture, BoolArray]:
     """A mixture that fits the posterior of t by importance sampling, and where it can be relied on, (axes,).
 
-    Each round has this ``share`` of the usual number of points. The effective sample size to reach is the same share of
-    the usual one, except on axes with ``several`` modes, which need all of it. A fit to less than half of that cannot
-    be relied on: its weights are flattened, so that it is wide.
+    Each round has this ``share`` of the usual number of points, and the effective sample size to reach is the same
+    share of the usual one. A fit to less than half of that cannot be relied on: its weights are flattened, so that it
+    is wide.
     """
-    wanted = np.where(several, _ENOUGH, share * _ENOUGH)
+    wanted = np.full(len(prior.mean), share * _ENOUGH)
     fit, effective = importance_corrected(view, prior, proposal, share, wanted)
     return fit, np.asarray(effective >= _TOO_FEW * wanted)
 

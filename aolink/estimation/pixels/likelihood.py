@@ -2,9 +2,10 @@
 
 A pixel is E[Y | path] = (1/N) sum_k (kernel integrated over it, the spot resting at theta_k) / D, and theta is linear
 in the coefficients z = (x(k0), xi) of the exposure. Only as many directions of xi are kept as move the spot visibly:
-the first singular vectors of the noise path, until the rest is a tenth of the kernel's standard deviation, rms. What is
-left out keeps its prior and widens the kernel by its variance, which is right to second order. Start states are kept
-whole.
+the first singular vectors of the noise path, until the rest is a tenth of the kernel's standard deviation, rms, and, as
+far as twelve coefficients do it, no more than the pixels can hardly see. What is left out keeps its prior and widens
+the kernel by its variance. Pixels that see more than that of it would take it for a motion that it is not. Start states
+are kept whole.
 
 The mean over the fast steps is taken by quadrature with few nodes (`aolink.estimation.model.quadrature`).
 """
@@ -36,6 +37,10 @@ from aolink.optics.sensor import BaseSensor, SpotSensor
 
 # Rms of the noise path that is left out, in standard deviations of the kernel.
 _LEFT_OUT = 0.1
+# And in standard deviations with which the pixels of a spot at rest tell its position; for the sake of this there are
+# no more coefficients than so many, since what an estimate costs grows with their square.
+_SEEN = 2.0
+_MOST_SEEN = 12
 # Random paths from which the number of nodes is found.
 _PATHS = 64
 # The table of a pixel's light over the spot's position: points in one standard deviation of the kernel, and its end.
@@ -96,7 +101,9 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
     _, values, vectors = np.linalg.svd(paths, full_matrices=False) if size else (0, np.zeros(0), np.zeros((0, 0)))
     # Each output by itself: a remainder that is spread over many of them is as small on each.
     rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0) / model.plant.n_outputs
-    kept = int(np.argmax(rest <= left_out**2 * variance))
+    coarse, fine = left_out * math.sqrt(variance), _SEEN * _resting_sd(sensor, variance)
+    kept = int(np.argmax(rest <= coarse**2))
+    kept = max(kept, min(int(np.argmax(rest <= fine**2)), _MOST_SEEN - n))
     V = vectors[:kept].T
     expand = np.zeros((n + size, n + kept))
     expand[:n, :n], expand[n:, n:] = np.eye(n), V
@@ -111,6 +118,18 @@ def reduction(model: ExposureModel, sensor: BaseSensor, *, left_out: float = _LE
         expand=expand, left_out=hidden, end_rows=model.end_rows @ expand, end_remainder=remainder,
         widening=float(rest[kept]) + model.unmodelled_rest, resolution=seen,
     )  # fmt: skip
+
+
+def _resting_sd(sensor: BaseSensor, variance: float) -> float:
+    """Standard deviation with which the pixels tell the position of a spot at rest (Cramer and Rao's bound).
+
+    By the mean information over positions in a pixel: a spot much narrower than that is seen only at its edges.
+    """
+    line = sensor.profile
+    positions = line.pixel_size * np.linspace(0, 1, _POINTS, endpoint=False)
+    light, slope = (each / line.pixel_size for each in pixel_masses(variance, line.edges, positions, 1))
+    noise = effective_noise_density(line) / line.pixel_size + shot_gain(line) * np.maximum(light, 0.0)
+    return float((slope**2 / noise).sum(axis=1).mean() ** -0.5)
 
 
 def _paths(model: ExposureModel, expand: FloatArray) -> FloatArray:

@@ -58,7 +58,10 @@ class ImportanceUpdater:
     free: float
     """Components are merged further while a merger costs less than this, in nats."""
     share: float
-    """Share of the usual number of points; and, where there is one mode, of the usual effective sample size."""
+    """Share of the usual number of points, and of the usual effective sample size, where the posterior has one mode.
+
+    Where it has several all are taken: what chance makes of their weights would add up from exposure to exposure.
+    """
 
     points: int
     """Tempered points of an axis where the usual points are not enough; 0 for none."""
@@ -104,15 +107,12 @@ class ImportanceUpdater:
         before = joined(rest, single(unseen).weighted(_DOUBT))
         usual = np.flatnonzero(~lost | (self.points == 0))
         after, poor = proposal, lost.copy()
-        if len(usual):
-            several = has_several(modes, _LEAST_DOUBTED_SHARE)
-            if len(usual) == len(lost):
-                after, good = posterior(view, before, proposal, self.share, several)
-            else:
-                some = view.part(usual)
-                fit, good = posterior(some, before.part(usual), proposal.part(usual), self.share, several[usual])
-                after = proposal.replaced(usual, fit)
-            poor[usual] |= ~good & new.believed[usual]
+        several = has_several(modes, _LEAST_DOUBTED_SHARE)[usual]
+        for which, share in ((usual[~several], self.share), (usual[several], 1.0)):
+            if len(which):
+                fit, good = posterior(view.part(which), before.part(which), proposal.part(which), share)
+                after = after.replaced(which, fit)
+                poor[which] |= ~good & new.believed[which]
         few = np.flatnonzero(poor)
         if len(few) and self.points:
             some, fit, missed = view.part(few), wide.part(few), self._missed(reduced)
@@ -130,7 +130,7 @@ class ImportanceUpdater:
         return MixtureUpdate(after, after.gaussian, carried, new, modes.total_evidence, has_several(modes), poor)
 
 
-PROFILE = ImportanceUpdater(carried=3, free=0.1, share=0.25, points=600)
+PROFILE = ImportanceUpdater(carried=6, free=0.01, share=0.25, points=600)
 MIXTURE = ImportanceUpdater(carried=6, free=1e-3, share=1.0, points=1200)
 
 

@@ -151,3 +151,20 @@ def test_fewer_nodes_and_coefficients_cost_less_than_the_noise():
     few = z @ coarse.reduced.expand
     added = (fine.predicted(full) - coarse.predicted(few)) ** 2 / fine.read_noise
     assert added.sum(axis=-1).mean() < 1.0
+
+
+@pytest.mark.parametrize("noise_density", [1e-6, 1e-4, 1e-2])
+def test_no_more_of_the_path_is_left_out_than_the_pixels_can_hardly_see(noise_density):
+    """Position's information by finite differences of the optics; twelve coefficients are enough of it."""
+    sensor = dataclasses.replace(LINE.sensor, noise_density=noise_density)
+    model = exposure_model(LINE.plant, 200)
+    reduced = likelihood.reduction(model, sensor)
+    left_out = model.basis[0] @ reduced.left_out @ model.basis[0].T
+    rms = np.sqrt(np.trace(left_out) / 200)
+    line, step = sensor.profile, 1e-4
+    places = np.linspace(0, line.pixel_size, 50)[:, None]
+    above, below = (exposure_density(line.kernel, line.edges, places + d) for d in (step, -step))
+    information = (((above - below) / (2 * step)) ** 2).sum(axis=1).mean() * line.pixel_size / noise_density
+    kernel_sd = np.sqrt(line.kernel.variance)
+    assert rms <= 0.1 * kernel_sd
+    assert rms <= 2.01 / np.sqrt(information) or reduced.size == 12
