@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from aolink.restoration.block_matching import block_matching
 from aolink.restoration.deblur import RestoredPictures, deblur
 from aolink.restoration.inverse import largest_zero, stable_direction
 from aolink.restoration.method import Blurred, Method, Restored
@@ -30,6 +31,7 @@ __all__ = [
     "Restored",
     "RestoredPictures",
     "Scanner",
+    "block_matching",
     "deblur",
     "find_method",
     "first_order",

@@ -24,12 +24,15 @@ FloatArray = NDArray[np.floating[Any]]
 _THREADS = 2
 _MOST_STEPS = 400
 _TOLERANCE = 1e-4
-# Above this kappa, in squares of the PSF's sum, single precision is wrong by far less than the noise; its error grows
-# with one over kappa.
 _SINGLE = 1e-3
 # Scenes of up to this many pixels are solved by one dense factorisation, which is faster than conjugate gradients; and
 # FFTs of fewer pixels than this gain nothing by a second thread.
 _SMALL_SCENE, _SMALL_FFT = 1200, 40_000
+
+
+def single_is_enough(kappa: float, sum_of_taps: float) -> bool:
+    """Whether single precision is wrong by far less than the noise; its error grows with one over kappa."""
+    return kappa >= _SINGLE * sum_of_taps**2
 
 
 class Solver(Protocol):
@@ -94,7 +97,7 @@ def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = F
     ``single`` allows single precision, which is used where its error is far below the noise.
     """
     taps = np.broadcast_to(psf.values, (shape[1], psf.values.shape[-1]))
-    single = single and kappa >= _SINGLE * float(taps.sum(axis=1).max()) ** 2
+    single = single and single_is_enough(kappa, float(taps.sum(axis=1).max()))
     dtype = np.float32 if single else np.float64
     bands = normal_bands(taps, np.ones(shape[1]))
     bands[0] += 2 * kappa
@@ -228,58 +231,107 @@ def differences_transposed(along: FloatArray, down: FloatArray) -> FloatArray:
     return out
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plane:
+    """A blur on a plane that goes round, as large as the scene or a little larger, where transforms are fast."""
+
+    taps: NDArray[np.float64]
+    frame: tuple[slice, slice]
+    """Where the frame lies in the scene."""
+    scene: tuple[int, int]
+    """Rows and columns of the scene, which begins at the plane's first pixel."""
+    shape: tuple[int, int]
+    """Rows and columns of the plane."""
+    transfer: NDArray[np.complexfloating[Any]]
+    """Of the blur, by `forward`."""
+    rough: FloatArray
+    """Spectrum of L."""
+
+    @classmethod
+    def of(cls, psf: Psf, shape: tuple[int, int]) -> Plane:
+        """The plane for a PSF on the plane, or along all rows alike, and a frame's rows and columns."""
+        taps, frame = _on_plane(psf, shape)
+        rows, columns = shape[0] + taps.shape[0] - 1, shape[1] + taps.shape[1] - 1
+        plane = fft.next_fast_len(rows, real=True), fft.next_fast_len(columns, real=True)
+        return cls(
+            taps=taps, frame=frame, scene=(rows, columns), shape=plane,
+            transfer=fft.rfft2(taps, plane), rough=_roughness_spectrum(plane),
+        )  # fmt: skip
+
+    @property
+    def blurred(self) -> tuple[slice, slice]:
+        """Where the frame lies in the blurred plane: only there does nothing that went round arrive."""
+        return slice(self.taps.shape[0] - 1, self.scene[0]), slice(self.taps.shape[1] - 1, self.scene[1])
+
+    @property
+    def _threads(self) -> int:
+        return _THREADS if self.scene[0] * self.scene[1] > _SMALL_FFT else 1
+
+    def forward(self, images: FloatArray, shape: tuple[int, int] | None = None) -> NDArray[np.complexfloating[Any]]:
+        """The spectrum of images from the plane's first pixel on."""
+        return np.asarray(fft.rfft2(images, shape or self.shape, workers=self._threads))
+
+    def backward(self, spectrum: NDArray[np.complexfloating[Any]], shape: tuple[int, int] | None = None) -> FloatArray:
+        """The whole plane with a spectrum, which is overwritten."""
+        return np.asarray(fft.irfft2(spectrum, shape or self.shape, workers=self._threads, overwrite_x=True))
+
+    def through(
+        self, images: FloatArray, factor: NDArray[np.inexact[Any]], shape: tuple[int, int] | None = None
+    ) -> FloatArray:
+        """The scene's pixels of images whose spectrum is multiplied by a factor."""
+        spectrum = self.forward(images, shape)
+        spectrum *= factor
+        return self.backward(spectrum, shape)[..., : self.scene[0], : self.scene[1]]
+
+    def placed(self, images: FloatArray) -> FloatArray:
+        """Images where the frame lies in the blurred plane, cut to the scene's size; zero around it."""
+        padded = np.zeros((*images.shape[:-2], *self.scene))
+        padded[..., *self.blurred] = images
+        return padded
+
+    def guess(self, images: FloatArray, kappa: float, share: float = 1.0, white: bool = False) -> FloatArray:
+        """The periodic solution for images continued from their last pixel to their first beyond the frame."""
+        padded, (above, left) = self.placed(images), (n - 1 for n in self.taps.shape)
+        down = (np.arange(1, above + 1) / (above + 1))[:, None]
+        padded[..., :above, :] = (1 - down) * padded[..., -1:, :] + down * padded[..., above, None, :]
+        right = np.arange(1, left + 1) / (left + 1)
+        padded[..., :left] = (1 - right) * padded[..., -1:] + right * padded[..., left, None]
+        transfer = fft.rfft2(self.taps, self.scene)
+        inverse = inverse_spectrum(transfer, _roughness_spectrum(self.scene), kappa, share, white)
+        return self.through(padded, transfer.conj() * inverse, self.scene)
+
+
+def _roughness_spectrum(shape: tuple[int, int]) -> FloatArray:
+    y, x = fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None]
+    return np.asarray(4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2)
+
+
+def inverse_spectrum(
+    transfer: NDArray[np.complexfloating[Any]], rough: FloatArray, kappa: float, share: float = 1.0, white: bool = False
+) -> FloatArray:
+    """One over that of (H'H + kappa L), or with I in the place of L; of the plane's pixels a share is measured."""
+    # A floor for the mean, which the differences do not hold.
+    prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
+    return np.asarray(1 / (share * np.abs(transfer) ** 2 + kappa * prior))
+
+
 def plane_solver(
     psf: Psf, shape: tuple[int, int], kappa: float, seen: BoolArray | None = None, white: bool = False
 ) -> IterativeSolver:
     """The solver of a PSF on the plane (or along all rows alike), with the periodic solver as preconditioner."""
-    taps, frame = _on_plane(psf, shape)
-    reach = (taps.shape[0] - 1, taps.shape[1] - 1)
-    rows, columns = size = (shape[0] + reach[0], shape[1] + reach[1])
-    # The blur goes round in a plane as large as the scene, or a little larger, where transforms are fast.
-    fast = (fft.next_fast_len(rows, real=True), fft.next_fast_len(columns, real=True))
-    threads = _THREADS if rows * columns > _SMALL_FFT else 1
+    plane = Plane.of(psf, shape)
     fraction = 1.0 if seen is None else float(seen.mean())
     # The frame's share of the scene.
-    share = fraction * shape[0] * shape[1] / (rows * columns)
-
-    def spectra(plane: tuple[int, int]) -> tuple[NDArray[np.complexfloating[Any]], FloatArray]:
-        """Transfer function, and the spectrum of the preconditioner."""
-        transfer = fft.rfft2(taps, plane)
-        y, x = fft.fftfreq(plane[0])[:, None], fft.rfftfreq(plane[1])[None]
-        rough = 4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2
-        # A floor for the mean, which the differences do not hold.
-        prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)
-        return transfer, 1 / (share * np.abs(transfer) ** 2 + kappa * prior)
-
-    def through(images: FloatArray, factor: NDArray[np.inexact[Any]], plane: tuple[int, int] = fast) -> FloatArray:
-        spectrum = fft.rfft2(images, plane, workers=threads)
-        spectrum *= factor
-        return np.asarray(fft.irfft2(spectrum, plane, workers=threads, overwrite_x=True))[..., :rows, :columns]
-
-    transfer, inverse = spectra(fast)
-    backward = transfer.conj()
-
-    def placed(images: FloatArray) -> FloatArray:
-        padded = np.zeros((*images.shape[:-2], *size))
-        padded[..., reach[0] :, reach[1] :] = images
-        return padded
-
-    def blur(scene: FloatArray) -> FloatArray:
-        return through(scene, transfer)[..., reach[0] :, reach[1] :]
-
-    def guess(images: FloatArray) -> FloatArray:
-        """The periodic solution for images continued from their last pixel to their first beyond the frame."""
-        padded = placed(images)
-        down = (np.arange(1, reach[0] + 1) / (reach[0] + 1))[:, None]
-        padded[..., : reach[0], :] = (1 - down) * padded[..., -1:, :] + down * padded[..., reach[0], None, :]
-        right = np.arange(1, reach[1] + 1) / (reach[1] + 1)
-        padded[..., : reach[1]] = (1 - right) * padded[..., -1:] + right * padded[..., reach[1], None]
-        round_it, its_inverse = spectra(size)
-        return through(padded, round_it.conj() * its_inverse, size)
-
+    share = fraction * shape[0] * shape[1] / (plane.scene[0] * plane.scene[1])
+    inverse = inverse_spectrum(plane.transfer, plane.rough, kappa, share, white)
+    backward = plane.transfer.conj()
     return IterativeSolver(
-        kappa=kappa, blur=blur, blur_transposed=lambda y: through(placed(y), backward),
-        nearly=lambda r: through(r, inverse), guess=guess, seen=seen, white=white, frame=frame,
+        kappa=kappa,
+        blur=lambda x: plane.through(x, plane.transfer)[..., *plane.blurred],
+        blur_transposed=lambda y: plane.through(plane.placed(y), backward),
+        nearly=lambda r: plane.through(r, inverse),
+        guess=lambda y: plane.guess(y, kappa, share, white),
+        seen=seen, white=white, frame=plane.frame,
     )  # fmt: skip
 
 

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from aolink.numerics.arrays import FloatArray
 from aolink.restoration import spectrum
-from aolink.restoration.markov import Solver, make_solver, plane_solver
+from aolink.restoration.block_matching import block_matching
+from aolink.restoration.markov import Plane, make_solver, plane_solver
 from aolink.restoration.method import Blurred, Restored
-from aolink.restoration.plug_and_play import Denoiser, non_local_means, plug_and_play
-from aolink.restoration.tv import total_variation
+from aolink.restoration.plug_and_play import Denoiser, plug_and_play
+from aolink.restoration.tv import plane_total_variation, total_variation
 from aolink.restoration.uncertainty import plane_variance
 
 # Least ratio of the variances of the noise and of the scene's differences for conjugate gradients: below it they need
@@ -46,9 +47,9 @@ class _Weights:
             total = max(total, _SMALLEST_RATIO / difference)
         return cls(noise=noise, unexplained=unexplained, total=total, difference=difference)
 
-    def restored(self, scene: NDArray[Any], solver: Solver) -> Restored:
+    def restored(self, scene: NDArray[Any], frame: tuple[slice, slice]) -> Restored:
         return Restored(
-            image=scene[(slice(None), *solver.frame)], noise_sd=math.sqrt(self.noise),
+            image=scene[(slice(None), *frame)], noise_sd=math.sqrt(self.noise),
             psf_noise_sd=math.sqrt(self.unexplained), difference_weight=self.difference,
         )  # fmt: skip
 
@@ -58,7 +59,7 @@ def gauss_markov(picture: Blurred) -> Restored:
     weights = _Weights.of(picture)
     solver = make_solver(picture.psf, _shape(picture), weights.difference * weights.total, picture.seen)
     whole = picture.whole
-    return weights.restored(solver.solve(solver.project(whole), solver.guess(whole)), solver)
+    return weights.restored(solver.solve(solver.project(whole), solver.guess(whole)), solver.frame)
 
 
 def tv(picture: Blurred) -> Restored:
@@ -67,29 +68,35 @@ def tv(picture: Blurred) -> Restored:
     return weights.restored(*_with_edges(picture, weights))
 
 
-def pnp(picture: Blurred, *, denoise: Denoiser = non_local_means) -> Restored:
+def pnp(picture: Blurred, *, denoise: Denoiser = block_matching) -> Restored:
     """Plug and play: a denoiser takes the place of the scene's prior."""
     weights = _Weights.of(picture)
-    start, solver = _with_edges(picture, weights)
+    start, frame = _with_edges(picture, weights)
     scene = plug_and_play(
         lambda kappa: plane_solver(picture.psf, _shape(picture), kappa, picture.seen, white=True),
         picture.whole, weights.total, start, denoise,
     )  # fmt: skip
-    return weights.restored(scene, solver)
+    return weights.restored(scene, frame)
 
 
 def why_not_pnp(picture: Blurred) -> str | None:
     return "pnp needs one PSF for the whole picture: use tv" if picture.psf.varies else None
 
 
-def _with_edges(picture: Blurred, weights: _Weights) -> tuple[FloatArray, Solver]:
-    # Total variation does not need the last digits; half of them take half of the time.
+def _with_edges(picture: Blurred, weights: _Weights) -> tuple[FloatArray, tuple[slice, slice]]:
+    """The scene by total variation, beyond the frame as well, and where the frame lies in it."""
+    psf, shape = picture.psf, _shape(picture)
     level = picture.whole.mean()
-    scene, solver = total_variation(
-        lambda kappa: make_solver(picture.psf, _shape(picture), kappa, picture.seen, single=True),
-        picture.whole - level, weights.total, weights.difference,
-    )  # fmt: skip
-    return scene.astype(np.float64) + level, solver
+    images = picture.whole - level
+    if psf.varies or (psf.on_line and picture.seen is None):
+        # Total variation does not need the last digits; half of them take half of the time.
+        scene, solver = total_variation(
+            lambda kappa: make_solver(psf, shape, kappa, picture.seen, single=True),
+            images, weights.total, weights.difference,
+        )  # fmt: skip
+        return scene.astype(np.float64) + level, solver.frame
+    plane = Plane.of(psf, shape)
+    return plane_total_variation(plane, images, weights.total, weights.difference, picture.seen) + level, plane.frame
 
 
 def _shape(picture: Blurred) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Plug and play: steps of any denoiser and of the data term in turn; non-local means unless another is given.
+"""Plug and play: steps of any denoiser and of the data term in turn. And a denoiser, non-local means.
 
 References
 ----------

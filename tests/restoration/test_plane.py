@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import fft, linalg
 
-from aolink.restoration import Psf, non_local_means
+from aolink.restoration import Psf, block_matching, non_local_means
 from aolink.restoration.markov import (
     DenseSolver,
     IterativeSolver,
     LineSolver,
+    Plane,
     Solver,
     dense_solver,
     differences_transposed,
@@ -20,7 +24,13 @@ from aolink.restoration.markov import (
     plane_solver,
     roughness,
 )
-from aolink.restoration.tv import ITERATIONS, WEIGHT, total_variation
+from aolink.restoration.tv import (
+    ITERATIONS,
+    WEIGHT,
+    plane_total_variation,
+    plane_weight,
+    total_variation,
+)
 from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, psnr, roughness_matrix
 
 FloatArray = NDArray[np.float64]
@@ -146,6 +156,40 @@ def test_few_iterations_are_enough(values: FloatArray) -> None:
     assert psnr(found[0], inside) > psnr(image, inside) + 4
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_on_the_plane_total_variation_is_what_exact_steps_find(masked: bool) -> None:
+    rng = np.random.default_rng(7)
+    image, inside = blurred(blocks(26, 30), CORNER, (1, 1))
+    image = image + 0.02 * rng.standard_normal(image.shape)
+    seen = rng.random(image.shape) > 0.1 if masked else None
+    psf, s2, weight = Psf(values=CORNER, origin=(1, 1)), 0.02**2, 50.0
+    plane, w = Plane.of(psf, (image.shape[0], image.shape[1])), plane_weight(s2, weight)
+    W = np.ones(image.shape) if seen is None else seen
+    H = blur_matrix(image.shape, CORNER)
+
+    def objective(x: FloatArray) -> float:
+        return float((W.ravel() * (image.ravel() - H @ x.ravel()) ** 2).sum() / (2 * s2) + w * variation(x))
+
+    exact, solver = total_variation(
+        lambda kappa: dense_solver(psf, image.shape, kappa, seen), image[None], s2, (w / WEIGHT) ** 2, 1000
+    )
+    found, few = (plane_total_variation(plane, image[None], s2, weight, seen, *n) for n in ((2000,), ()))
+    assert found.shape == few.shape == exact.shape
+    assert plane.frame == solver.frame
+    least = objective(exact[0])
+    assert least * 0.9999 < objective(found[0]) < least * 1.001
+    assert abs(psnr(few[0][plane.frame], inside) - psnr(exact[0][plane.frame], inside)) < 0.2
+
+
+def test_the_weight_on_the_plane_does_not_depend_on_the_unit_of_light() -> None:
+    image, _ = blurred(blocks(40, 50), CORNER, (1, 1))
+    image = image + 0.01 * np.random.default_rng(8).standard_normal(image.shape)
+    plane = Plane.of(Psf(values=CORNER, origin=(1, 1)), (image.shape[0], image.shape[1]))
+    one = plane_total_variation(plane, image[None], 1e-4, 60.0)
+    thousand = plane_total_variation(plane, 1000 * image[None], 1e2, 60e-6)
+    np.testing.assert_allclose(thousand, 1000 * one, atol=0.05)  # in single precision
+
+
 def in_precision(single: bool, psf: Psf, image: np.ndarray, noise_variance: float) -> np.ndarray:
     """The picture restored by total variation, in single precision or in double."""
     return total_variation(
@@ -197,3 +241,61 @@ def test_non_local_means_as_its_definition() -> None:
     scene = blocks(90, 90)
     noisy = scene + 0.05 * rng.standard_normal(scene.shape)
     assert psnr(non_local_means(noisy, 0.05), scene) > psnr(noisy, scene) + 4
+
+
+def one_group(guide: FloatArray, noisy: FloatArray, y: int, x: int, noise_sd: float, wiener: bool) -> tuple[Any, ...]:
+    """Places, patches and weight of the group of a patch, from the definition."""
+    found = []
+    for v in range(max(y - 8, 0), min(y + 8, guide.shape[0] - 8) + 1):
+        for u in range(max(x - 8, 0), min(x + 8, guide.shape[1] - 8) + 1):
+            away = ((guide[v : v + 8, u : u + 8] - guide[y : y + 8, x : x + 8]) ** 2).sum()
+            found.append((-1.0 if (v, u) == (y, x) else away, v, u))
+    places = [(v, u) for _, v, u in sorted(found)[:16]]
+    H = linalg.hadamard(16) / 4
+
+    def spectrum(image: FloatArray) -> FloatArray:
+        patches = np.array([fft.dctn(image[v : v + 8, u : u + 8], norm="ortho") for v, u in places])
+        return np.asarray(np.tensordot(H, patches, 1))
+
+    shrink = spectrum(guide) ** 2 / (spectrum(guide) ** 2 + noise_sd**2)
+    if not wiener:
+        shrink = (abs(spectrum(noisy)) > 2.7 * noise_sd).astype(float)
+        shrink[0, 0, 0] = 1
+    patches = np.tensordot(H, shrink * spectrum(noisy), 1)
+    return places, fft.idctn(patches, axes=(1, 2), norm="ortho"), 1 / (shrink**2).sum()
+
+
+def test_block_matching_as_its_definition() -> None:
+    rng = np.random.default_rng(9)
+    scene = blocks(27, 31)
+    noisy = scene + 0.05 * rng.standard_normal(scene.shape)
+    level, window = noisy.mean(), np.outer(np.kaiser(8, 2.0), np.kaiser(8, 2.0))
+    guide = image = noisy - level
+    for wiener in (False, True):
+        total, weight = np.zeros(scene.shape), np.zeros(scene.shape)
+        for y in sorted({*range(0, 20, 3), 19}):
+            for x in sorted({*range(0, 24, 3), 23}):
+                places, patches, trust = one_group(guide, image, y, x, 0.05, wiener)
+                for (v, u), patch in zip(places, patches, strict=True):
+                    total[v : v + 8, u : u + 8] += trust * window * patch
+                    weight[v : v + 8, u : u + 8] += trust * window
+        guide = total / weight
+    found = block_matching(noisy, 0.05)
+    np.testing.assert_allclose(found, guide + level, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(1, 60), (1, 3), (5, 9), (8, 8), (60, 12)])
+def test_block_matching_of_small_pictures_makes_their_noise_less(shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(10).standard_normal(shape)
+    found = block_matching(5 + noise, 1.0)
+    assert found.shape == shape
+    assert abs(found.mean() - 5 - noise.mean()) < 0.2
+    assert found.std() < 0.5 * noise.std()
+
+
+def test_block_matching_in_bands_is_what_it_is_at_once() -> None:
+    scene = blocks(60, 40)
+    noisy = scene + 0.05 * np.random.default_rng(11).standard_normal(scene.shape)
+    whole, bands = (block_matching(noisy, 0.05, band=n) for n in (100, 2))
+    assert abs(whole - bands).max() < 1e-3  # sums in another order move a coefficient across the threshold now and then
+    assert psnr(whole, scene) > psnr(non_local_means(noisy, 0.05), scene)
