@@ -1,18 +1,27 @@
 """The command identify: recordings of blurred frames into a rig file with a model of what disturbs."""
 
+import glob
 import json
+import math
+import time
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, stdout
+from aolink.cli.common import JsonOption, OverwriteOption, app, open_recording, progress, stdout, warn
 from aolink.errors import IdentificationError
 from aolink.files import check_target, writing
 
 if TYPE_CHECKING:
-    from aolink.jobs.identify import Found
+    from aolink.jobs.follow import News, Offer
+    from aolink.jobs.identify import Found, Wanted
+    from aolink.recording.remote import Url
+    from aolink.rig import Rig
+
+_LOOK_S = 0.2
+"""How often a recording that is being written is looked at."""
 
 
 class PlantKind(StrEnum):
@@ -25,10 +34,10 @@ class PlantKind(StrEnum):
 
 @app.command(
     epilog="Example: aolink identify session.mcap -o identified.toml --model resonance"
-    "  |  aolink identify *.mcap -o rig.toml"
+    "  |  aolink identify *.mcap -o rig.toml  |  aolink identify session.mcap --follow -o identified.toml"
 )
 def identify(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings of one rig.")],
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Recordings of one rig, or their URLs.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="RIG.toml", help="The rig file to write.")],
     model: Annotated[
         list[str] | None,
@@ -36,7 +45,7 @@ def identify(
             "--model",
             metavar="KIND+KIND...",
             help="What disturbs: random-walk, ornstein-uhlenbeck, second-order, resonance, ar3, ar4, or a sum of them."
-            " Given several times, cross-validation chooses; without it, from nine.",
+            " Given several times, cross-validation chooses; without it, from nine; with --follow, the rig file's own.",
         ),
     ] = None,
     plant: Annotated[
@@ -52,6 +61,14 @@ def identify(
     rig: Annotated[
         str | None, typer.Option(metavar="RIG.toml", help="Start from this rig file, not from the recording's own.")
     ] = None,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow",
+            help="Follow one recording while it is written: say how the rig file's model fits and, where it no longer"
+            " does, offer a new one in a file of its own. The session and its rig file stay as they are.",
+        ),
+    ] = False,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -62,22 +79,34 @@ def identify(
     """
     from aolink.identification import CANDIDATES
     from aolink.jobs import identify as job
+    from aolink.recording.remote import location, only_paths
     from aolink.rig import load_rig
 
-    check_target(output, overwrite=overwrite, sources=files, suffix=".toml", error=IdentificationError)
+    places = [location(file) for file in files]
+    sources = [*only_paths(places), *([Path(rig)] if rig else [])]
+    check_target(output, overwrite=overwrite, sources=sources, suffix=".toml", error=IdentificationError)
     kind = None if plant is PlantKind.KNOWN else plant.value
     wanted = job.Wanted(
         models=tuple(model) if model else () if kind else CANDIDATES, plant=kind, noise=noise, kernel=kernel,
         highest_hz=highest or None,
     )  # fmt: skip
-    recordings = [open_recording(file) for file in files]
+    if follow:
+        if len(places) > 1:
+            raise typer.BadParameter("--follow is for one recording")
+        if kind or noise or kernel or overwrite:
+            raise typer.BadParameter(
+                "--follow fits the disturbance alone and never overwrites: leave out --plant, --noise, --kernel and"
+                " --overwrite"
+            )
+        _follow(places[0], output, load_rig(rig) if rig else None, wanted, sources, as_json=as_json)
+        return
+    recordings = [open_recording(place) for place in places]
     with progress("identify", None) as tell:
 
         def told(what: str, done: int, of: int) -> None:
             tell(done, f"{what}: {done} of {of}")
 
         result = job.identify(recordings, load_rig(rig) if rig else None, wanted, told)
-    sources = [*files, *([Path(rig)] if rig else [])]
     with writing(output, overwrite=overwrite, sources=sources, error=IdentificationError) as partial:
         partial.write_text(result.text, newline="")
     if as_json:
@@ -91,6 +120,64 @@ def identify(
         for note in each.notes:
             stdout.print(f"note: {note}", markup=False)
     stdout.print(f"wrote {output}", markup=False)
+
+
+def _follow(
+    place: "Path | Url", output: Path, rig: "Rig | None", wanted: "Wanted", sources: list[Path], *, as_json: bool
+) -> None:
+    """Follow a recording up to its end, and write what is offered."""
+    from aolink.control.drift import WINDOW
+    from aolink.jobs.follow import Following, Offer, offer_path
+    from aolink.recording.growing import GrowingRecording
+
+    if taken := sorted(output.parent.glob(f"{glob.escape(output.stem)}-[0-9]*{glob.escape(output.suffix)}")):
+        raise IdentificationError(f"{taken[0]} exists, and further offers would have such names: give another -o")
+    recording = GrowingRecording(place, lambda: time.sleep(_LOOK_S), rig=rig)
+    with progress("follow", None) as tell:
+
+        def told(what: str, done: int, of: int) -> None:
+            tell(following.exposures, f"{what}: {done} of {of}")
+
+        following = Following(recording.rig, wanted, output, told)
+        for exposure in recording.exposures():
+            for each in following.see(exposure):
+                if isinstance(each, Offer):
+                    with writing(each.path, sources=sources, error=IdentificationError) as partial:
+                        partial.write_text(each.result.text, newline="")
+                _say(each, as_json=as_json)
+            tell(following.exposures)
+    if recording.damage:
+        warn(f"{recording.path}: {recording.damage}")
+    if not following.judged:
+        raise IdentificationError(
+            f"{recording.path} ended after {following.exposures} exposures: {WINDOW} or more that show a spot are"
+            " needed to say whether a model fits"
+        )
+    if not as_json:
+        offers = ", ".join(offer_path(output, k + 1).name for k in range(following.offers)) or "none"
+        how = recording.end_metadata.get("ended", "complete")
+        ended = f"ended{'' if how == 'complete' else f' ({how})'} after {following.exposures} exposures"
+        stdout.print(f"{recording.path} {ended}; offers: {offers}", markup=False)
+
+
+def _say(each: "News | Offer", *, as_json: bool) -> None:
+    """Print what is new, a line for each thing, at once."""
+    from aolink.cli.tables.identification import offer_lines
+    from aolink.jobs.follow import News
+
+    if as_json:
+        if isinstance(each, News):
+            print(json.dumps({"frame": each.frame_id, "fits": each.fits, "text": each.text}), flush=True)
+            return
+        row = {
+            "frame": each.frame_id, "out": str(each.path), "fitted": each.fitted, "held_out": each.held_out,
+            "log_likelihood": each.log_likelihood, "before": each.before if math.isfinite(each.before) else None,
+            "outputs": [_as_json(found) for found in each.result.found],
+        }  # fmt: skip
+        print(json.dumps(row), flush=True)
+        return
+    for line in [each.text] if isinstance(each, News) else offer_lines(each):
+        stdout.print(f"frame {each.frame_id}: {line}", markup=False)
 
 
 def _as_json(found: "Found") -> dict[str, Any]:

@@ -3,12 +3,13 @@
 from aolink.identification.choose import CANDIDATES, Tried, chosen, tried
 from aolink.identification.models import PARAMETERS, PLANTS, UNITS, IdentifiedPlant, Process, ProcessSum, kinds_of
 from aolink.identification.readings import FEWEST, Readings, readings
+from aolink.identification.rig_model import RigModel, rig_model
 from aolink.identification.rig_text import identified_text
 from aolink.identification.search import Maximum, Space, maxima, space_of
 from aolink.identification.sets import Identified, Piece, identified
 
 __all__ = [
     "CANDIDATES", "FEWEST", "PARAMETERS", "PLANTS", "UNITS", "Identified", "IdentifiedPlant", "Maximum", "Piece",
-    "Process", "ProcessSum", "Readings", "Space", "Tried", "chosen", "identified", "identified_text", "kinds_of",
-    "maxima", "readings", "space_of", "tried",
+    "Process", "ProcessSum", "Readings", "RigModel", "Space", "Tried", "chosen", "identified", "identified_text",
+    "kinds_of", "maxima", "readings", "rig_model", "space_of", "tried",
 ]  # fmt: skip

@@ -10,9 +10,11 @@ They are sampled at the fast rate exactly.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,65 +48,28 @@ _APART = 1e-4
 """Least distance of two poles, as a share of their modulus: a double pole has no partial fractions."""
 
 
-@dataclass(frozen=True)
-class Process:
-    """One process of a disturbance, with the values of its parameters in the order of `PARAMETERS`."""
-
-    kind: str
-    values: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if self.kind not in PARAMETERS:
-            raise IdentificationError(f"{self.kind!r} is no kind of process: use one of {', '.join(PARAMETERS)}")
-        if len(self.values) != len(self.names) or not all(0 < value < math.inf for value in self.values):
-            raise IdentificationError(f"{self.kind} has {', '.join(self.names)}, each above 0, not {self.values}")
+class Covariance(ABC):
+    """The covariance of a process: a sum of exponentials, one for each of its poles."""
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return PARAMETERS[self.kind]
+    @abstractmethod
+    def poles(self) -> ComplexArray:
+        """lambda_i, 1/s, distinct."""
 
-    def __getitem__(self, name: str) -> float:
-        return self.values[self.names.index(name)]
+    @property
+    @abstractmethod
+    def shares(self) -> ComplexArray:
+        """The share of each pole in the stationary covariance, slope units squared."""
+
+    @property
+    @abstractmethod
+    def walk(self) -> float:
+        """Intensity of a random walk, slope units squared per second; 0 of a stationary process."""
 
     @property
     def is_stationary(self) -> bool:
         """Whether it has a stationary variance."""
-        return self.kind != "random-walk"
-
-    @cached_property
-    def poles(self) -> ComplexArray:
-        """lambda_i, 1/s, distinct."""
-        if not self.is_stationary:
-            return np.zeros(1, dtype=np.complex128)
-        found: list[complex] = []
-        for name, value in zip(self.names, self.values, strict=True):
-            if name.endswith("correlation_s"):
-                found.append(complex(-1 / value))
-            elif name.endswith("frequency_hz"):
-                damping = self[name.replace("frequency_hz", "damping")]
-                found += _pair(2 * math.pi * value, damping)
-        poles = np.array(found)
-        for k in range(1, len(poles)):
-            while np.abs(poles[k] - poles[:k]).min() < _APART * abs(poles[k]):
-                poles[k] *= 1 + 2 * _APART
-        return poles
-
-    @property
-    def variance(self) -> float:
-        """Stationary variance, slope units squared; infinite of a random walk."""
-        if not self.is_stationary:
-            return math.inf
-        if self.kind == "ornstein-uhlenbeck":
-            return self["intensity"] * self["correlation_s"] / 2
-        return self["sd"] ** 2
-
-    @cached_property
-    def shares(self) -> ComplexArray:
-        """The share of each pole in the stationary covariance, slope units squared: 1 / (a'(lambda) a(-lambda))."""
-        poles = self.poles
-        shares = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
-        return np.asarray(shares * (self.variance / shares.sum().real))
+        return self.walk == 0
 
     def covariance(self, lag_s: FloatArray) -> FloatArray:
         """Cov(theta(t), theta(t + lag)) of a stationary process, lags at least zero, shape of ``lag_s``."""
@@ -138,6 +103,65 @@ class Process:
         return np.asarray(np.maximum(self.poles.real, -fastest) + 1j * self.poles.imag)
 
 
+@dataclass(frozen=True)
+class Process(Covariance):
+    """One process of a disturbance, with the values of its parameters in the order of `PARAMETERS`."""
+
+    kind: str
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.kind not in PARAMETERS:
+            raise IdentificationError(f"{self.kind!r} is no kind of process: use one of {', '.join(PARAMETERS)}")
+        if len(self.values) != len(self.names) or not all(0 < value < math.inf for value in self.values):
+            raise IdentificationError(f"{self.kind} has {', '.join(self.names)}, each above 0, not {self.values}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return PARAMETERS[self.kind]
+
+    def __getitem__(self, name: str) -> float:
+        return self.values[self.names.index(name)]
+
+    @property
+    def walk(self) -> float:
+        return self["intensity"] if self.kind == "random-walk" else 0.0
+
+    @cached_property
+    def poles(self) -> ComplexArray:
+        if not self.is_stationary:
+            return np.zeros(1, dtype=np.complex128)
+        found: list[complex] = []
+        for name, value in zip(self.names, self.values, strict=True):
+            if name.endswith("correlation_s"):
+                found.append(complex(-1 / value))
+            elif name.endswith("frequency_hz"):
+                damping = self[name.replace("frequency_hz", "damping")]
+                found += _pair(2 * math.pi * value, damping)
+        poles = np.array(found)
+        for k in range(1, len(poles)):
+            while np.abs(poles[k] - poles[:k]).min() < _APART * abs(poles[k]):
+                poles[k] *= 1 + 2 * _APART
+        return poles
+
+    @property
+    def variance(self) -> float:
+        """Stationary variance, slope units squared; infinite of a random walk."""
+        if not self.is_stationary:
+            return math.inf
+        if self.kind == "ornstein-uhlenbeck":
+            return self["intensity"] * self["correlation_s"] / 2
+        return self["sd"] ** 2
+
+    @cached_property
+    def shares(self) -> ComplexArray:
+        """The share of each pole in the stationary covariance, slope units squared: 1 / (a'(lambda) a(-lambda))."""
+        poles = self.poles
+        shares = np.array([1 / (np.prod(p - np.delete(poles, k)) * np.prod(-p - poles)) for k, p in enumerate(poles)])
+        return np.asarray(shares * (self.variance / shares.sum().real))
+
+
 def _pair(omega: float, damping: float) -> list[complex]:
     root = omega * complex(damping**2 - 1) ** 0.5
     return [-omega * damping + root, -omega * damping - root]
@@ -157,6 +181,13 @@ class StateSpace:
     """(1, n_states)"""
     initial_covariance: FloatArray
     """Stationary covariance, (n_states, n_states); that of the first state of a random walk is ``start_variance``."""
+
+
+class Disturbance(Protocol):
+    """What a likelihood needs of a model: independent processes, whose sum it is."""
+
+    @property
+    def processes(self) -> Sequence[Covariance]: ...
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ _SPACING = 0.06
 _DECAY = 0.4
 """By how much a resonance of the grid decays in a frame period, in nats."""
 _STARTS = 8
+_ROUNDS = 3
+"""How often, at most, the aliases of what is the highest maximum by then are looked at once more."""
 _MOST = 3000
 """Most points of a grid of several processes."""
 KEPT = 12.0
@@ -224,6 +226,17 @@ def maxima(space: Space, seen: Sequence[Readings], tell: Told | None = None) -> 
             _add(space, best, climb(space, each.x, of))
     if not best:
         raise IdentificationError("no model of this kind has a likelihood here: are there readings at all?")
+    looked_at: list[Maximum] = []
+    for _ in range(_ROUNDS):
+        # A sharp line beside a drift is often found at an alias first, and only from its very top is the true one.
+        top = max(best, key=lambda each: each.log_likelihood)
+        if any(_near(space, top.x, other.x, 5e-3) for other in looked_at):
+            break
+        looked_at.append(top)
+        for start in _aliases(space, top.x, seen[0]):
+            _add(space, best, climb(space, start, of))
+    highest = max(each.log_likelihood for each in best)
+    best = [each for each in best if each.log_likelihood > highest - KEPT]
     apart: list[Maximum] = []
     for each in sorted(best, key=lambda each: -each.log_likelihood):
         # Halfway along a ridge it is no lower: that is one maximum, not yet reached from both ends.

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from aolink.control import Act, ControlLoop, State, find_controller, stability
+from aolink.control import Act, ControllerRow, ControlLoop, State, find_controller, stability
 from aolink.errors import RecordingError
 from aolink.estimation import Driver, Estimate
 from aolink.exposure import Exposure, residual_rms
@@ -43,7 +43,7 @@ def seed_of(recording: Recording) -> int | None:
 
 
 def closed_loop(
-    rig: Rig, controller: str, estimator: str, exposures: int, *, seed: int | None = None,
+    rig: Rig, controller: str | ControllerRow, estimator: str, exposures: int, *, seed: int | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Closed]:  # fmt: skip
     """The exposures of a simulated rig whose loop is closed, as a session on virtual time has them.
@@ -51,7 +51,7 @@ def closed_loop(
     Parameters
     ----------
     controller:
-        Its name; empty to leave the loop open, with the mirror at its safe input.
+        Its name, or its row; empty to leave the loop open, with the mirror at its safe input.
     estimator:
         The estimator that serves it; empty for none.
     seed:

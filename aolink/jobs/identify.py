@@ -105,12 +105,17 @@ def identify(recordings: Sequence[Recording], rig: Rig | None, wanted: Wanted, t
         seen.append(readings(own, list(recording.exposures()), plant_known=plant_known))
         if tell:
             tell("recordings", number + 1, len(recordings))
-    found = [_of_output(first, label, each, wanted, tell) for label, each in _by_output(first, seen)]
+    return from_readings(first, seen, wanted, tell)
+
+
+def from_readings(rig: Rig, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None = None) -> Result:
+    """As `identify`, from the readings of each recording."""
+    found = [_of_output(rig, label, each, wanted, tell) for label, each in _by_output(rig, seen)]
     one = found[0]
     if wanted.plant and len(found) > 1:
         raise IdentificationError("a plant is identified where one input moves one output of a copy of it")
     text = identified_text(
-        first.toml, first, [each.model for each in found], plant=one.plant, noise=one.noise, wider=one.wider
+        rig.toml, rig, [each.model for each in found], plant=one.plant, noise=one.noise, wider=one.wider
     )
     return Result(found=tuple(found), text=text)
 
@@ -125,12 +130,17 @@ def _by_output(rig: Rig, seen: Sequence[Readings]) -> list[tuple[str, list[Readi
     return [(label, [_some(each, which) for each in seen]) for label, which in zip(labels, groups, strict=True)]
 
 
-def _some(seen: Readings, which: list[int]) -> Readings:
+def _some(seen: Readings, which: Sequence[int]) -> Readings:
+    return seen.of_outputs(outputs_of(seen, which))
+
+
+def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
+    """Those of some outputs that a model is fitted to. Raises IdentificationError where none shows a spot."""
     seeing = [o for o in which if seen.usable[o].any()]
     if not seeing:
         raise IdentificationError("no exposure shows a spot of this output")
-    chosen_outputs = np.unique(np.linspace(0, len(seeing) - 1, min(len(seeing), _MOST_OUTPUTS)).round().astype(int))
-    return seen.of_outputs([seeing[k] for k in chosen_outputs])
+    at = np.unique(np.linspace(0, len(seeing) - 1, min(len(seeing), _MOST_OUTPUTS)).round().astype(int))
+    return [seeing[k] for k in at]
 
 
 def _of_output(rig: Rig, output: str, seen: Sequence[Readings], wanted: Wanted, tell: Tell | None) -> Found:

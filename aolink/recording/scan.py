@@ -48,8 +48,8 @@ from aolink.recording.search import HEAD, MESSAGE_HEAD, Search, begins_a_record,
 _MOST_READINGS = 4
 """How many times the file's size is read, at most, of records that turn out to be none."""
 _READ_BYTES = 1 << 20
-_MAGIC = b"\x89MCAP0\r\n"
-_FOOTER_BYTES = HEAD.size + 20 + len(_MAGIC)
+MAGIC = b"\x89MCAP0\r\n"
+_FOOTER_BYTES = HEAD.size + 20 + len(MAGIC)
 
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
 _PARSERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
@@ -140,14 +140,14 @@ def open_recording(path: Path | Url, expected: Sequence[tuple[int, int]] = ()) -
             if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
                 raise RecordingError(f"{path} is a pipe or a device: a recording must be a file, copy it into one")
             file = path.open("rb")
-        head = file.read(len(_MAGIC) + HEAD.size)
+        head = file.read(len(MAGIC) + HEAD.size)
     except OSError as error:
         raise RecordingError(f"cannot read {path}: {os.strerror(error.errno or 0).lower()}") from None
-    if len(head) < len(_MAGIC):
+    if len(head) < len(MAGIC):
         file.close()
         raise RecordingError(f"{path} is empty or too short to be a recording")
     # A bit of the first bytes may be damaged: then the record after them tells.
-    if not head.startswith(_MAGIC) and head[len(_MAGIC) :][:1] != bytes([Opcode.HEADER]):
+    if not head.startswith(MAGIC) and head[len(MAGIC) :][:1] != bytes([Opcode.HEADER]):
         file.close()
         raise RecordingError(f"{path} is not a recording: it is not an MCAP file")
     return file
@@ -159,14 +159,14 @@ def read_summary(file: IO[bytes]) -> Summary | None:
     Empty where the writer has left it out.
     """
     size = file.seek(0, os.SEEK_END)
-    if size < len(_MAGIC) + _FOOTER_BYTES:
+    if size < len(MAGIC) + _FOOTER_BYTES:
         return None
     file.seek(size - _FOOTER_BYTES)
     tail = file.read(_FOOTER_BYTES)
     opcode, length = HEAD.unpack_from(tail)
     start, _, crc = struct.unpack_from("<QQI", tail, HEAD.size)
     end = size - _FOOTER_BYTES
-    if not tail.endswith(_MAGIC) or (opcode, length) != (Opcode.FOOTER, 20) or start > end:
+    if not tail.endswith(MAGIC) or (opcode, length) != (Opcode.FOOTER, 20) or start > end:
         return None
     start = start or end
     if end - start > limits().record_bytes:
@@ -236,9 +236,9 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
 
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
-    if file.read(len(_MAGIC)) != _MAGIC:
-        lose(Loss(0, len(_MAGIC), "the first bytes are damaged"))
-    position = len(_MAGIC)
+    if file.read(len(MAGIC)) != MAGIC:
+        lose(Loss(0, len(MAGIC), "the first bytes are damaged"))
+    position = len(MAGIC)
     search, before = Search(file, size), 0
     whole_end: bool | None = None
     readings, budget = _MOST_READINGS * size, Budget(str(getattr(file, "name", "the file")), size)
@@ -282,6 +282,35 @@ def scan(file: IO[bytes], on_loss: Callable[[Loss], None]) -> Iterator[tuple[Mca
             end = found
         position, before = end, head[0]
     lose(Loss(size, 0, f"it was cut off: it ends at byte {size}, without an index"))
+
+
+def grown(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) -> tuple[int, list[McapRecord], bool]:
+    """The record at a position of a file that may still be written; of a chunk, those in it.
+
+    Returns
+    -------
+    Where the next record begins, which is ``position`` while this one is not whole; what it holds, as far as it is of
+    interest; whether it is the end of the data.
+
+    Raises
+    ------
+    RecordingError
+        What is there makes no sense, or is no longer there.
+    """
+    size, name = file.seek(0, os.SEEK_END), str(getattr(file, "name", "the file"))
+    if size < position:
+        raise RecordingError(f"{name} has become shorter while it was read: it was cut or replaced; begin again")
+    file.seek(position)
+    head = file.read(HEAD.size)
+    end = position + HEAD.size + (HEAD.unpack(head)[1] if len(head) == HEAD.size else 0)
+    if len(head) < HEAD.size or end > size:
+        return position, [], False
+    if not is_plausible(head[0], end - position - HEAD.size, file, 0):
+        raise RecordingError(f"{name} makes no sense at byte {position}: `aolink recover` copies what is whole")
+    record = _record_at(file, position, on_loss)
+    if isinstance(record, Chunk):
+        return end, list(broken_up(record, position, on_loss, Budget(name, size))), False
+    return end, [] if record is None else [record], head[0] == Opcode.DATA_END
 
 
 def _check_data(file: IO[bytes], end: int, on_loss: Callable[[Loss], None]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aolink.control import delay_steps
+from aolink.control import ControllerRow, Seen, delay_steps
 from aolink.control.fall_back import INTEGRATOR, Rival
 from aolink.control.loop import centroids
 from aolink.exposure import residual_rms
@@ -102,3 +102,43 @@ def test_a_controller_whose_model_fits_again_acts_again(tmp_path: Path) -> None:
 def test_it_can_be_switched_off() -> None:
     assert small_rig(control="fall_back = false").control.fall_back is False
     assert small_rig().control.fall_back is True
+
+
+class Pushed:
+    """A controller that always gives the same input, and remembers what it was shown."""
+
+    shown: list[Seen]
+
+    def __init__(self, rig: Rig) -> None:
+        self.shown, self._u = [], np.full(rig.n_inputs, 0.05)
+
+    def see(self, seen: Seen) -> None:
+        self.shown.append(seen)
+
+    def step(self, held: FloatArray) -> FloatArray:
+        return self._u
+
+
+def test_who_does_not_act_is_shown_the_state_and_slopes_of_a_mirror_of_its_own() -> None:
+    rig = small_rig(DRIFT)
+    pushed = Pushed(rig)
+    row = ControllerRow(name="pushed", summary="for show", build=lambda _: pushed, needs_state=True)
+    rival = Rival(rig, row, delay_steps(rig), rig.mirror.park)
+    held = np.tile(rig.mirror.park, (STEPS, 1))
+    plant = rig.plant
+    state = np.random.default_rng(0).standard_normal((plant.axes, plant.n_states))
+    rest = np.tile(rig.mirror.park, (STEPS + delay_steps(rig), 1))
+    inputs = np.concatenate([rest, rig.mirror.quantise(np.full((2 * STEPS, rig.n_inputs), 0.05))])
+    away, path = np.zeros_like(state), []
+    for u in inputs[: 3 * STEPS]:
+        path.append(away)
+        away = away @ plant.A.T + (u - rig.mirror.park).reshape(plant.axes, -1) @ plant.B.T
+    path.append(away)
+    for k in (1, 2, 3):
+        rival.see(held, np.zeros(rig.n_outputs), state)
+        seen = pushed.shown[-1]
+        assert seen.state is not None
+        np.testing.assert_allclose(seen.state - state, path[k * STEPS], atol=1e-12)
+        slopes = np.array(path[(k - 1) * STEPS : k * STEPS]) @ plant.C.T
+        np.testing.assert_allclose(seen.slopes, slopes.mean(axis=0).ravel(), atol=1e-12)
+    assert abs(path[-1]).max() > 0.01

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from aolink.control import ControllerRow, ControlLoop, Seen, State
+from aolink.control import ControllerRow, ControlLoop, Seen, State, find_controller
 from aolink.control.loop import BLIND_EXPOSURES, TRUSTED_EXPOSURES, centroids
 from aolink.errors import ControlError
 from aolink.estimation import Status, make_estimator
@@ -32,6 +32,16 @@ def run(rig: Rig, controller: str, estimator: str = "", exposures: int = 60) -> 
 def test_the_integrator_takes_off_what_is_slow() -> None:
     rig = small_rig(DRIFT)
     assert residual(run(rig, "integrator")) < 0.6 * residual(run(rig, ""))
+
+
+def test_a_controller_may_be_given_by_its_row() -> None:
+    """As one that is not installed is."""
+    rig = small_rig(DRIFT)
+    row = ControllerRow(name="mine", summary="", build=find_controller("integrator", rig).build, needs_state=False)
+    ours = list(closed_loop(rig, row, "", 12))
+    assert residual(ours) == residual(run(rig, "integrator", exposures=12))
+    assert ours[-1].act is not None
+    assert ours[-1].act.acting == "mine"
 
 
 def test_lqg_takes_off_a_line_that_the_integrator_makes_worse() -> None:

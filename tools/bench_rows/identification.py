@@ -1,19 +1,26 @@
-"""Whether the sets of `aolink identify` hold the truth as often as they say, over logs drawn at random."""
+"""`aolink identify` over logs drawn at random: whether its sets hold the truth, and what it offers when it follows."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 import aolink
-from aolink.identification import Process, ProcessSum, identified, maxima, readings, space_of
-from aolink.rig import Rig, parse_rig
+from aolink.exposure import Exposure
+from aolink.identification import Identified, Process, ProcessSum, identified, maxima, readings, space_of
+from aolink.jobs.follow import Following, Offer
+from aolink.jobs.identify import Wanted
+from aolink.numerics.covariance import psd_root
+from aolink.rig import Rig, load_rig, parse_rig
 from bench_rows.row import FULL, Effort, Row
 
 _KINDS = (
@@ -122,3 +129,106 @@ def _rows(logs: list[dict[str, bool]]) -> Iterator[Row]:
             f"95 % sets of {name} that hold the truth", f"{sum(hits)} of {len(hits)}", f"{least:.0f}, binomial",
             sum(hits) / max(least, 1.0), 1.0,
         )  # fmt: skip
+
+
+_FIRST_FOLLOWED = 40_000
+_CHANGED_AFTER = 80
+"""Exposures."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """What becomes of the disturbance of the rig `loop`, whose rig file goes on believing in what it was."""
+
+    name: str
+    frequency: float = 1.0
+    """Factor of the line's frequency."""
+    sd: float = 1.0
+    """Factor of the gain of all its noise: of the sd of drift and line."""
+
+    def rig(self) -> Rig:
+        text = load_rig("loop").toml.replace("frequency_hz = 12.0", f"frequency_hz = {12.0 * self.frequency}")
+        return parse_rig(text.replace("\nsd = 0.1", f"\nsd = {0.1 * self.sd}"))
+
+
+_CHANGES = (
+    Change("line 10 % higher", frequency=1.1),
+    Change("line 10 % lower", frequency=0.9),
+    Change("line 20 % higher", frequency=1.2),
+    Change("line 20 % lower", frequency=0.8),
+    Change("gain of the noise times 3", sd=3.0),
+    Change("gain of the noise by 3", sd=1 / 3),
+)
+
+
+def following(effort: Effort) -> list[Row]:
+    """What `aolink identify --follow` offers on the rig `loop` when its disturbance changes after 80 of 320 exposures.
+
+    8 logs of each change; of logs without one, 16, and 8 of the rig `jitter`, with 320 exposures each.
+    """
+    exposures, seeds = effort.of(320, 4), range(_FIRST_FOLLOWED, _FIRST_FOLLOWED + effort.of(8))
+    rows = []
+    for rig, count in (("loop", 2 * len(seeds)), ("jitter", len(seeds))):
+        quiet = [_offers(list(aolink.simulate(rig, exposures, seed=_FIRST_FOLLOWED + k)), rig)[0] for k in range(count)]
+        right = sum(not each for each in quiet)
+        rows.append(Row(
+            f"{rig}, unchanged: logs without an offer", f"{right} of {count}", "all of them", right / count, 0.95,
+        ))  # fmt: skip
+    for change in _CHANGES:
+        logs = [_offers(changed(change, exposures, seed), "loop") for seed in seeds]
+        offered = [offers[0] for offers, _ in logs if offers]
+        truth = 12.0 * change.frequency
+        held = sum(_frequency(offer).holds(truth) for offer in offered)
+        off = [100 * abs(_frequency(offer).best / truth - 1) for offer in offered] or [math.nan]
+        later = [offer.frame_id - _CHANGED_AFTER for offer in offered]
+        when = f", {min(later)} to {max(later)} exposures later" if later else ""
+        missed = sum(each for _, each in logs)
+        rows.append(Row(
+            f"loop, {change.name}: logs with an offer", f"{len(offered)} of {len(logs)}{when}",
+            f"said not to fit in {missed}; frequency off by {np.median(off):.1f} %, at most {max(off):.1f} %; {held} of"
+            f" {len(offered)} sets hold the truth",
+            len(offered) / len(logs), 0.5,
+        ))  # fmt: skip
+    return rows
+
+
+def _offers(exposures: Sequence[Exposure], rig: str) -> tuple[list[Offer], bool]:
+    """What is offered, and whether it was said that the rig file's model does not fit."""
+    job = Following(load_rig(rig), Wanted(), Path("identified.toml"))
+    news = [each for exposure in exposures for each in job.see(exposure)]
+    return [each for each in news if isinstance(each, Offer)], any(
+        each.fits is False for each in news if not isinstance(each, Offer)
+    )
+
+
+def _frequency(offer: Offer) -> Identified:
+    (found,) = offer.result.found
+    return next(each for each in found.parameters if each.name.endswith("frequency_hz"))
+
+
+def changed(change: Change, exposures: int, seed: int) -> list[Exposure]:
+    """A log of the rig `loop` whose disturbance goes on from the state that it is in when its model changes."""
+    rig, random = load_rig("loop"), np.random.default_rng(seed)
+    slopes = _slopes([(rig, _CHANGED_AFTER), (change.rig(), max(exposures - _CHANGED_AFTER, 0) + 2)], random)
+    with TemporaryDirectory() as folder:
+        np.save(Path(folder) / "slopes.npy", slopes)
+        table = '[disturbance]\nplant_noise = false\nrecorded = "slopes.npy"\n\n[simulation]'
+        path = Path(folder) / "rig.toml"
+        path.write_text(rig.toml.replace("[simulation]", table, 1))
+        return list(aolink.simulate(load_rig(path), exposures, seed=seed))
+
+
+def _slopes(parts: list[tuple[Rig, int]], random: np.random.Generator) -> NDArray[np.float64]:
+    """Slopes at each fast step, (steps, 1), by the models of several rigs, each for so many exposures."""
+    out: list[NDArray[np.float64]] = []
+    state = None
+    for rig, exposures in parts:
+        model = None if rig.disturbance is None else rig.disturbance.model
+        assert model is not None
+        if state is None:
+            state = psd_root(model.initial_covariance) @ random.standard_normal(len(model.A))
+        root = model.B_w @ psd_root(model.process_noise)
+        for push in random.standard_normal((exposures * rig.timing.frame_period_steps, root.shape[1])):
+            out.append(model.C @ state)
+            state = model.A @ state + root @ push
+    return np.array(out)

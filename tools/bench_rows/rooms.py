@@ -21,16 +21,21 @@ ROWS = {
     "start": ("command_start", "view_start"),
     "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
+    "shaken": ("shaken",),
     "moving_scene": ("moving_scene",),
     "loop": ("residual_slopes", "fall_back"),
-    "identification": ("coverage",),
+    "loop_worth": (
+        "worth_headline", "worth_lines", "worth_resonance", "worth_air", "worth_factors",
+    ),
+    "identification": ("coverage", "following"),
 }  # fmt: skip
 """Functions that measure, by the module of bench_rows that they are in, in the order of the table."""
 
 LONG = frozenset(
     {
-        "soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "moving_scene", "residual_slopes",
-        "fall_back", "coverage",
+        "soak", "bit_errors", "large_frames", "time_to_park", "restoration_quality", "shaken", "moving_scene",
+        "residual_slopes", "fall_back", "worth_headline", "worth_lines", "worth_resonance", "worth_air",
+        "worth_factors", "coverage", "following",
     }
 )  # fmt: skip
 """Those that take two minutes or more each, `soak` forty: they are measured where they are named, or with `--long`."""

@@ -11,6 +11,7 @@ from rich.table import Table
 from aolink.identification import UNITS, Identified
 
 if TYPE_CHECKING:
+    from aolink.jobs.follow import Offer
     from aolink.jobs.identify import Found
 
 
@@ -31,6 +32,24 @@ def found(one: Found) -> Iterator[Table]:
         unit = UNITS.get(parameter.name.split(".")[-1], "")
         table.add_row(parameter.name, f"{parameter.best:.4g}", unit, set_text(parameter))
     yield table
+
+
+def offer_lines(offer: Offer) -> Iterator[str]:
+    """What is offered in the place of what, and how much likelier it makes exposures that it was not fitted to."""
+    (first, last), (held_first, held_last) = offer.fitted, offer.held_out
+    yield (
+        f"{offer.path.name} is offered: log-likelihood {offer.log_likelihood:.1f} nats against {offer.before:.1f} of"
+        f" {offer.before_name} ({offer.before_model}) on frames {held_first} to {held_last}, held out; fitted to frames"
+        f" {first} to {last}"
+    )
+    for one in offer.result.found:
+        values = ", ".join(
+            f"{each.name} {each.best:.4g}{' ' * bool(unit)}{unit} ({set_text(each)})"
+            for each in one.parameters
+            for unit in [UNITS.get(each.name.split(".")[-1], "")]
+        )
+        yield f"{offer.path.name}, {one.output}: {one.model.name}: {values}"
+        yield from (f"note: {note}" for note in one.notes)
 
 
 def set_text(parameter: Identified) -> str:

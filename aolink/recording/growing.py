@@ -1,0 +1,98 @@
+"""A recording that a session may still be writing: its exposures as they come, each once, up to its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+
+from mcap.records import Attachment, Channel, McapRecord, Metadata, Schema
+from mcap.records import Message as McapMessage
+
+from aolink import files
+from aolink.errors import RecordingError
+from aolink.recording import topics
+from aolink.recording.reader import RawMessage, Recording
+from aolink.recording.remote import Url, location
+from aolink.recording.scan import MAGIC, Loss, grown, open_recording
+from aolink.rig import Rig
+
+
+class GrowingRecording(Recording):
+    """A recording whose exposures come as they are written: what gives them waits for more.
+
+    They end where the file does: with the end of its data or, where it was cut off, when nobody writes it any longer.
+    They can be read once, in order, without truth and scene; numbers, slices and counts need an index.
+
+    Parameters
+    ----------
+    wait:
+        Called where there is nothing new, before the next look at the file.
+    rig:
+        As of `Recording`.
+
+    Raises
+    ------
+    RecordingError
+        As by `Recording`; the file is behind a URL, or does not begin with its rig file.
+    """
+
+    def __init__(self, path: str | Path | Url, wait: Callable[[], None], *, rig: Rig | None = None) -> None:
+        if isinstance(place := location(path), Url):
+            raise RecordingError(f"{place} is a URL: what is followed while it is written is a file of this machine")
+        self._wait = wait
+        self._coming = self._written(place)
+        self._names: dict[int, str] = {}
+        """Names of the schemas by their ids."""
+        super().__init__(place, rig=rig)
+
+    def _survey(self, *, check: bool) -> str | None:
+        """Read up to the rig file, which a session writes before any message."""
+        for record in self._coming:
+            if isinstance(record, Attachment) and record.name == topics.RIG_ATTACHMENT:
+                return record.data.decode(errors="replace")
+            if isinstance(record, McapMessage):
+                raise RecordingError(f"{self.path} has messages before its rig file: it can only be read when finished")
+        return None
+
+    def _own_messages(
+        self, wanted: Collection[str], low: int = 0, high: int = 1 << 64, chunks: slice = slice(None)
+    ) -> Iterator[RawMessage]:
+        for record in self._coming:
+            if isinstance(record, Schema):
+                self._names[record.id] = record.name
+            elif isinstance(record, Channel):
+                self._channels[record.id] = (record.topic, self._names.get(record.schema_id, ""))
+            elif isinstance(record, Metadata):
+                self._note([record])
+            elif isinstance(record, McapMessage) and record.channel_id in self._channels:
+                topic, schema = self._channels[record.channel_id]
+                if topic in wanted and low <= record.log_time < high:
+                    yield RawMessage(topic, schema, record.log_time, record.sequence, record.data)
+
+    def _written(self, path: Path) -> Iterator[McapRecord]:
+        """The records of the file, those in chunks too, as they are written."""
+        while path.exists() and path.stat().st_size < len(MAGIC) and _is_being_written(path):
+            self._wait()  # the session has only just begun
+        with open_recording(path) as file:
+            position, ended, written = len(MAGIC), False, True
+            while not ended:
+                before = position
+                position, records, ended = grown(file, position, self._lose)
+                yield from records
+                if position > before:
+                    continue
+                if not written:
+                    what = f"it was cut off: it ends at byte {position}, without an index"
+                    self._lose(Loss(position, 0, what))
+                    return
+                # What was written between the last look and the writer's end is still read.
+                if written := _is_being_written(path):
+                    self._wait()
+
+
+def _is_being_written(path: Path) -> bool:
+    """As `files.is_being_written`; true where that cannot be found out, as of a file that may only be read."""
+    try:
+        return files.is_being_written(path)
+    except OSError:
+        return True

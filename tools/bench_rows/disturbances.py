@@ -1,0 +1,152 @@
+"""What a loop is disturbed by, step by step, with what is known of it by one who has seen its true slopes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, optimize, signal
+
+from aolink.identification import Process, ProcessSum
+from aolink.numerics.covariance import psd_root
+from aolink.optics.turbulence import FrozenFlow, Layer
+
+FloatArray = NDArray[np.float64]
+
+STEP_S = 1e-3
+PUPIL_M = 0.5
+WINDS_M_S = (5.0, 11.0)
+"""Of the two layers, which blow in directions drawn by the seed."""
+DAMPING = 0.002
+_SHORTEST_M = PUPIL_M / 8
+_PIXELS = 16
+"""Of HCIPy's screens across the pupil."""
+_ORDER = 64
+_RIDGE = 1e-9
+_HIGHEST_HZ = 100.0
+"""Up to which a model is fitted to the spectrum of turbulence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """Slopes at each fast step, and the state from which one who has seen all of them up to a step predicts the next.
+
+    Row k of ``states``, (steps, n), goes with ``slopes[k]``, which is C x(k); the prediction is x(k+1) = A x(k).
+    """
+
+    slopes: FloatArray
+    states: FloatArray
+    A: FloatArray
+    C: FloatArray
+    model: ProcessSum
+    """What an estimator is told."""
+
+
+def together(parts: Sequence[Disturbance]) -> Disturbance:
+    """The sum of independent disturbances."""
+    return Disturbance(
+        np.sum([part.slopes for part in parts], axis=0), np.hstack([part.states for part in parts]),
+        np.asarray(linalg.block_diag(*(part.A for part in parts))), np.hstack([part.C for part in parts]),
+        ProcessSum(tuple(process for part in parts for process in part.model.processes)),
+    )  # fmt: skip
+
+
+def line(frequency_hz: float, sd: float, steps: int, seed: int) -> Disturbance:
+    """A resonance that noise drives. Its model is the true one."""
+    model = ProcessSum((Process("resonance", (frequency_hz, DAMPING, sd)),))
+    space, random = model.state_space(STEP_S), np.random.default_rng([seed, 1])
+    pushes = random.standard_normal((steps, len(space.A))) @ psd_root(space.W).T @ space.B_w.T
+    states = np.empty((steps, len(space.A)))
+    state = psd_root(space.initial_covariance) @ random.standard_normal(len(space.A))
+    for k, push in enumerate(pushes):
+        states[k] = state
+        state = space.A @ state + push
+    return Disturbance(states @ space.C[0], states, space.A, space.C, model)
+
+
+def turbulence(kind: str, sd: float, steps: int, past: int, seed: int) -> Disturbance:
+    """Tilt of two von Karman layers in frozen flow: ``own`` waves, or HCIPy's screens, ``hcipy``.
+
+    It has no finite model. What is known is fitted to its true slopes in the first ``past`` steps: an autoregressive
+    model, and for the estimators the sum of two processes of second order with the likeliest spectrum (Whittle).
+    """
+    slopes = sd * _tilt(kind, steps, seed)
+    order = min(_ORDER, past // 4)
+    A = _autoregressive(slopes[:past], order)
+    led = np.concatenate([np.full(order - 1, slopes[0]), slopes])
+    states = np.lib.stride_tricks.sliding_window_view(led, order)[:, ::-1]
+    return Disturbance(slopes, states, A, np.eye(1, order), _likeliest(slopes[:past]))
+
+
+@lru_cache(maxsize=16)
+def _tilt(kind: str, steps: int, seed: int) -> FloatArray:
+    """Of mean zero and sd 1, (steps,)."""
+    random = np.random.default_rng([seed, 2])
+    made = np.sum([(_waves if kind == "own" else _screen)(wind, steps, random) for wind in WINDS_M_S], axis=0)
+    return np.asarray((made - made.mean()) / made.std())
+
+
+def _wind(speed_m_s: float, random: np.random.Generator) -> tuple[float, float]:
+    turn = random.uniform(0, 2 * math.pi)
+    return speed_m_s * math.cos(turn), speed_m_s * math.sin(turn)
+
+
+def _waves(speed_m_s: float, steps: int, random: np.random.Generator) -> FloatArray:
+    """Mean slope over a square pupil."""
+    flow = FrozenFlow(Layer(r0_m=0.1, wind_m_s=_wind(speed_m_s, random)), random, shortest_m=_SHORTEST_M)
+    k = flow.wave_numbers
+    tilts = 1j * k[:, 0] * flow.amplitudes * np.prod(np.sinc(k * PUPIL_M / (2 * math.pi)), axis=1)
+    times = STEP_S * np.arange(steps, dtype=np.float64)
+    return np.concatenate([np.real(tilts @ flow.blown(times[k : k + 4096])) for k in range(0, steps, 4096)])
+
+
+def _screen(speed_m_s: float, steps: int, random: np.random.Generator) -> FloatArray:
+    """The same by HCIPy's infinitely long screen: the difference of the phase between two sides of the pupil."""
+    import hcipy
+
+    side = _PIXELS + 1
+    grid = hcipy.make_pupil_grid(side, PUPIL_M * side / _PIXELS)
+    layer = hcipy.InfiniteAtmosphericLayer(
+        grid, hcipy.Cn_squared_from_fried_parameter(0.1, 500e-9), 25.0, np.array(_wind(speed_m_s, random)),
+        seed=int(random.integers(1 << 31)),
+    )  # fmt: skip
+    tilts = np.empty(steps)
+    for k in range(steps):
+        layer.evolve_until(k * STEP_S)
+        phase = np.asarray(layer.phase_for(500e-9)).reshape(side, side)
+        tilts[k] = (phase[:, -1] - phase[:, 0]).mean()
+    return tilts
+
+
+def _autoregressive(slopes: FloatArray, order: int) -> FloatArray:
+    """The companion matrix of the least-squares fit, whose state is the last values, the newest first."""
+    rows = np.lib.stride_tricks.sliding_window_view(slopes, order + 1)
+    before, after = rows[:, -2::-1], rows[:, -1]
+    normal = before.T @ before
+    normal += _RIDGE * np.trace(normal) / order * np.eye(order)
+    return np.vstack([np.linalg.solve(normal, before.T @ after), np.eye(order - 1, order)])
+
+
+def _likeliest(slopes: FloatArray) -> ProcessSum:
+    frequency, power = signal.periodogram(slopes, 1 / STEP_S, window="hann", detrend="constant")
+    used = slice(2, int(np.searchsorted(frequency, _HIGHEST_HZ)))  # the taper mixes the first two with the mean
+    omega, power, sd = 2 * math.pi * frequency[used], power[used] / 2, slopes.std()
+
+    def model(x: FloatArray) -> ProcessSum:
+        values = np.exp(x).reshape(2, 3)
+        return ProcessSum(tuple(Process("second-order", tuple(each)) for each in values.tolist()))
+
+    def minus_log_likelihood(x: FloatArray) -> float:
+        density = np.zeros_like(omega)
+        for each in model(x).processes:
+            poles = each.poles[:, None]
+            density += (each.shares[:, None] * -2 * poles / (poles**2 + omega**2)).sum(axis=0).real
+        return float(np.sum(np.log(density) + power / density))
+
+    start = np.log([0.3, 0.03, 0.7 * sd, 0.05, 0.01, 0.7 * sd])
+    limits = [(math.log(1e-3), math.log(10.0))] * 2 + [(math.log(1e-3 * sd), math.log(3 * sd))]
+    return model(optimize.minimize(minus_log_likelihood, start, method="L-BFGS-B", bounds=2 * limits).x)

@@ -1,0 +1,318 @@
+"""What closing the loop is worth under turbulence and a line, beside pyRTC's predictors and the limit."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from aolink.control import ControllerRow
+from aolink.control.loop import centroids
+from aolink.exposure import Exposure, residual_rms
+from aolink.identification import ProcessSum, identified_text, maxima, readings, space_of
+from aolink.jobs.closed_loop import closed_loop
+from aolink.rig import Rig, load_rig, parse_rig
+from bench_rows.disturbances import STEP_S, Disturbance, line, together, turbulence
+from bench_rows.rivals import PREDICTORS, predicted, with_true_state
+from bench_rows.row import Effort, Row
+
+FloatArray = NDArray[np.float64]
+
+GAINS = (0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.3)
+_KERNEL_SD = 0.1 / math.sqrt(2)
+"""Of the rig `loop`, slope units."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A disturbance, a camera, and what finds the state for `lqg`."""
+
+    turbulence: str
+    """``own``, ``hcipy``, or empty for none."""
+    line: float
+    """Times the frame rate; 0 for none. Where there are both, their sd is equal."""
+    widths: float = 1.5
+    """Sd of the path over that of the kernel."""
+    steps: int = 50
+    """Fast steps in an exposure, and from frame to frame."""
+    noise: float = 0.02
+    """Sd of the centroid's noise (of a sum over all pixels) over that of the path."""
+    estimators: tuple[str, ...] = ("o1", "moments")
+    """With the model of who knows the disturbance."""
+    identified: tuple[str, ...] = ()
+    """With the model that is found in the past exposures alone."""
+
+    def __str__(self) -> str:
+        kind = {"own": "turbulence", "hcipy": "HCIPy's turbulence", "": ""}[self.turbulence]
+        at = f"line at {self.line:g}" if self.line else ""
+        text = " + ".join(filter(None, (kind, at)))
+        others = [
+            f"{self.widths:g} widths" if self.widths != 1.5 else "", f"N = {self.steps}" if self.steps != 50 else "",
+            f"noise {100 * self.noise:g} %" if self.noise != 0.02 else "",
+        ]  # fmt: skip
+        return ", ".join(filter(None, (text, *others)))
+
+    @property
+    def kinds(self) -> list[str]:
+        """Of the processes that are identified, as `aolink identify --model` names them."""
+        return [kind for kind, there in (("ornstein-uhlenbeck", self.turbulence), ("resonance", self.line)) if there]
+
+    @property
+    def sd(self) -> float:
+        """Of the path, slope units."""
+        return self.widths * _KERNEL_SD
+
+    def disturbance(self, steps: int, past: int, seed: int) -> Disturbance:
+        """Slopes of that many fast steps, the first ``past`` of them known."""
+        parts, sd = [], self.sd / math.sqrt(bool(self.turbulence) + bool(self.line))
+        if self.turbulence:
+            parts.append(turbulence(self.turbulence, sd, steps, past, seed))
+        if self.line:
+            parts.append(line(self.line / (self.steps * STEP_S), sd, steps, seed))
+        return together(parts)
+
+    def rig(self, model: ProcessSum) -> Rig:
+        """The rig `loop` with this camera, which believes in ``model``."""
+        text = load_rig("loop").toml.replace("exposure_steps = 50", f"exposure_steps = {self.steps}")
+        # The variance of the centroid is 2/3 V.
+        text = text.replace("noise_density = 1e-5", f"noise_density = {1.5 * (self.noise * self.sd) ** 2:.6g}")
+        return parse_rig(identified_text(text, parse_rig(text), [model]))
+
+
+HEADLINE = tuple(
+    Cell("own", at, estimators=("o1", "moments", "profile"), identified=("o1", "profile")) for at in (2.4, 2.7)
+)  # fmt: skip
+# At 3.0 whole periods fit into an exposure: the centroid is zero, the blur has no phase, and nothing can help.
+TURBULENCE_AND_LINE = (
+    *(Cell("own", at, estimators=("o1", "moments", "profile")) for at in (0.6, 1.5)),
+    *(Cell("own", at) for at in (0.24, 1.2, 3.0, 3.3)),
+    *(Cell("hcipy", at) for at in (2.4, 2.7)),
+)  # fmt: skip
+LINE = (
+    *(Cell("", at) for at in (0.24, 1.2, 1.5, 2.4, 2.7, 3.0, 3.3)), Cell("", 0.6, identified=("o1",)),
+)  # fmt: skip
+TURBULENCE = (Cell("hcipy", 0.0), Cell("own", 0.0, identified=("o1",)))
+FACTORS = tuple(
+    cell
+    for at in (0.6, 2.4)
+    for cell in (
+        *(Cell("own", at, widths=widths) for widths in (0.5, 4.0)),
+        *(Cell("own", at, steps=steps) for steps in (20, 200)),
+        Cell("own", at, noise=0.1),
+    )
+)  # fmt: skip
+"""One at a time, around 1.5 widths, 50 steps and 2 %."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much of each cell is run."""
+
+    seeds: Sequence[int] = range(701, 706)
+    past: int = 200
+    """Exposures with the mirror at rest that predictors are fitted to and models identified from, ..."""
+    exposures: int = 100
+    """... and those after them whose loop is closed, ..."""
+    settled: int = 20
+    """... the first of which are left out."""
+    gains: Sequence[float] = GAINS
+
+
+FULL = Size()
+SHORT = Size(seeds=range(1, 3), past=64, exposures=6, settled=3, gains=GAINS[:1])
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A ratio that is to be at most ``limit`` with its bound."""
+
+    name: str
+    over: str
+    """Empty for the best integrator."""
+    limit: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Residual slopes at the fast rate of each seed, root mean square, slope units, by what closed the loop."""
+
+    cell: Cell
+    rms: Mapping[str, FloatArray]
+    lines: tuple[float, ...]
+    """Where the line was identified, times the frame rate, by seed; empty where it was not looked for."""
+
+    @cached_property
+    def best(self) -> str:
+        """The integrator with the best gain for these seeds, with hindsight."""
+        return min((name for name in self.rms if name.startswith("integrator")), key=lambda name: self.rms[name].mean())
+
+    @property
+    def ours(self) -> list[str]:
+        """What served `lqg`."""
+        return [*self.cell.estimators, *(f"identified {name}" for name in self.cell.identified)]
+
+    @property
+    def goals(self) -> list[Goal]:
+        """Those of the cell, named before anything was measured."""
+        at, found = self.cell.line, []
+        if not at:
+            found += [Goal(name, "", 1.02) for name in self.ours]
+        elif self.cell.turbulence and at in (2.4, 2.7) and "profile" in self.ours:
+            found += [Goal("identified profile", "", 0.95), Goal("profile", "", 0.95)]
+        elif "profile" in self.ours:
+            found.append(Goal("profile", "o1", 0.9))
+        if at and "identified o1" in self.ours:
+            found.append(Goal("identified o1", "o1", 1.05))
+        return found
+
+    def reaches(self, goal: Goal) -> bool:
+        """Whether the bound keeps it."""
+        return self.ratio(goal.name, goal.over).bound <= goal.limit
+
+    def ratio(self, name: str, over: str = "") -> Ratio:
+        """To the best integrator, or to another."""
+        return Ratio.of(self.rms[name] / self.rms[over or self.best])
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Mean of a ratio over seeds, and its one-sided 95 % bound (Student)."""
+
+    mean: float
+    bound: float
+
+    @classmethod
+    def of(cls, shares: FloatArray) -> Ratio:
+        n = len(shares)
+        more = stats.t.ppf(0.95, n - 1) * shares.std(ddof=1) / math.sqrt(n)
+        return cls(float(shares.mean()), float(shares.mean() + more))
+
+    def __str__(self) -> str:
+        return f"{self.mean:.2f} (<{self.bound:.2f})"
+
+
+def measured(cell: Cell, size: Size) -> Measured:
+    """Close the loop of a cell by each controller, on the same disturbances."""
+    each, models = zip(*(_of_seed(cell, seed, size) for seed in size.seeds), strict=True)
+    lines = [
+        process["frequency_hz"] * cell.steps * STEP_S
+        for model in models if model for process in model.processes if process.kind == "resonance"
+    ]  # fmt: skip
+    return Measured(cell, {name: np.array([found[name] for found in each]) for name in each[0]}, tuple(lines))
+
+
+def all_measured(cells: Sequence[Cell], short: bool) -> Iterator[Measured]:
+    """Of each cell; for a short form of the first one, with short exposures. Standard error says how long each took."""
+    for cell in [replace(cells[0], steps=20)] if short else cells:
+        start = time.monotonic()
+        yield measured(cell, SHORT if short else FULL)
+        print(f"  {cell}: {time.monotonic() - start:.0f} s", file=sys.stderr, flush=True)
+
+
+def _of_seed(cell: Cell, seed: int, size: Size) -> tuple[dict[str, float], ProcessSum | None]:
+    past = size.past * cell.steps
+    whole = cell.disturbance(past + (size.exposures + 1) * cell.steps, past, seed)
+    ahead = replace(whole, slopes=whole.slopes[past:], states=whole.states[past:])
+    rms: dict[str, float] = {}
+    identified = None
+    with TemporaryDirectory() as folder:
+
+        def run(name: str, rig: Rig, controller: str | ControllerRow, estimator: str = "") -> None:
+            series = [seen.exposure for seen in closed_loop(rig, controller, estimator, size.exposures, seed=seed)]
+            rms[name] = residual_rms(series[size.settled :])
+
+        def played(model: ProcessSum) -> Rig:
+            return _played(cell.rig(model), ahead.slopes, Path(folder) / "ahead.toml")
+
+        rig = played(whole.model)
+        run("open", rig, "")
+        for gain in size.gains:
+            run(f"integrator {gain:g}", replace(rig, control=replace(rig.control, gain=gain)), "integrator")
+        before = _played(cell.rig(whole.model), whole.slopes[:past], Path(folder) / "before.toml")
+        earlier = [seen.exposure for seen in closed_loop(before, "", "", size.past, seed=seed + 10_000)]
+        for name in PREDICTORS:
+            run(name, rig, predicted(name, np.array([centroids(rig, exposure) for exposure in earlier])))
+        for estimator in cell.estimators:
+            run(estimator, rig, "lqg", estimator)
+        if cell.identified:
+            identified = _identified(before, earlier, cell.kinds)
+            own = played(identified)
+            for estimator in cell.identified:
+                run(f"identified {estimator}", own, "lqg", estimator)
+        run("true state", rig, with_true_state(ahead))
+    return rms, identified
+
+
+def _played(believes: Rig, slopes: FloatArray, path: Path) -> Rig:
+    """A rig that is disturbed by these slopes, whatever it believes in."""
+    np.save(path.with_suffix(".npy"), slopes[:, None])
+    table = f'[disturbance]\nplant_noise = false\nrecorded = "{path.stem}.npy"\n\n[simulation]'
+    path.write_text(believes.toml.replace("[simulation]", table, 1))
+    return load_rig(path)
+
+
+def _identified(rig: Rig, exposures: list[Exposure], kinds: Sequence[str]) -> ProcessSum:
+    """What `aolink identify --model` finds of blurred frames alone, without its intervals."""
+    seen = [readings(rig, exposures)]
+    space = space_of(kinds, seen, rig.sensor.kernel.variance, with_noise=False, with_kernel=False)
+    return space.model(maxima(space, seen)[0].x)
+
+
+def worth_headline(effort: Effort) -> list[Row]:
+    """Turbulence and a line of equal sd at 2.4 and 2.7 times the frame rate: what centroids cannot reach."""
+    return _rows(HEADLINE, effort)
+
+
+def worth_lines(effort: Effort) -> list[Row]:
+    """The same with the line elsewhere, and with HCIPy's turbulence."""
+    return _rows(TURBULENCE_AND_LINE, effort)
+
+
+def worth_resonance(effort: Effort) -> list[Row]:
+    """A resonance alone."""
+    return _rows(LINE, effort)
+
+
+def worth_air(effort: Effort) -> list[Row]:
+    """Turbulence alone, where nothing is to be gained, and nothing to be lost."""
+    return _rows(TURBULENCE, effort)
+
+
+def worth_factors(effort: Effort) -> list[Row]:
+    """Amplitude, exposure and noise, one at a time."""
+    return _rows(FACTORS, effort)
+
+
+def _rows(cells: Sequence[Cell], effort: Effort) -> list[Row]:
+    """A line for each cell, and one for each of its goals."""
+    rows = []
+    for each in all_measured(cells, effort.share < 1):
+        rows += [_row(each), *(_goal_row(each, goal) for goal in each.goals)]
+    return rows
+
+
+def _row(each: Measured) -> Row:
+    theirs = [f"{name} {each.ratio(name)}" for name in (*PREDICTORS, "true state")]
+    found = f"; line identified at {', '.join(f'{at:.2f}' for at in each.lines)}" if each.lines else ""
+    return Row(
+        f"loop, {each.cell}", ", ".join(f"{name} {each.ratio(name)}" for name in each.ours) + found,
+        f"{', '.join(theirs)}; {each.best} {each.rms[each.best].mean():.4f}, open {each.rms['open'].mean():.4f}",
+        1 / min(each.ratio(name).mean for name in each.ours), 0.0,
+    )  # fmt: skip
+
+
+def _goal_row(each: Measured, goal: Goal) -> Row:
+    ratio = each.ratio(goal.name, goal.over)
+    return Row(
+        f"loop, {each.cell}: {goal.name} over {goal.over or 'the best integrator'}", str(ratio),
+        f"below {goal.limit:g}", goal.limit / ratio.bound, 1.0,
+    )  # fmt: skip
