@@ -38,6 +38,7 @@ SECTIONS = (
     "A family of plants that nobody tuned for",
     "Blur that nobody here made",
     "Films whose motion we know",
+    "What closing the loop is worth",
 )
 NUMBER = r"-?\d+(?:\.\d+)?(?:e-?\d+)?"
 
@@ -273,7 +274,7 @@ def test_without_matplotlib_it_says_what_to_install() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 2
-    assert "aolink[plot]" in done.stderr
+    assert "aolink[bench,dev,plot]" in done.stderr
     assert "Traceback" not in done.stderr
 
 

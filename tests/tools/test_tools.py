@@ -138,12 +138,16 @@ def test_a_word_that_no_row_has_is_an_error() -> None:
         "batches",
         "restoration",
         "moving_scene",
+        "loop",
+        "loop_worth",
     ],
 )
 def test_every_row_that_is_written_is_in_the_table(room: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(TOOLS))
     if room == "restoration":
         needed("skimage")
+    if room == "loop_worth":
+        needed("pyrtc")
     rooms = importlib.import_module("bench_rows.rooms").ROWS
     module = importlib.import_module(f"bench_rows.{room}")
     measuring = ("Row", "list[Row]")

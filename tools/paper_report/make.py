@@ -18,6 +18,7 @@ from paper_report.blocks import as_html, as_markdown
 from paper_report.ensemble import Cell, map_cells
 from paper_report.judge import judge_plan
 from paper_report.limit import against_o1, limit_table
+from paper_report.loop import loop_cells
 from paper_report.made_films import made_films
 from paper_report.page import Results, build
 from paper_report.shake import shake_table
@@ -70,6 +71,8 @@ def compute(effort: n.Effort, out: Path) -> Results:
         spheres = film(effort)
     with _timed("made films"):
         made = made_films(effort)
+    with _timed("closed loops"):
+        loops = loop_cells(effort is n.QUICK)
     with _timed("family"):
         family = judge_plan(out / "family.jsonl", effort.family)
     with _timed("map"):
@@ -81,7 +84,7 @@ def compute(effort: n.Effort, out: Path) -> Results:
     return Results(
         printed=printed, lively=lively, effort=effort, rows=rows, norms=norms, errors=errors, forms=forms,
         remark_1=first, remark_2=second, mechanism=mechanism, shake=shake, limit=limit, over_o1=over_o1, film=spheres,
-        made=made, family=family, cells=cells,
+        made=made, family=family, loops=loops, cells=cells,
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from bench_rows.loop_worth import Measured as ClosedLoops
 
 from aolink.plant.lifting import lift
 from aolink.plant.observability import observability
@@ -16,6 +17,7 @@ from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
 from paper_report.ensemble import Cell, Measured
 from paper_report.judge import Row as JudgedRow
 from paper_report.limit import Scene, against_o1_section, limit_section
+from paper_report.loop import loop_section
 from paper_report.made_films import MadeFilm, made_section
 from paper_report.numbers import (
     Effort,
@@ -57,6 +59,7 @@ class Results:
     film: list[Film]
     made: list[MadeFilm]
     family: list[JudgedRow]
+    loops: list[ClosedLoops]
     cells: list[Cell]
 
 
@@ -97,6 +100,7 @@ def build(results: Results) -> list[Block]:
         *family_section(results.family, _picture("family.png")),
         *film_section(results.film),
         *made_section(results.made, results.effort),
+        *loop_section(results.loops),
     ]
 
 
