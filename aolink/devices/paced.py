@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.devices.interfaces import lacks_of
+from aolink.devices.outages import Outages
 from aolink.devices.simple import DirectMirror, Held
 from aolink.rig import Rig
 
 _REMEMBERED = 1000
 _LATE = 0.5
 """A step whose input was taken only after this part of it held the one before for longer: it was late."""
+_LEAST_WATCH_NS = 1_000_000
 
 
 class PacedMirror:
@@ -24,7 +26,8 @@ class PacedMirror:
 
     The scheduler and the line decide how exactly that goes. A step for which the device took its input later than
     half-way counts as late, and is reported to have held the input before. Where steps begin while the device is still
-    busy with an earlier one, the newest is sent, and those between are late.
+    busy with an earlier one, the newest is sent, and those between are late. An answer that was heard late because this
+    host was held up meanwhile does not make the device late: it is taken to have answered at its usual pace.
     """
 
     def __init__(self, rig: Rig, driver: DirectMirror) -> None:
@@ -47,6 +50,7 @@ class PacedMirror:
         """Held while the driver is called; never asked for by who holds ``_changed``."""
         self._lateness_ns: deque[int] = deque(maxlen=_REMEMBERED)
         """How long after the beginning of their steps the device had taken its newest inputs."""
+        self._outages = Outages(max(rig.timing.fast_step_ns // 4, _LEAST_WATCH_NS))
         self._parked = self._closed = False
         self._failed: Exception | None = None
         self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
@@ -96,6 +100,7 @@ class PacedMirror:
             self._closed = True
             self._changed.notify()
         self._thread.join()
+        self._outages.close()
         self._driver.close()
 
     def _play(self) -> None:
@@ -137,10 +142,12 @@ class PacedMirror:
                 if self._parked:
                     self._held.append((self._now, True))
                     return
+            held_up_ns = self._outages.total_ns()
             taken = self._driver.put(u)
             with self._changed:
-                taken_ns = self.time_ns()
-                self._lateness_ns.append(taken_ns - step * self._step_ns)
+                answered_ns = self.time_ns()
+                self._lateness_ns.append(answered_ns - step * self._step_ns)
+                taken_ns = answered_ns - (self._outages.total_ns() - held_up_ns)
                 reached = taken_ns / self._step_ns - _LATE
                 late = step < reached
                 self._held.append((self._now if late else taken, late))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import threading
 import time
 from dataclasses import replace
@@ -99,6 +101,29 @@ def test_a_device_that_is_busy_goes_on_with_the_newest_step(rig: Rig) -> None:
     assert all(late for _, late in told[first : first + 6])  # it held the safe input all the time
     assert {held for held, _ in told[first : first + 6]} == {float(rig.mirror.park[0])}
     assert not {0.002, 0.003, 0.004, 0.005} & set(np.round(device.given, 3).tolist())  # what is over is not sent
+
+
+def test_a_host_that_is_held_up_does_not_make_the_device_late(rig: Rig) -> None:
+    """It stands still for fifteen steps, after the device has taken an input and before the host hears so."""
+    mirror = PacedMirror(rig, device := Device())
+    first = mirror.time_ns() // rig.timing.fast_step_ns + 5
+
+    def put(u: NDArray[np.float64]) -> NDArray[np.float64]:
+        device.given.append(float(u[0]))
+        if len(device.given) == 1:
+            goes_on = subprocess.Popen(
+                ["sh", "-c", f"sleep 0.1; kill -STOP {os.getpid()}; sleep 0.3; kill -CONT {os.getpid()}"]
+            )
+            goes_on.wait()
+        return u
+
+    device.put = put  # type: ignore[method-assign]
+    mirror.send(first, np.linspace(0.001, 0.03, 30)[:, None])
+    told = reports(mirror, first + 30)
+    mirror.close()
+    during = told[first + 8 : first + 18]
+    assert all(late for _, late in during)  # their own inputs were not sent
+    assert {held for held, _ in during} == {0.001}
 
 
 def test_parking_empties_the_queue(rig: Rig) -> None:

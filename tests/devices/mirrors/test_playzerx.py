@@ -232,10 +232,8 @@ def test_a_whole_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     exposures = list(recording.exposures())
     assert all(exposure.inputs_assumed == 0 for exposure in exposures[:10])
     assert max(np.abs(exposure.inputs).max() for exposure in exposures) > 0.1
-    # A frame that came while the mirror was being parked may follow.
-    for exposure, found in islice(zip(exposures, estimate(recording, "o1"), strict=True), 10):
-        assert exposure.truth is not None
-        assert np.abs(found.path - exposure.truth.path).max() < 0.05  # of 0.3 that the drive moves the spot
+    # A frame that came while the mirror was being parked may follow. The drive moves the spot by 0.3.
+    bench.check_paths(recording.rig, islice(zip(exposures, estimate(recording, "o1"), strict=True), 10))
 
 
 @pytest.mark.parametrize(

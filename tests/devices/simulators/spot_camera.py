@@ -21,6 +21,8 @@ mirror = SimpleNamespace(held=None)
 """What it looks at."""
 mirrors: dict[str, Held] = {}
 """What it looks at where its key ``sees`` says so, for several sessions at once."""
+saw: dict[int, NDArray[np.float64]] = {}
+"""What the mirror held in each fast step of its exposures, (n_steps, n_inputs), by their starts."""
 
 
 class SpotCamera:
@@ -59,10 +61,12 @@ class SpotCamera:
 
     def _follow(self, start_ns: int, n_steps: int) -> Truth:
         """The spot follows what the mirror held in the middle of each fast step, to the end of an exposure."""
-        plant, step_ns, passed = self._rig.plant, self._step_ns, []
+        plant, step_ns, passed, held = self._rig.plant, self._step_ns, [], []
         end_ns = start_ns + n_steps * step_ns
         for begin_ns in range(self._followed_ns, end_ns, step_ns):
             passed.append(self._state)
-            self._state = plant.A @ self._state + plant.B @ self._held(begin_ns + step_ns // 2)
+            held.append(self._held(begin_ns + step_ns // 2))
+            self._state = plant.A @ self._state + plant.B @ held[-1]
+        saw[start_ns] = np.array(held[-n_steps:])
         self._followed_ns, states = end_ns, np.array(passed[-n_steps:])
         return Truth(start_state=states[:1], end_state=self._state[None], path=plant.C @ states.T)
