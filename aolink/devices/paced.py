@@ -50,7 +50,7 @@ class PacedMirror:
         """Held while the driver is called; never asked for by who holds ``_changed``."""
         self._lateness_ns: deque[int] = deque(maxlen=_REMEMBERED)
         """How long after the beginning of their steps the device had taken its newest inputs."""
-        self._outages = Outages(max(rig.timing.fast_step_ns // 4, _LEAST_WATCH_NS))
+        self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_WATCH_NS))
         self._parked = self._closed = False
         self._failed: Exception | None = None
         self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
