@@ -355,8 +355,7 @@ def record_at(
 def broken_up(chunk: Chunk, offset: int, on_loss: Callable[[Loss], None], budget: Budget) -> Iterator[McapRecord]:
     """The records in a chunk, one by one; nothing if it is damaged."""
     try:
-        budget.take_bytes(chunk.uncompressed_size)
-        data, count = _decompressed(chunk), 0
+        data, count = _decompressed(chunk, budget), 0
         if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise ValueError("checksum")
         for count, (opcode, at, length) in enumerate(_heads(data), 1):
@@ -425,10 +424,11 @@ def _record_at(file: IO[bytes], position: int, on_loss: Callable[[Loss], None]) 
     return record
 
 
-def _decompressed(chunk: Chunk) -> bytes:
+def _decompressed(chunk: Chunk, budget: Budget) -> bytes:
     """What a chunk holds. It may say one size and hold another: neither may fill the memory."""
     if chunk.uncompressed_size > limits().chunk_bytes:
         raise ValueError(f"a chunk of {chunk.uncompressed_size} bytes")
+    budget.take_bytes(chunk.uncompressed_size)
     data = chunk.data
     if chunk.compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=chunk.uncompressed_size + 1)

@@ -95,6 +95,19 @@ def test_cut_off_at_any_byte_all_whole_chunks_come_back(
         assert not Recording(result.path, check=True).damage
 
 
+@pytest.mark.parametrize("bit", [27, 31, 40, 63])
+def test_an_impossible_size_of_a_chunk_costs_no_other_one(
+    many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path, bit: int
+) -> None:
+    """Its size without compression is not believed, and not held against the file."""
+    data, chunks = many_chunks
+    damaged = bytearray(data)
+    damaged[chunks[2][0] + struct.calcsize("<BQQQ") + bit // 8] ^= 1 << bit % 8
+    (path := tmp_path / "a.mcap").write_bytes(damaged)
+    assert sequences(path) == set().union(*(m for k, m in enumerate(by_chunk(data, chunks)) if k != 2))
+    assert [loss.offset for loss in Recording(path, check=True).losses] == [chunks[2][0]]
+
+
 @pytest.mark.long
 def test_flipped_bits_cost_no_more_than_their_chunks(
     many_chunks: tuple[bytes, list[tuple[int, int]]], tmp_path: Path
