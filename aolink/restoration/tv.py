@@ -6,7 +6,7 @@ iteration, so there the blurred plane is split off as well and the linear step i
 References
 ----------
 Boyd et al. 2011 (ADMM); Matakos, Ramani & Fessler 2013 and Almeida & Figueiredo 2013 (borders by splitting the plane
-off before it is masked).
+off before it is masked); Bauschke, Goebel, Lucet & Wang 2008 (the proximal average).
 """
 
 from __future__ import annotations
@@ -64,38 +64,60 @@ def total_variation(
     # Differences plus scaled dual variables: times the shrinkage f they are the split differences, the rest the duals.
     along, down = np.diff(x, axis=-1), np.diff(x, axis=-2)
     for _ in range(iterations):
-        f = _shrinkage(along, down, threshold)
-        kept = 2 * f
-        kept -= 1
-        right = differences_transposed(kept[..., :, :-1] * along, kept[..., :-1, :] * down)
+        kept = _shrinkage(along, down, threshold)
+        right = differences_transposed(*((2 * f - 1) * v for f, v in zip(kept, (along, down), strict=True)))
         right *= kappa
         right += seen
         x = solver.solve(right, x, _TOLERANCE)
-        f *= -_RELAXATION
-        f += 1
-        along *= f[..., :, :-1]
-        down *= f[..., :-1, :]
-        for v, new in ((along, np.diff(x, axis=-1)), (down, np.diff(x, axis=-2))):
+        for f, v, axis in zip(kept, (along, down), (-1, -2), strict=True):
+            f *= -_RELAXATION
+            f += 1
+            v *= f
+            new = np.diff(x, axis=axis)
             new *= _RELAXATION
             v += new
     return x, solver
 
 
-def _shrinkage(along: FloatArray, down: FloatArray, threshold: float) -> FloatArray:
-    """max(1 - threshold / |gradient|, 0) at each pixel."""
-    size = np.zeros((*along.shape[:-1], down.shape[-1]), along.dtype)
-    np.square(along, out=size[..., :-1])
-    size[..., :-1, :] += down * down
-    np.sqrt(size, out=size)
-    np.maximum(size, threshold, out=size)
-    np.divide(-threshold, size, out=size)
-    size += 1
-    return size
+def _shrinkage(along: FloatArray, down: FloatArray, threshold: float) -> tuple[FloatArray, FloatArray]:
+    """What differences along rows (..., rows, columns - 1) and down columns (..., rows - 1, columns) keep.
+
+    A pixel has four gradients, of a difference to its left or right and one above or below, and keeps
+    max(1 - threshold / |gradient|, 0) of each. A difference keeps the mean of the four that it is part of. This is the
+    proximal operator of the proximal average of the four total variations, so what is minimised is convex and treats
+    all four diagonal directions alike.
+    """
+    *batch, rows, columns = (*along.shape[:-1], down.shape[-1])
+    across = np.zeros((*batch, rows, columns + 1), along.dtype)
+    upright = np.zeros((*batch, rows + 1, columns), along.dtype)
+    np.square(along, out=across[..., :, 1:-1])
+    np.square(down, out=upright[..., 1:-1, :])
+    left, right, above, below = across[..., :-1], across[..., 1:], upright[..., :-1, :], upright[..., 1:, :]
+
+    def lost(one: FloatArray, other: FloatArray) -> FloatArray:
+        """A quarter of what a gradient of these squares loses."""
+        size = one + other
+        np.maximum(size, threshold * threshold, out=size)
+        np.sqrt(size, out=size)
+        return np.divide(-threshold / 4, size, out=size)
+
+    right_below, right_above, left_below, left_above = (lost(a, b) for a in (right, left) for b in (below, above))
+    keep_along = right_below[..., :-1] + right_above[..., :-1]
+    keep_along += left_below[..., 1:]
+    keep_along += left_above[..., 1:]
+    keep_along += 1
+    keep_down = right_below[..., :-1, :] + left_below[..., :-1, :]
+    keep_down += right_above[..., 1:, :]
+    keep_down += left_above[..., 1:, :]
+    keep_down += 1
+    return keep_along, keep_down
 
 
-PLANE_ITERATIONS = 40
-# Penalty on the split plane, in weights of a pixel, for which these iterations are enough.
-_PLANE_PENALTY = 0.05
+PLANE_ITERATIONS = 28
+# Penalties on the split plane, in weights of a pixel, and on the split differences, in lambdas, for which these
+# iterations are enough.
+_PLANE_PENALTY = 0.07
+_DIFFERENCE_PENALTY = 6.0
 
 
 def plane_weight(noise_variance: float, difference_weight: float) -> float:
@@ -136,7 +158,7 @@ def plane_total_variation(
     -------
     The scenes, beyond the frame as well, (batch, rows, columns).
     """
-    kappa = PENALTY * difference_weight * noise_variance
+    kappa = _DIFFERENCE_PENALTY * difference_weight * noise_variance
     threshold = plane_weight(noise_variance, difference_weight) * noise_variance / kappa
     single = single_is_enough(kappa, float(plane.taps.sum()))
     real, complex_ = (np.dtype(np.float32), np.dtype(np.complex64)) if single else (np.dtype(float), np.dtype(complex))
@@ -152,24 +174,26 @@ def plane_total_variation(
     part = 1 / (weight + _PLANE_PENALTY)
     rows, columns = plane.scene
     spectrum = plane.forward(plane.guess(images, difference_weight * noise_variance).astype(real))
-    dual = np.zeros_like(data)
-    # Differences plus scaled dual variables, as above.
-    along = down = np.zeros_like(data)
-    for k in range(iterations + 1):
-        u, x = plane.backward(spectrum * transfer), plane.backward(spectrum)
-        if k == iterations:
-            break
-        u += dual
-        dual = u - (data + _PLANE_PENALTY * u) * part
-        u -= 2 * dual
-        along, down = along + _next(x, -1), down + _next(x, -2)
-        f = _shrinkage(along[..., :rows, : columns - 1], down[..., : rows - 1, :columns], threshold)
-        split_along, split_down = along.copy(), down.copy()
-        split_along[..., :rows, : columns - 1] *= 2 * f[..., :, :-1] - 1
-        split_down[..., : rows - 1, :columns] *= 2 * f[..., :-1, :] - 1
-        right = _before(split_along, -1) + _before(split_down, -2)
-        spectrum = (plane.forward(u) * back + share * plane.forward(right)) * solve
-        along, down = (along - split_along) / 2, (down - split_down) / 2
+    # Of the blurred plane and of the differences: the splits plus scaled dual variables, as above.
+    u, x = plane.backward(spectrum * transfer), plane.backward(spectrum)
+    along, down = _next(x, -1), _next(x, -2)
+    shrunk_along, shrunk_down = along[..., :rows, : columns - 1], down[..., : rows - 1, :columns]
+    for _ in range(iterations):
+        kept_along, kept_down = _shrinkage(shrunk_along, shrunk_down, threshold)
+        split_u, split_along, split_down = (data + _PLANE_PENALTY * u) * part, along.copy(), down.copy()
+        split_along[..., :rows, : columns - 1] *= kept_along
+        split_down[..., : rows - 1, :columns] *= kept_down
+        right = _before(2 * split_along - along, -1) + _before(2 * split_down - down, -2)
+        spectrum = (plane.forward(2 * split_u - u) * back + share * plane.forward(right)) * solve
+        blurred, x = plane.backward(spectrum * transfer), plane.backward(spectrum)
+        for v, new, split in (
+            (u, blurred, split_u),
+            (along, _next(x, -1), split_along),
+            (down, _next(x, -2), split_down),
+        ):
+            new -= split
+            new *= _RELAXATION
+            v += new
     return x[..., :rows, :columns]
 
 

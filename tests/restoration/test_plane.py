@@ -109,11 +109,15 @@ def test_differences_and_their_transpose_are_adjoint() -> None:
     assert roughness(x).ravel() == pytest.approx(roughness_matrix((5, 6)) @ x.ravel())
 
 
+def corners(across: FloatArray, upright: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Views of the four gradients of each pixel, of differences with nothing beyond the edges."""
+    return [(a, d) for a in (across[:, :-1], across[:, 1:]) for d in (upright[:-1], upright[1:])]
+
+
 def variation(x: FloatArray) -> float:
-    size = np.zeros(x.shape)
-    size[..., :-1] += np.diff(x, axis=-1) ** 2
-    size[..., :-1, :] += np.diff(x, axis=-2) ** 2
-    return float(np.sqrt(size).sum())
+    """The mean of the four total variations."""
+    gradients = corners(np.pad(np.diff(x, axis=1), ((0, 0), (1, 1))), np.pad(np.diff(x, axis=0), ((1, 1), (0, 0))))
+    return float(np.mean([np.hypot(*each).sum() for each in gradients]))
 
 
 def test_total_variation_meets_its_dual() -> None:
@@ -125,18 +129,23 @@ def test_total_variation_meets_its_dual() -> None:
     x, _ = total_variation(lambda kappa: make_solver(point, scene.shape, kappa), noisy[None], s2, weight, 400)
     w = WEIGHT * np.sqrt(weight)
     primal = ((noisy - x[0]) ** 2).sum() / (2 * s2) + w * variation(x[0])
-    # The dual by projected gradients, a different way altogether.
-    along, down = np.zeros((24, 29)), np.zeros((23, 30))
+    # The dual by projected gradients, a different way altogether: a field for each of a pixel's four gradients.
+    fields = np.zeros((4, 2, *scene.shape))
+
+    def flow() -> NDArray[np.floating[Any]]:
+        across, upright = np.zeros((24, 31)), np.zeros((25, 30))
+        for views, field in zip(corners(across, upright), fields, strict=True):
+            for view, part in zip(views, field, strict=True):
+                view += part
+        return differences_transposed(across[:, 1:-1], upright[1:-1])
+
     for _ in range(3000):
-        residual = noisy - s2 * differences_transposed(along, down)
-        along, down = along + np.diff(residual, axis=1) / (8 * s2), down + np.diff(residual, axis=0) / (8 * s2)
-        size = np.zeros(scene.shape)
-        size[:, :-1] += along**2
-        size[:-1] += down**2
-        factor = np.maximum(np.sqrt(size) / w, 1)
-        along, down = along / factor[:, :-1], down / factor[:-1]
-    flow = differences_transposed(along, down)
-    bound = (noisy * flow).sum() - s2 / 2 * (flow**2).sum()
+        residual = noisy - s2 * flow()
+        along, down = np.diff(residual, axis=1), np.diff(residual, axis=0)
+        fields += np.array(corners(np.pad(along, ((0, 0), (1, 1))), np.pad(down, ((1, 1), (0, 0))))) / (32 * s2)
+        fields /= np.maximum(np.hypot(fields[:, :1], fields[:, 1:]) / (w / 4), 1)
+    bound = (noisy * flow()).sum() - s2 / 2 * (flow() ** 2).sum()
+    # What is minimised is the proximal average of the four, which is nearly their mean.
     assert bound <= primal <= bound * 1.002
 
 
@@ -177,7 +186,7 @@ def test_on_the_plane_total_variation_is_what_exact_steps_find(masked: bool) -> 
     assert found.shape == few.shape == exact.shape
     assert plane.frame == solver.frame
     least = objective(exact[0])
-    assert least * 0.9999 < objective(found[0]) < least * 1.001
+    assert least * 0.999 < objective(found[0]) < least * 1.001  # their penalties differ, so their averages do
     assert abs(psnr(few[0][plane.frame], inside) - psnr(exact[0][plane.frame], inside)) < 0.2
 
 
