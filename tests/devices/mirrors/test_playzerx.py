@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from aolink import estimate
 from aolink.devices.mirrors.playzerx import PlayzerX, codes_of, command, remaining, sample_rate, samples
+from aolink.devices.outages import Outages
 from aolink.devices.simple import Held, Lacks
 from aolink.errors import AolinkError, DeviceError
 from aolink.recording.reader import Recording
@@ -31,6 +32,8 @@ STEP_NS = 2_000_000
 STALL_S = 0.5
 """How long the device's queue lasts in tests: longer than a busy machine holds a test up."""
 PATIENCE_S = 10.0
+HELD_UP_NS = 100_000_000
+"""Half of what the queue lasts in the test of a dry one."""
 
 codes = st.lists(st.tuples(st.integers(0, 4095), st.integers(0, 4095)), min_size=1, max_size=40)
 lasers = st.one_of(st.tuples(st.integers(0, 255)), st.tuples(*[st.integers(0, 255)] * 3))
@@ -188,8 +191,24 @@ def test_a_command_for_steps_that_are_handed_over_is_late() -> None:
 
 def test_a_queue_that_runs_dry_is_said_and_survived() -> None:
     """The host is held up for longer than the queue lasts: every step is told once, with what was really held."""
+    for _ in range(5):
+        told, out, held_up_ns = ran_dry()
+        if held_up_ns < HELD_UP_NS:  # else the machine may have stopped the simulator in the middle of its samples
+            break
+    held = np.concatenate([each.u for each in told])
+    late = np.concatenate([each.late for each in told if each.late is not None])
+    assert [each.first_step for each in told] == [0, *np.cumsum([len(each.u) for each in told])[:-1]]
+    assert late.sum() > 50
+    near = [np.abs(held[1:-1] - out[1 + k : len(out) - 1 + k]).max(axis=1) < 1e-9 for k in (-1, 0, 1)]
+    dry = np.count_nonzero(np.diff(late.astype(int)) > 0)  # how often: a busy machine adds to it
+    assert (~np.any(near, axis=0)).sum() <= 2 * dry  # where the phase of the samples was in doubt, by one at most
+
+
+def ran_dry() -> tuple[list[Held], NDArray[np.float64], int]:
+    """What the driver told, what the device put out, and for how long this process was held up by the machine."""
     with simulators.PlayzerX() as device:
         mirror = opened(device, ahead_s=0.2)
+        outages = Outages(STEP_NS)
         begin = mirror.time_ns() // STEP_NS + 300
         assert mirror.send(begin, np.repeat(np.linspace(0.1, 0.9, 1000), 2).reshape(-1, 2)) == 0
         before = poll(mirror, told_until(begin + 30))
@@ -197,15 +216,11 @@ def test_a_queue_that_runs_dry_is_said_and_survived() -> None:
             time.sleep(0.4)
         end = mirror.time_ns() // STEP_NS + 200
         told = before + poll(mirror, told_until(end))
-        held = np.concatenate([each.u for each in told])
-        late = np.concatenate([each.late for each in told if each.late is not None])
-        assert [each.first_step for each in told] == [0, *np.cumsum([len(each.u) for each in told])[:-1]]
-        assert late.sum() > 50
-        out = inputs_of(device, len(held))
-        near = [np.abs(held[1:-1] - out[1 + k : len(out) - 1 + k]).max(axis=1) < 1e-9 for k in (-1, 0, 1)]
-        dry = np.count_nonzero(np.diff(late.astype(int)) > 0)  # how often: a busy machine adds to it
-        assert (~np.any(near, axis=0)).sum() <= 2 * dry  # where the phase of the samples was in doubt, by one at most
+        out = inputs_of(device, sum(len(each.u) for each in told))
+        held_up_ns = outages.total_ns()
+        outages.close()
         mirror.close()
+    return told, out, held_up_ns
 
 
 def session_rig(device: simulators.PlayzerX) -> Rig:
