@@ -270,11 +270,16 @@ class PlayzerX:
 
     def _serve(self) -> None:
         """Count the samples, and fill the queue."""
-        asked_ns = time.monotonic_ns()
-        left = self._count()
-        answered_ns = time.monotonic_ns()
-        if answered_ns - asked_ns > _SLOW_NS and left > self._ahead // 2:
-            return  # there is time to ask again
+        # A slow answer does not tell whether the queue ran dry meanwhile, nor before which samples. The next one does,
+        # as long as nothing more was handed over.
+        for _ in range(_TRIES):
+            asked_ns = time.monotonic_ns()
+            left = self._count()
+            answered_ns = time.monotonic_ns()
+            if answered_ns - asked_ns <= _SLOW_NS:
+                break
+            if left > self._ahead // 2:
+                return  # there is time to ask again
         with self._changed:
             if left:
                 self._take_count(self._handed - left, asked_ns, answered_ns)

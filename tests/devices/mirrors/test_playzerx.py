@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from itertools import islice
@@ -189,10 +190,14 @@ def test_a_command_for_steps_that_are_handed_over_is_late() -> None:
         mirror.close()
 
 
-def test_a_queue_that_runs_dry_is_said_and_survived() -> None:
-    """The host is held up for longer than the queue lasts: every step is told once, with what was really held."""
+@pytest.mark.parametrize("waiting", [False, True])
+def test_a_queue_that_runs_dry_is_said_and_survived(waiting: bool) -> None:
+    """The device does not read its line for longer than its queue lasts, perhaps with samples and a question on it.
+
+    Every step is told once, with what was really held.
+    """
     for _ in range(5):
-        told, out, held_up_ns = ran_dry()
+        told, out, held_up_ns = ran_dry(waiting)
         if held_up_ns < HELD_UP_NS:  # else the machine may have stopped the simulator in the middle of its samples
             break
     held = np.concatenate([each.u for each in told])
@@ -204,18 +209,19 @@ def test_a_queue_that_runs_dry_is_said_and_survived() -> None:
     assert (~np.any(near, axis=0)).sum() <= 2 * dry  # where the phase of the samples was in doubt, by one at most
 
 
-def ran_dry() -> tuple[list[Held], NDArray[np.float64], int]:
+def ran_dry(waiting: bool) -> tuple[list[Held], NDArray[np.float64], int]:
     """What the driver told, what the device put out, and for how long this process was held up by the machine."""
-    with simulators.PlayzerX() as device:
+    with simulators.PlayzerX(deaf=(600 if waiting else sys.maxsize, 0.4)) as device:
         mirror = opened(device, ahead_s=0.2)
         outages = Outages(STEP_NS)
         begin = mirror.time_ns() // STEP_NS + 300
         assert mirror.send(begin, np.repeat(np.linspace(0.1, 0.9, 1000), 2).reshape(-1, 2)) == 0
-        before = poll(mirror, told_until(begin + 30))
-        with device.lock:  # it hears nothing meanwhile, and goes on putting out samples
-            time.sleep(0.4)
-        end = mirror.time_ns() // STEP_NS + 200
-        told = before + poll(mirror, told_until(end))
+        told = poll(mirror, told_until(begin + 30))
+        if not waiting:
+            with device.lock:  # it hears nothing meanwhile, and goes on putting out samples
+                time.sleep(0.4)
+        end = mirror.time_ns() // STEP_NS + (500 if waiting else 200)
+        told += poll(mirror, told_until(end))
         out = inputs_of(device, sum(len(each.u) for each in told))
         held_up_ns = outages.total_ns()
         outages.close()

@@ -8,6 +8,7 @@ it sends unasked looks like its answers.
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 from typing import NamedTuple
@@ -65,6 +66,8 @@ class PlayzerX(SerialDevice):
         By how much its samples are faster than they should be, as a part.
     loses:
         Number of a sample, counted from 0, that is lost on the line.
+    deaf:
+        After how many samples it once stops reading its line, behind the next question, and for how long, s.
     slowest:
         Its least rate, samples a second.
     left_over:
@@ -79,10 +82,12 @@ class PlayzerX(SerialDevice):
 
     def __init__(
         self, *, ping: bytes = b"pl-ok\n", data_format: str | None = "XYM", capacity: int = 125_000,
-        rate_error: float = 0.0, loses: int | None = None, slowest: int = 50, left_over: bytes = b"",
+        rate_error: float = 0.0, loses: int | None = None, deaf: tuple[int, float] = (sys.maxsize, 0.0),
+        slowest: int = 50, left_over: bytes = b"",
         analog: bool = False, updates_ms: int = 0, faults: Faults = NO_FAULTS,
     ) -> None:  # fmt: skip
         self._ping, self._data_format, self._loses, self._slowest = ping, data_format, loses, slowest
+        self._deaf, self._after_question = deaf, False
         self._capacity, self._colours = capacity, 3 if data_format == "XYRGB" else 1
         self._rate_error, self._analog = rate_error, analog
         self.every_s = updates_ms / 1000 or None
@@ -107,6 +112,10 @@ class PlayzerX(SerialDevice):
         return read_commands(waiting)
 
     def answer(self, request: bytes) -> bytes:
+        if self._after_question and request[2:3] == b"d" and self._arrived >= self._deaf[0]:
+            time.sleep(self._deaf[1])
+            self._deaf = (sys.maxsize, 0.0)
+        self._after_question = request[2:3] == b"g"
         with self.lock:
             self._pass_time()
             return self._execute(chr(request[2]), request)
