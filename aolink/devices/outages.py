@@ -7,7 +7,10 @@ import time
 
 
 class Outages:
-    """A thread that should run every ``period_ns`` sees by its own lateness when nothing here ran."""
+    """A thread that should run every ``period_ns`` sees by its own lateness when nothing here ran.
+
+    It is some time late without an outage, too: what is shorter than a period is not counted.
+    """
 
     def __init__(self, period_ns: int) -> None:
         self._period_ns = period_ns
@@ -18,7 +21,7 @@ class Outages:
         self._thread.start()
 
     def total_ns(self) -> int:
-        """Of all outages so far, the one included that has just ended and that the thread has yet to see."""
+        """Time of all outages so far, that of one included which has just ended and which the thread has yet to see."""
         with self._changed:
             return self._ended_ns + self._overdue_ns()
 

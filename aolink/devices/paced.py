@@ -18,7 +18,8 @@ from aolink.rig import Rig
 _REMEMBERED = 1000
 _LATE = 0.5
 """A step whose input was taken only after this part of it held the one before for longer: it was late."""
-_LEAST_WATCH_NS = 1_000_000
+_LEAST_PERIOD_NS = 1_000_000
+"""Of looking whether the host is held up: more often would cost more than it tells."""
 
 
 class PacedMirror:
@@ -26,8 +27,8 @@ class PacedMirror:
 
     The scheduler and the line decide how exactly that goes. A step for which the device took its input later than
     half-way counts as late, and is reported to have held the input before. Where steps begin while the device is still
-    busy with an earlier one, the newest is sent, and those between are late. An answer that was heard late because this
-    host was held up meanwhile does not make the device late: it is taken to have answered at its usual pace.
+    busy with an earlier one, the newest is sent, and those between are late. Time for which this host was held up while
+    it waited for an answer is not the device's, and does not make it late.
     """
 
     def __init__(self, rig: Rig, driver: DirectMirror) -> None:
@@ -49,8 +50,8 @@ class PacedMirror:
         self._device = threading.Lock()
         """Held while the driver is called; never asked for by who holds ``_changed``."""
         self._lateness_ns: deque[int] = deque(maxlen=_REMEMBERED)
-        """How long after the beginning of their steps the device had taken its newest inputs."""
-        self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_WATCH_NS))
+        """How long after the beginning of their steps the device's answers to its newest inputs were heard."""
+        self._outages = Outages(max(rig.timing.fast_step_ns // 8, _LEAST_PERIOD_NS))
         self._parked = self._closed = False
         self._failed: Exception | None = None
         self._thread = threading.Thread(target=self._play, name="aolink-paced-mirror", daemon=True)
@@ -61,7 +62,7 @@ class PacedMirror:
 
     @property
     def timing_sigma_ns(self) -> float:
-        """Root mean square of how late the device has taken its newest inputs, ns."""
+        """Root mean square of how late the device's answers to its newest inputs were heard, ns: it took them before."""
         with self._changed:
             return float(np.sqrt(np.mean(np.square(self._lateness_ns)))) if self._lateness_ns else 0.0
 

@@ -54,6 +54,16 @@ class Device:
         self.closed += 1
 
 
+class StopsTheHost(Device):
+    """It answers its first input after 0.1 s, and then this process stands still for 0.3 s."""
+
+    def put(self, u: NDArray[np.float64]) -> NDArray[np.float64]:
+        if not self.given:
+            stop_and_go_on = f"sleep 0.1; kill -STOP {os.getpid()}; sleep 0.3; kill -CONT {os.getpid()}"
+            subprocess.run(["sh", "-c", stop_and_go_on], check=True)
+        return super().put(u)
+
+
 def reports(mirror: PacedMirror, end: int, first: int = 0) -> list[tuple[float, bool]]:
     """What the mirror held in each step from ``first`` to ``end``, and whether it was late."""
     told: list[tuple[float, bool]] = []
@@ -105,19 +115,8 @@ def test_a_device_that_is_busy_goes_on_with_the_newest_step(rig: Rig) -> None:
 
 def test_a_host_that_is_held_up_does_not_make_the_device_late(rig: Rig) -> None:
     """It stands still for fifteen steps, after the device has taken an input and before the host hears so."""
-    mirror = PacedMirror(rig, device := Device())
+    mirror = PacedMirror(rig, StopsTheHost())
     first = mirror.time_ns() // rig.timing.fast_step_ns + 5
-
-    def put(u: NDArray[np.float64]) -> NDArray[np.float64]:
-        device.given.append(float(u[0]))
-        if len(device.given) == 1:
-            goes_on = subprocess.Popen(
-                ["sh", "-c", f"sleep 0.1; kill -STOP {os.getpid()}; sleep 0.3; kill -CONT {os.getpid()}"]
-            )
-            goes_on.wait()
-        return u
-
-    device.put = put  # type: ignore[method-assign]
     mirror.send(first, np.linspace(0.001, 0.03, 30)[:, None])
     told = reports(mirror, first + 30)
     mirror.close()

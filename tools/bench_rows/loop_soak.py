@@ -40,8 +40,8 @@ def closed_loop_soak(effort: Effort) -> Row:
             report = record(
                 load_rig(file), *ports, path, estimators=["o1"], control="lqg", exposures=exposures, progress=progress
             )
+        growth_mb = _resident_mb() - settled_mb  # before the recording is read, which takes memory of its own
         recorded, size_mb = len(Recording(path)), path.stat().st_size / 1e6
-    growth_mb = _resident_mb() - settled_mb
     lost = report.frames_lost + report.frames_incomplete + abs(exposures - recorded)
     unaccounted = report.steps_commanded - sum(getattr(report, end) for end in _ENDS)
     skipped = report.estimation["o1"].skipped
