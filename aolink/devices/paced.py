@@ -62,7 +62,7 @@ class PacedMirror:
 
     @property
     def timing_sigma_ns(self) -> float:
-        """Root mean square of how late the device's answers to its newest inputs were heard, ns: it took them before."""
+        """Rms of how late the device's answers to its newest inputs were heard, ns; it had taken them before."""
         with self._changed:
             return float(np.sqrt(np.mean(np.square(self._lateness_ns)))) if self._lateness_ns else 0.0
 

@@ -14,8 +14,8 @@ import numpy as np
 from aolink.estimation.compiled.small import compiled, inlined
 from aolink.numerics.arrays import BoolArray, FloatArray
 
-# A product of variance ratios is replaced by its logarithm when it exceeds this.
-_LARGE = 1e200
+LARGE = 1e200
+"""A product of variance ratios is replaced by its logarithm when it exceeds this."""
 
 
 class Line(NamedTuple):
@@ -49,7 +49,7 @@ class Line(NamedTuple):
 
 
 @compiled
-def _place(theta: float, low: float, per_unit: float, pixels: int, points: int, reach: int) -> tuple[int, int, float]:
+def place(theta: float, low: float, per_unit: float, pixels: int, points: int, reach: int) -> tuple[int, int, float]:
     """First pixel in a padded row that a spot lights, or -1; nearest point of the table; distance from it in pixels.
 
     The arguments are numbers, not the `Line`: counting references to its arrays would take longer than all the rest.
@@ -69,7 +69,7 @@ def expected_light(line: Line, path: FloatArray, f: FloatArray) -> None:
     f[:] = 0.0
     points, _, reach = line.table.shape
     for k in range(len(path)):
-        first, point, d = _place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
+        first, point, d = place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
         if first < 0:
             continue
         w = line.weights[k]
@@ -86,7 +86,7 @@ def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatAr
     points, _, reach = line.table.shape
     slope = np.empty(reach)
     for k in range(len(path)):
-        first, point, d = _place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
+        first, point, d = place(path[k], line.low, line.per_unit, line.y.shape[1], points, reach)
         if first < 0:
             continue
         w = line.weights[k]
@@ -115,7 +115,7 @@ def log_likelihood_of(line: Line, row: int, f: FloatArray) -> float:
                 total += e * e / R
                 # One logarithm of a product: one for each pixel would take longer than all else here.
                 product *= R * quiet
-                if product > _LARGE:
+                if product > LARGE:
                     total += math.log(product)
                     product = 1.0
             else:
@@ -134,21 +134,14 @@ def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArr
 
 
 @compiled
-def log_likelihoods(line: Line, t: FloatArray, out: FloatArray) -> None:
-    """Log-likelihoods (rows, points) of points t (rows, points, n)."""
-    for row in range(len(t)):
-        log_likelihoods_of_row(line, row, t[row], out[row])
-
-
-@compiled
-def log_likelihoods_of_row(line: Line, row: int, t: FloatArray, out: FloatArray) -> None:
-    """Log-likelihoods (points,) of points t (points, n) in one row."""
+def log_likelihoods_of_lines(line: Line, row: int, t: FloatArray, begin: int, end: int, out: FloatArray) -> None:
+    """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row."""
     path = np.empty(len(line.weights))
     f = np.empty(line.y.shape[1] + 2 * line.table.shape[2])
-    for j in range(len(t)):
-        path_of(line.inputs[row], line.basis, t[j], path)
+    for k in range(begin, end):
+        path_of(line.inputs[row], line.basis, t[:, k], path)
         expected_light(line, path, f)
-        out[j] = log_likelihood_of(line, row, f)
+        out[k] = log_likelihood_of(line, row, f)
 
 
 @inlined
@@ -181,7 +174,7 @@ def fisher_information(
     if gain:
         for p in range(pixels):
             product *= 1.0 + gain * quiet * (scores[2, p] if usable[p] else 0.0)
-            if product > _LARGE:
+            if product > LARGE:
                 total += math.log(product)
                 product = 1.0
     for i in range(n):

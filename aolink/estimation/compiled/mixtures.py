@@ -1,4 +1,4 @@
-"""Gaussian mixtures, compiled: Runnalls' reduction, and adaptive importance sampling of a line sensor's pixels."""
+"""Gaussian mixtures, compiled: Runnalls' reduction, and adaptive importance sampling of the pixels."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 
 import numpy as np
 
-from aolink.estimation.compiled.line import Line, expected_light, log_likelihood_of
+from aolink.estimation.compiled.likelihoods import log_likelihoods_of_row
+from aolink.estimation.compiled.line import Line
+from aolink.estimation.compiled.plane import Plane
 from aolink.estimation.compiled.small import cholesky, compiled, compiled_sums, decay, lower_inverse
 from aolink.numerics.arrays import FloatArray
 
@@ -229,10 +231,10 @@ def log_densities(
 
 @compiled
 def importance_corrected(
-    line: Line, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray, log_weight: FloatArray,
-    mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray, enough: FloatArray,
-    least_effective: float, halvings: int, prior_points: float, last_prior_points: float, loosened: float,
-    negligible: float, effective: FloatArray,
+    seen: Line | Plane, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
+    log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray,
+    enough: FloatArray, least_effective: float, halvings: int, prior_points: float, last_prior_points: float,
+    loosened: float, negligible: float, effective: FloatArray,
 ) -> None:  # fmt: skip
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
@@ -251,7 +253,6 @@ def importance_corrected(
     weight, tempered, some, more = np.empty(many), np.empty(many), np.empty(many), np.empty(many)
     old_mean, old_inverse = np.empty((rounds, count, n)), np.empty((rounds, count, n, n))
     old_weight, old_constant = np.empty((rounds, count)), np.empty((rounds, count))
-    path, f = np.empty(len(line.weights)), np.empty(line.y.shape[1] + 2 * line.table.shape[2])
     for axis in range(axes):
         w, x, P = log_weight[axis], mean[axis], covariance[axis]
         _roots(prior_weight[axis], prior_covariance[axis], prior_root, prior_inverse, prior_constant)
@@ -260,13 +261,7 @@ def importance_corrected(
             old_weight[r], old_mean[r], old_inverse[r], old_constant[r] = w, x, inverse, constant
             begin, end = r * points, (r + 1) * points
             _draw(w, x, root, uniform[r], normal[r], total, t, begin)
-            for k in range(begin, end):
-                path[:] = line.inputs[axis]
-                for i in range(n):
-                    for node in range(len(path)):
-                        path[node] += t[i, k] * line.basis[i, node]
-                expected_light(line, path, f)
-                target[k] = log_likelihood_of(line, axis, f)
+            log_likelihoods_of_row(seen, axis, t, begin, end, target)
             _log_densities(
                 prior_weight[axis], prior_mean[axis], prior_inverse, prior_constant, t, begin, end, some, prior_logs,
                 prior_density,

@@ -114,10 +114,13 @@ class MixtureFilter(Filter):
         n = self.plant.n_states
         twice.mapped(np.eye(n), np.zeros((n, n))).reduced(1).log_density(twice.mean)
         drop_repeats(twice.mean, twice.covariance, 1.0, *(np.zeros((1, 2)) for _ in range(3)))
-        if self.plant.n_outputs > 1:
-            return
-        model, pixels = exposure_model(self.plant, 2), self.sensor.profile.pixels
-        dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
+        model, outputs, pixels = exposure_model(self.plant, 2), self.plant.n_outputs, self.sensor.profile.pixels
+        dark: Profile | SpotWindows
+        if outputs == 1:
+            dark = Profile(density=np.zeros((1, pixels)), mask=np.ones((1, pixels), dtype=bool))
+        else:
+            window = (1, outputs // 2, pixels, pixels)
+            dark = SpotWindows(density=np.zeros(window), mask=np.ones(window, dtype=bool))
         response = model.response(np.zeros((2, self.plant.n_inputs * self.plant.axes)))
         view = PixelView(self.sensor, model, response, dark, updater.reduction(model, self.sensor))
         updater.update(view.part(one), self.prior.part(one), self._unseen.part(one), 0)

@@ -16,7 +16,6 @@ windowed moments decides (`scattered`). In both cases tempered sequential Monte 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -26,7 +25,6 @@ from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels.gaussian_mixture import (
     GaussianMixture,
-    cholesky,
     joined,
     log_sum,
     stacked_axes,
@@ -34,7 +32,6 @@ from aolink.estimation.pixels.gaussian_mixture import (
 )
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.estimation.pixels.tempering import fitted, tempered_points
-from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray
 
 # Most rounds, and the effective sample size that is enough.
@@ -122,65 +119,20 @@ def importance_corrected(
 ) -> tuple[GaussianMixture, FloatArray]:
     """A mixture fitted to weighted points, and their effective sample size, (axes,), which is to reach ``enough``."""
     n = view.reduced.size
-    points = min(_MOST_POINTS, 2 ** math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
-    if (line := view.line) is not None:
-        numbers = [_quasi_random(points, n, k) for k in range(_ROUNDS)]
-        fit = proposal.copy()
-        effective = np.empty(len(prior.mean))
-        compiled_mixtures.importance_corrected(
-            line, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
-            np.stack([e for _, e in numbers]), enough, _LEAST_EFFECTIVE, _HALVINGS, n * _PRIOR_POINTS,
-            n * _LAST_PRIOR_POINTS, _LOOSENED, _NEGLIGIBLE, effective,
-        )  # fmt: skip
-        return fit, effective
-    proposal, proposals = proposal.ordered(), list[GaussianMixture]()
-    t = np.zeros((len(prior.mean), 0, n))
-    target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
-    fit, going_on = proposal, np.ones(len(t), dtype=bool)
-    for k in range(_ROUNDS):
-        new = _drawn(proposal, points, k)
-        proposals.append(proposal)
-        t = np.concatenate([t, new], axis=1)
-        target = np.concatenate([target, with_noise(prior, new) + view.log_likelihoods(new)], axis=1)
-        log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
-        log_weight -= log_sum(log_weight, axis=1)[:, None]
-        effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
-        tempered = _tempered(log_weight, _LEAST_EFFECTIVE)
-        loosened = replace(proposal, covariance=proposal.covariance * (_LOOSENED if k else 1.0))
-        last = _refitted(proposal, t, tempered, loosened, n * _LAST_PRIOR_POINTS)
-        some = np.flatnonzero(going_on)
-        fit = fit.replaced(some, last.part(some))
-        going_on &= effective < enough
-        if not going_on.any():
-            break
-        proposal = _refitted(proposal, t, tempered, proposal, n * _PRIOR_POINTS)
+    numbers = [_quasi_random(points_of_round(n, share), n, k) for k in range(_ROUNDS)]
+    fit = proposal.copy()
+    effective = np.empty(len(prior.mean))
+    compiled_mixtures.importance_corrected(
+        view.seen, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
+        np.stack([e for _, e in numbers]), enough, _LEAST_EFFECTIVE, _HALVINGS, n * _PRIOR_POINTS,
+        n * _LAST_PRIOR_POINTS, _LOOSENED, _NEGLIGIBLE, effective,
+    )  # fmt: skip
     return fit, effective
 
 
-def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Weights raised to the largest power up to one at which the effective sample size is ``least``, or half of all."""
-    least = min(least, log_weight.shape[1] / 2)
-    low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
-    power = high
-    for _ in range(_HALVINGS):
-        w = power[:, None] * log_weight
-        enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
-        low, high = np.where(enough, power, low), np.where(enough, high, power)
-        power = (low + high) / 2
-        power = np.where(low == 1, 1.0, power)
-    w = np.where(low == 1, 1.0, low)[:, None] * log_weight
-    return w - log_sum(w, axis=1)[:, None]
-
-
-def _drawn(proposal: GaussianMixture, count: int, number: int) -> FloatArray:
-    """Points of a mixture, (axes, count, n); those of each round have a number."""
-    axes, _, n = proposal.mean.shape
-    u, e = _quasi_random(count, n, number)
-    total = np.cumsum(np.exp(proposal.log_weight), axis=1)
-    component = np.minimum((total[:, None] < u[:, None] * total[:, -1:, None]).sum(axis=2), total.shape[1] - 1)
-    rows = np.arange(axes)[:, None]
-    root = cholesky(proposal.covariance)[rows, component]
-    return np.asarray(proposal.mean[rows, component] + np.add.reduce(root * e[:, None], axis=-1))
+def points_of_round(n: int, share: float) -> int:
+    """Points that each round has for n coefficients: this share of the usual number, to a power of two."""
+    return min(_MOST_POINTS, 1 << math.ceil(math.log2(share * max(_FEWEST_POINTS, _POINTS * n**2))))
 
 
 @lru_cache(maxsize=32)
@@ -191,23 +143,3 @@ def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArr
     points = qmc.Sobol(n + 1, scramble=False).random(count)
     points = (points + np.random.default_rng(number).random(n + 1)) % 1.0
     return points[:, 0], np.asarray(special.ndtri(np.clip(points[:, 1:], 1e-12, 1 - 1e-12)))
-
-
-def _refitted(
-    mixture: GaussianMixture, points: FloatArray, log_weight: FloatArray, beside: GaussianMixture, prior_points: float
-) -> GaussianMixture:
-    """One EM step with weighted points; the covariances of ``beside`` count as ``prior_points`` more."""
-    logs = mixture.component_log_densities(points)
-    share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
-    mass = np.add.reduce(share, axis=2)
-    effective = mass**2 / np.maximum(np.add.reduce(share * share, axis=2), 1e-300)
-    safe = np.maximum(mass, 1e-300)[..., None]
-    mean = batched.long_matmul(share, points) / safe
-    mean = np.where(mass[..., None] > 1e-9, mean, mixture.mean)
-    away = points[:, None] - mean[:, :, None]
-    spread = batched.long_matmul(batched.transpose(away * share[..., None]), away) / safe[..., None]
-    trust = (effective / (effective + prior_points))[..., None, None]
-    covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
-    mass = np.where(mass > _NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
-    with np.errstate(divide="ignore"):
-        return GaussianMixture(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

@@ -19,7 +19,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from aolink.estimation.compiled.line import Line, log_likelihoods
+from aolink.estimation.compiled.likelihoods import log_likelihoods
+from aolink.estimation.compiled.line import Line
+from aolink.estimation.compiled.plane import Plane
 from aolink.estimation.frames.frame_data import Profile, SpotWindows
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model import quadrature
@@ -214,21 +216,17 @@ class PixelView:
         flat = batched.long_matmul(t, self.rows.T)
         return np.asarray(flat.reshape(*t.shape[:2], self.outputs, -1) + self.nodes.inputs[:, None])
 
-    def predicted(self, t: FloatArray) -> FloatArray:
-        """Densities of the pixels without noise, (axes, k, pixels)."""
-        w, edges, terms = self.nodes.weights, self.optics.profile.edges, mehler_series(self.kernel)
-        path = self.paths(t).reshape(*t.shape[:2], self.outputs // 2, 2, -1)
-        X, Y = (pixel_masses(self.kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
-        light = sum(c * batched.long_matmul(batched.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms))
-        return np.asarray(light).reshape(*t.shape[:2], -1) / self.optics.pixel_size
-
     def log_likelihoods(self, t: FloatArray) -> FloatArray:
         """Log-likelihoods of many points (axes, points, n), (axes, points)."""
-        if (line := self.line) is None:
-            return self.log_likelihood(self.predicted(t))
         out = np.empty(t.shape[:2])
-        log_likelihoods(line, np.ascontiguousarray(t), out)
+        log_likelihoods(self.seen, np.ascontiguousarray(batched.transpose(t)), out)
         return out
+
+    @property
+    def seen(self) -> Line | Plane:
+        """The frame for compiled code."""
+        line = self.line
+        return self._plane if line is None else line
 
     @property
     def line(self) -> Line | None:
@@ -245,8 +243,24 @@ class PixelView:
             kernel_variance=self.sensor.kernel.variance,
         )  # fmt: skip
 
+    @property
+    def _plane(self) -> Plane:
+        """The frame of spots for compiled code."""
+        profile, nodes, terms = self.optics.profile, self.nodes, mehler_series(self.kernel)
+        across, down = (
+            np.stack([_light_table(float(self.kernel[d, d]), profile.pixel_size, j) for j in range(len(terms))])
+            for d in (0, 1)
+        )
+        windows = (len(self.y), self.outputs // 2, profile.pixels, profile.pixels)
+        return Plane(
+            y=np.ascontiguousarray(self.y).reshape(windows), usable=np.ascontiguousarray(self.mask).reshape(windows),
+            inputs=np.ascontiguousarray(nodes.inputs), basis=np.ascontiguousarray(batched.transpose(nodes.basis)),
+            weights=nodes.weights, across=across, down=down, terms=np.array(terms), low=float(profile.edges[0]),
+            per_unit=1 / profile.pixel_size, read_noise=self.read_noise, gain=self.gain,
+        )  # fmt: skip
+
     def linearised(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`predicted`, and its Jacobian (axes, k, pixels, n)."""
+        """Densities of the pixels without noise, (axes, k, pixels), and their Jacobian (axes, k, pixels, n)."""
         w, edges, D = self.nodes.weights[:, None], self.optics.profile.edges, self.optics.pixel_size
         lead, size, spots, terms = t.shape[:2], t.shape[2], self.outputs // 2, mehler_series(self.kernel)
         path = self.paths(t).reshape(*lead, spots, 2, -1)
@@ -297,13 +311,14 @@ class PixelView:
 
 
 @lru_cache(maxsize=64)
-def _light_table(variance: float, pixel: float) -> FloatArray:
+def _light_table(variance: float, pixel: float, order: int = 0) -> FloatArray:
     """Taylor coefficients of the densities of pixels about a spot, for points in its own pixel, (points, 4, pixels).
 
-    They are those of powers of its distance from the point, in pixels.
+    They are those of powers of its distance from the point, in pixels; of the derivative of this ``order`` by the
+    spot's position.
     """
     points = math.ceil(_POINTS * pixel / math.sqrt(variance))
     half = math.ceil(_REACH * math.sqrt(variance) / pixel) + 1
     places = (np.arange(points) + 0.5) * pixel / points
-    masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, 3)
+    masses = pixel_masses(variance, pixel * np.arange(-half, half + 1.0), places, order + 3)[order:]
     return np.stack([mass * pixel ** (k - 1) / math.factorial(k) for k, mass in enumerate(masses)], axis=1)

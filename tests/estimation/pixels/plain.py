@@ -1,33 +1,127 @@
-"""The plain twin, in NumPy, of what compiled code does for a line sensor's pixels."""
+"""The plain twins, in NumPy, of what compiled code does for pixels: of a line sensor, and of spots on a plane."""
+
+import math
+from dataclasses import replace
 
 import numpy as np
 
 from aolink.estimation import Profile
 from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.pixels import importance
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
 from aolink.optics.kernel import pixel_masses
+from aolink.optics.plane import mehler_series
 from tests.kinds import must_be
 
 
 class PlainView(PixelView):
-    """A `PixelView` of a line sensor whose likelihood, modes and importance weights are those of NumPy."""
+    """A `PixelView` whose likelihood and modes are those of NumPy."""
+
+    sees_line: bool
 
     @classmethod
     def of(cls, view):
         """The twin of a view."""
         twin = cls.__new__(cls)
-        twin.__dict__.update(vars(view), on_line=False)
+        twin.__dict__.update(vars(view), on_line=False, sees_line=view.on_line)
         return twin
 
     def moments(self, about):
+        if not self.sees_line:
+            return super().moments(about)
         return WindowedMoments(self.sensor.profile).look(self.nodes, about, must_be(Profile, self.measured))
 
     def predicted(self, t):
-        return self.linearised(t)[0]
+        """Densities of the pixels without noise, (axes, k, pixels)."""
+        if self.sees_line:
+            return self.linearised(t)[0]
+        w, edges, terms = self.nodes.weights, self.optics.profile.edges, mehler_series(self.kernel)
+        path = self.paths(t).reshape(*t.shape[:2], self.outputs // 2, 2, -1)
+        X, Y = (pixel_masses(self.kernel[d, d], edges, path[:, :, :, d], len(terms) - 1) for d in (0, 1))
+        light = sum(c * batched.long_matmul(batched.transpose(Y[j]), X[j] * w[:, None]) for j, c in enumerate(terms))
+        return np.asarray(light).reshape(*t.shape[:2], -1) / self.optics.pixel_size
 
     def linearised(self, t):
+        if not self.sees_line:
+            return super().linearised(t)
         path, w, pixel = self.paths(t)[:, :, 0], self.nodes.weights, self.optics.pixel_size
         mass, slope = pixel_masses(self.kernel[0, 0], self.optics.profile.edges, path, 1)
         f = batched.matmul(w[None], mass)[..., 0, :] / pixel
         return f, batched.long_matmul(np.swapaxes(slope * w[:, None], -1, -2), self.nodes.basis[0]) / pixel
+
+    def log_likelihoods(self, t):
+        return self.log_likelihood(self.predicted(t))
+
+
+def importance_corrected(view, prior, proposal, share, enough):
+    """The twin of `importance.importance_corrected`."""
+    n = view.reduced.size
+    points = importance.points_of_round(n, share)
+    proposals = list[GaussianMixture]()
+    t = np.zeros((len(prior.mean), 0, n))
+    target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
+    fit, going_on = proposal, np.ones(len(t), dtype=bool)
+    for k in range(importance._ROUNDS):
+        new = _drawn(proposal, points, k)
+        proposals.append(proposal)
+        t = np.concatenate([t, new], axis=1)
+        target = np.concatenate([target, with_noise(prior, new) + view.log_likelihoods(new)], axis=1)
+        log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
+        log_weight -= log_sum(log_weight, axis=1)[:, None]
+        effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
+        tempered = _tempered(log_weight, importance._LEAST_EFFECTIVE)
+        loosened = replace(proposal, covariance=proposal.covariance * (importance._LOOSENED if k else 1.0))
+        last = _refitted(proposal, t, tempered, loosened, n * importance._LAST_PRIOR_POINTS)
+        some = np.flatnonzero(going_on)
+        fit = fit.replaced(some, last.part(some))
+        going_on &= effective < enough
+        if not going_on.any():
+            break
+        proposal = _refitted(proposal, t, tempered, proposal, n * importance._PRIOR_POINTS)
+    return fit, effective
+
+
+def _tempered(log_weight, least):
+    """Weights raised to the largest power up to one at which the effective sample size is ``least``, or half of all."""
+    least = min(least, log_weight.shape[1] / 2)
+    low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
+    power = high
+    for _ in range(importance._HALVINGS):
+        w = power[:, None] * log_weight
+        enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
+        low, high = np.where(enough, power, low), np.where(enough, high, power)
+        power = (low + high) / 2
+        power = np.where(low == 1, 1.0, power)
+    w = np.where(low == 1, 1.0, low)[:, None] * log_weight
+    return w - log_sum(w, axis=1)[:, None]
+
+
+def _drawn(proposal, count, number):
+    """Points of a mixture, (axes, count, n); those of each round have a number."""
+    axes, _, n = proposal.mean.shape
+    u, e = importance._quasi_random(count, n, number)
+    total = np.cumsum(np.exp(proposal.log_weight), axis=1)
+    component = np.minimum((total[:, None] < u[:, None] * total[:, -1:, None]).sum(axis=2), total.shape[1] - 1)
+    rows = np.arange(axes)[:, None]
+    root = cholesky(proposal.covariance)[rows, component]
+    return np.asarray(proposal.mean[rows, component] + np.add.reduce(root * e[:, None], axis=-1))
+
+
+def _refitted(mixture, points, log_weight, beside, prior_points):
+    """One EM step with weighted points; the covariances of ``beside`` count as ``prior_points`` more."""
+    logs = mixture.component_log_densities(points)
+    share = np.exp(logs - log_sum(logs, axis=1)[:, None] + log_weight[:, None])  # (axes, components, points)
+    mass = np.add.reduce(share, axis=2)
+    effective = mass**2 / np.maximum(np.add.reduce(share * share, axis=2), 1e-300)
+    safe = np.maximum(mass, 1e-300)[..., None]
+    mean = batched.long_matmul(share, points) / safe
+    mean = np.where(mass[..., None] > 1e-9, mean, mixture.mean)
+    away = points[:, None] - mean[:, :, None]
+    spread = batched.long_matmul(batched.transpose(away * share[..., None]), away) / safe[..., None]
+    trust = (effective / (effective + prior_points))[..., None, None]
+    covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
+    mass = np.where(mass > importance._NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
+    with np.errstate(divide="ignore"):
+        return GaussianMixture(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

@@ -4,13 +4,16 @@ import dataclasses
 import os
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy import linalg
 
 from aolink.estimation import exposure_model, make_estimator
 from aolink.estimation.compiled import forget_stale, make_ready, small
-from aolink.estimation.frames.frame_data import Profile
+from aolink.estimation.frames.frame_data import Needs, Profile, SpotWindows
+from aolink.estimation.frames.measure import measure
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.pixels import likelihood, modes
 from aolink.estimation.pixels.filter import MixtureFilter
@@ -28,10 +31,12 @@ from aolink.estimation.pixels.modes import (
 )
 from aolink.estimation.pixels.updates import MIXTURE, PROFILE, explored
 from aolink.optics.camera import to_density
+from aolink.optics.sensor import Kernel
 from aolink.rig import load_rig
 from aolink.simulation.model import simulate
+from tests.estimation.pixels import plain
 from tests.estimation.pixels.plain import PlainView
-from tests.kinds import truth_of
+from tests.kinds import must_be, truth_of
 
 LIVELY = load_rig("section-vi-lively")
 
@@ -259,11 +264,80 @@ def test_importance_sampling_with_the_same_points(pair):
     _, proposal = explored(view.part(some), prior)
     proposal = proposal.ordered()
     (ours, points), (theirs, their_points) = (
-        importance_corrected(each.part(some), prior, proposal, 1.0, np.full(6, 100.0)) for each in (view, in_numpy)
+        corrected(each.part(some), prior, proposal, 1.0, np.full(6, 100.0))
+        for corrected, each in ((importance_corrected, view), (plain.importance_corrected, in_numpy))
     )
     np.testing.assert_allclose(points, their_points, rtol=0.02)
     weights, their_weights = (np.exp(each.ordered().log_weight) for each in (ours, theirs))
     np.testing.assert_allclose(weights, their_weights, atol=2e-3)
+    sd = np.sqrt(np.einsum("aii->ai", theirs.gaussian.covariance))
+    np.testing.assert_allclose(ours.gaussian.mean / sd, theirs.gaussian.mean / sd, atol=5e-3)
+    np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.gaussian.covariance)) / sd, 1.0, atol=5e-3)
+
+
+SPOTS = load_rig("single-lenslet")
+PLANES: dict[str, dict[str, Any]] = {
+    "round": {},
+    "aslant": {"kernel": Kernel(shape="gaussian", sigma=0.13, matrix=((0.15, 0.05), (0.05, 0.09)))},
+    "shot noise": {"photoelectrons": 300.0},
+}
+
+
+def looked_at_plane(kind, masked):
+    """A view of one spot on a plane that moves along both directions, and the prior of t."""
+    own = SPOTS.plant
+    A, B, B_w, C, P = (linalg.block_diag(m, m) for m in (own.A, own.B, own.B_w, own.C, own.initial_covariance))
+    plant = dataclasses.replace(
+        own, A=A, B=B, B_w=B_w, C=C, initial_covariance=P, process_noise=0.1 * np.eye(2), initial_mean=np.zeros(4),
+        axes=1,
+    )  # fmt: skip
+    rig = changed(dataclasses.replace(SPOTS, plant=plant), **PLANES[kind])
+    (exposure,) = exposures_of(rig, 1, 3)
+    mask = exposure.mask.copy()
+    mask[:masked, ::3] = False
+    measured, _ = measure(rig, dataclasses.replace(exposure, mask=mask), Needs(what="windows", least_usable=0.5))
+    model, windows = exposure_model(plant, exposure.n_steps), must_be(SpotWindows, measured)
+    view = likelihood.PixelView(
+        rig.sensor, model, model.response(exposure.inputs), windows, likelihood.reduction(model, rig.sensor)
+    )
+    assert not view.on_line
+    truth = exposure.truth.start_state.reshape(1, 4)
+    return view, PlainView.of(view), Gaussian(truth, plant.initial_covariance[None] / 20)
+
+
+@pytest.mark.parametrize("masked", [0, 9])
+@pytest.mark.parametrize("kind", PLANES)
+def test_the_likelihood_of_a_spot_on_a_plane_is_that_of_the_twin(kind, masked):
+    """Points far away are among them: spots half outside the window, and quite outside."""
+    view, in_numpy, state = looked_at_plane(kind, masked)
+    prior = view.reduced.prior(state)
+    rng = np.random.default_rng(4)
+    t = prior.mean[:, None] + rng.standard_normal((1, 60, view.reduced.size)) * 0.3
+    t[0, 40:50, 0] += 1.0
+    t[0, 50:, :4] += 7.0
+    f = in_numpy.predicted(t)
+    light = f.sum(axis=2) * view.optics.pixel_size
+    assert light[0, :40].min() > 0.9
+    assert ((light[0, 40:50] > 0.01) & (light[0, 40:50] < 0.9)).any()
+    assert light[0, 50:].max() < 1e-6
+    ours, theirs = view.log_likelihoods(t), in_numpy.log_likelihoods(t)
+    noise = np.sqrt(view.read_noise)
+    residual = np.abs(view.y[:, None] - f).sum(axis=2) / noise
+    assert np.all(np.abs(ours - theirs) < 4e-7 * f.max() / noise * (residual + 1) + 1e-9 * np.abs(theirs))
+    assert masked == 0 or not np.allclose(theirs, looked_at_plane(kind, 0)[1].log_likelihoods(t))
+
+
+@pytest.mark.parametrize("kind", ["round", "aslant"])
+def test_importance_sampling_of_a_spot_on_a_plane_with_the_same_points(kind):
+    view, in_numpy, state = looked_at_plane(kind, 0)
+    prior = single(state)
+    _, proposal = explored(view, prior)
+    (ours, points), (theirs, their_points) = (
+        corrected(each, prior, proposal, 0.5, np.full(1, 100.0))
+        for corrected, each in ((importance_corrected, view), (plain.importance_corrected, in_numpy))
+    )
+    assert points[0] > 30
+    np.testing.assert_allclose(points, their_points, rtol=0.02)
     sd = np.sqrt(np.einsum("aii->ai", theirs.gaussian.covariance))
     np.testing.assert_allclose(ours.gaussian.mean / sd, theirs.gaussian.mean / sd, atol=5e-3)
     np.testing.assert_allclose(np.sqrt(np.einsum("aii->ai", ours.gaussian.covariance)) / sd, 1.0, atol=5e-3)

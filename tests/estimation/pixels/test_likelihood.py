@@ -54,7 +54,7 @@ def view_of(rig, *, photoelectrons=0.0, seed=1, all_steps=False, **how):
     level = len(reduced.resolution.levels) - 1 if all_steps else 0
     view = likelihood.PixelView(rig.sensor, model, model.response(exposure.inputs), measured, reduced, level)
     assert not all_steps or view.whole_nodes == exposure.n_steps
-    return view if spots else PlainView.of(view), model
+    return PlainView.of(view), model
 
 
 def some_points(view, count=3, seed=2):
