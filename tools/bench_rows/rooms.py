@@ -18,7 +18,7 @@ ROWS = {
         "recording_rate", "loop_stall", "reestimation_rate", "memory_of_an_hour", "kill_at_any_moment", "truncation",
         "flipped_bits", "batch_workers", "rrd_of_ten_minutes", "rrd_size", "view_first",
     ),
-    "start": ("command_start", "view_start"),
+    "start": ("command_start", "first_profile", "view_start"),
     "batches": ("tiny_recordings", "read_over_needed", "cluster_workers"),
     "restoration": ("restoration_quality", "restoration_uncertainty", "restoration_time"),
     "shaken": ("shaken",),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import pty
+import shutil
 import statistics
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import aolink
 from bench_rows.recording import hour
 from bench_rows.row import Effort, Row, median_s, timed
 
@@ -23,6 +25,7 @@ _RECORDING = Path(__file__).parents[2] / "recordings" / "section-vi.mcap"
 _FIRST_PART = b"32/"
 """What the progress bar says when the first part of a long recording is with the viewer."""
 _COMMAND = (sys.executable, "-m", "aolink")
+_NOT_COMPILED = shutil.ignore_patterns("__pycache__")
 
 
 @contextmanager
@@ -39,8 +42,9 @@ def _compiled() -> Iterator[None]:
             os.environ.update(before)
 
 
-def _run(*command: str | Path) -> None:
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+def _run(*command: str | Path, **where: str) -> None:
+    environment = os.environ | where
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
 
 
 def _row(what: str, command: Sequence[str | Path], peer: str, limit_s: float, effort: Effort) -> Row:
@@ -58,6 +62,28 @@ def command_start(effort: Effort) -> list[Row]:
         _row("import aolink", (sys.executable, "-c", "import aolink"), "pass", 0.3, effort),
         _row("aolink --help", (*_COMMAND, "--help"), "import typer, rich.console", 0.3, effort),
     ]
+
+
+_FIRST_PROFILE = """
+import aolink
+from aolink.estimation import make_estimator
+
+rig = aolink.load_rig("section-vi-lively")
+make_estimator(rig, "profile").step(next(iter(aolink.simulate(rig, 1, seed=1))))
+"""
+
+
+def first_profile(_: Effort) -> Row:
+    """In a package that nobody has used yet: its installation compiles, and then the first `profile`."""
+    with tempfile.TemporaryDirectory() as name:
+        own = shutil.copytree(Path(aolink.__file__).parent, Path(name) / "aolink", ignore=_NOT_COMPILED)
+        where = {"PYTHONPATH": str(own.parent), "PYTHONSAFEPATH": "1"}
+        compiled = timed(lambda: _run(sys.executable, "-m", "aolink.estimation.compiled", **where))
+        first = timed(lambda: _run(sys.executable, "-c", _FIRST_PROFILE, **where))
+    return Row(
+        "the first estimate of `profile`, from the start of Python, after an installation that compiles",
+        f"{first:.2f} s", f"limit 5 s; compiling {compiled:.0f} s", 5 / first, 1.0,
+    )  # fmt: skip
 
 
 def view_start(effort: Effort) -> list[Row]:

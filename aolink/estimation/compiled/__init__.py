@@ -1,11 +1,12 @@
-"""Loops over axes, components and pixels, compiled by Numba: of line sensors, and of many spots of one plant.
+"""Loops over axes, components and pixels, compiled by Numba: of line sensors, of spots, and of many spots of one plant.
 
 Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the processor's
-cache. Each loop for line sensors has a twin in NumPy, in `pixels.modes` and `pixels.importance`, that spots on a plane
-use and that tests compare it with; the loops for many spots of one plant are tested against the dense view of the same
-pixels. They hold no lock, so axes are shared among threads; the result for one axis does not depend on how many others
-there are, bit for bit. Machine code is kept beside the source or in the user's cache. It is made when an estimator is
-made, not during a session.
+cache. Each loop for line sensors and for spots has a twin in NumPy that tests compare it with: in `pixels.modes`, where
+spots on a plane use it, or in `tests/estimation/pixels/plain.py`. The loops for many spots of one plant are tested
+against the dense view of the same pixels. They hold no lock, so axes are shared among threads; the result for one axis
+does not depend on how many others there are, bit for bit. Machine code is kept beside the source or in the user's
+cache. ``python -m aolink.estimation.compiled`` makes it, as a part of the installation; otherwise it is made when the
+first estimator that needs it is made, not during a session.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from aolink.rig import load_rig
 
 compiled.compiles_itself = True
 make_estimator(load_rig("section-vi-lively"), "mixture")
+make_estimator(load_rig("tip-tilt"), "mixture")
 make_estimator(load_rig("membrane-12x12"), "profile")
 """
 compiles_itself = False
