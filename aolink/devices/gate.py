@@ -35,7 +35,8 @@ _SLACK_S = 1.0
 _DELAY_S = 1.0
 """On virtual time, how long a packet may take beyond four times the rig file's latency: a rig may inject stalls."""
 _LONGEST_TEXT = 1000
-_REMEMBERED_BLOCKS = 65_536
+_REMEMBERED_BLOCKS = 4096
+"""A closed loop sends some six of them for each exposure; of older ones only the id is checked."""
 _KINDS: dict[str, tuple[type[Message], ...]] = {
     "camera": (pb.FrameChunk, pb.TruthChunk, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
     "mirror": (pb.Applied, pb.CommandAck, pb.ClockReply, pb.Event, pb.Ack, pb.Identity),
