@@ -17,6 +17,7 @@ from aolink.cli import (  # noqa: F401  their commands
     recordings,
     restore,
     rigs,
+    sessions,
 )
 from aolink.cli.common import app, stderr
 from aolink.errors import AolinkError

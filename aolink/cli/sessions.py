@@ -1,0 +1,415 @@
+"""Commands that run sessions: record, replay, demo."""
+
+import json
+import math
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from aolink.cli.common import (
+    EstimatorOption,
+    FileArgument,
+    JsonOption,
+    KeyOption,
+    OutputOption,
+    OverwriteOption,
+    app,
+    check_measured,
+    get_ready,
+    load_checked,
+    open_recording,
+    program,
+    progress,
+    stderr,
+    stdout,
+    warn,
+    with_key,
+)
+from aolink.cli.terminal import progress_bar
+from aolink.errors import EstimatorError
+from aolink.signals import Interrupted, StopRequest
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from aolink.recording.reader import Recording
+    from aolink.rig import Rig
+    from aolink.session import Report
+    from aolink.session.dry_run import DryRun
+    from aolink.viewing import LiveView
+
+MOST_EXPOSURES = 2**32 - 1
+
+
+class Light(StrEnum):
+    """The light in a recording for a calibration."""
+
+    DARK = "dark"
+    FLAT = "flat"
+    STILL = "still"
+
+
+@app.command(
+    epilog="Example: aolink record --camera /dev/pts/3 --mirror /dev/pts/4 --rig section-vi"
+    " --estimator o3 --exposures 100 -o session.mcap"
+)
+def record(
+    rig: Annotated[
+        str, typer.Option(metavar="RIG.toml", help="A rig file, or the name of a rig that comes with aolink.")
+    ],
+    output: OutputOption,
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PORT",
+            help="Port of the camera: a device path or socket://host:port; by default the rig file names the driver.",
+        ),
+    ] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, likewise.")] = None,
+    key: KeyOption = None,
+    estimator: EstimatorOption = None,
+    exposures: Annotated[int | None, typer.Option(min=1, max=MOST_EXPOSURES, help="How many exposures.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="S", help="How long to record, s of device time.")] = None,
+    note: Annotated[str, typer.Option(metavar="TEXT", help="A text to keep in the recording.")] = "",
+    calibration: Annotated[
+        Light | None,
+        typer.Option(help="Record frames of this light for `aolink calibrate`; the mirror stays parked."),
+    ] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Close the loop with this controller, integrator, lqg or another package's; the first -e serves it.",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --control: also a loop that is unstable by the model.")
+    ] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show the session live in Rerun, which skips exposures if it is too slow.")
+    ] = False,
+    inputs: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--input",
+            metavar="KIND:NAME=VALUE,...|FILE",
+            help="Play this, not the rig's drive: sine:amplitude=0.2,frequency=5; chirp:amplitude=0.2,from=1,to=40;"
+            " prbs:amplitude=0.2,to=40,seed=3; step:amplitude=0.2,at=1; column=0 for one input only;"
+            " or inputs from a .csv, .npy, .npz or .mcap file.",
+        ),
+    ] = None,
+    reconnect: Annotated[
+        float,
+        typer.Option(
+            min=0, metavar="S", help="Wait so long for a native device's port that vanishes, and go on with it."
+        ),
+    ] = 0.0,
+    split_mib: Annotated[
+        float, typer.Option(min=0, max=2**30, metavar="MIB", help="Begin another file at this size; 0 for one file.")
+    ] = 0.0,
+    split_s: Annotated[
+        float, typer.Option(min=0, metavar="S", help="Begin another file after this time; 0 for one file.")
+    ] = 0.0,
+    compression: Annotated[str, typer.Option(help="lz4, zstd or none.")] = "lz4",
+    chunk_kib: Annotated[int, typer.Option(metavar="KIB", help="Write a chunk to the file at this size.")] = 128,
+    flush_s: Annotated[
+        float, typer.Option(metavar="S", help="Write a chunk to the file at this age; a kill loses at most twice this.")
+    ] = 0.1,
+    fsync_s: Annotated[float, typer.Option(metavar="S", help="How often the file is synchronised to the disk.")] = 1.0,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check everything, with the devices, but send the mirror no input.")
+    ] = False,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Record a session: play the rig's drive, or close the loop; record everything, estimate online.
+
+    In real time an estimator that is slower than the camera skips exposures; the recording has them all.
+    Without --exposures or --duration it records until Ctrl-C; the recording stays whole either way.
+    """
+    from aolink import session
+    from aolink.recording.mcap_file import WriteOptions
+
+    options = WriteOptions(
+        compression=compression, chunk_bytes=chunk_kib << 10, flush_s=flush_s, fsync_s=fsync_s,
+        split_bytes=round(split_mib * 2**20), split_s=split_s,
+    )  # fmt: skip
+    loaded = load_checked(rig)
+    if force and not control:
+        raise typer.BadParameter("--force is for --control")
+    if exposures is not None and duration is not None:
+        raise typer.BadParameter("give --exposures or --duration, not both")
+    if duration is not None:
+        periods = duration / (loaded.timing.frame_period_steps * loaded.timing.fast_step_s)
+        if not 0 < periods <= MOST_EXPOSURES:
+            raise typer.BadParameter(f"--duration {duration:g} is not a number of seconds above zero")
+        exposures = math.ceil(periods)
+    loaded, camera, mirror = with_key(loaded, camera, mirror, key)
+    played = None
+    if inputs:
+        from aolink.session.excitation import excitation
+
+        if control or calibration:
+            raise typer.BadParameter("--input is not for --control or --calibration, which give the inputs themselves")
+        played = excitation(inputs, loaded)
+        exposures = exposures or played.exposures or None
+    get_ready(loaded, estimator or [])
+    if dry_run:
+        from aolink.session.dry_run import dry_run as checked
+
+        with StopRequest().installed() as stop:
+            found = checked(
+                loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0,
+                calibration=calibration or "", inputs=played, control=control or "", force=force,
+                overwrite=overwrite, stop=stop,
+            )  # fmt: skip
+        stop.raise_if_asked()
+        _print_dry_run(found, as_json)
+        return
+    report = session.Report()
+
+    def told(done: int) -> None:
+        skipped = report.exposures_skipped.items()
+        notes = ["skipped: " + ", ".join(f"{name} {n}" for name, n in skipped)] if skipped else []
+        tell(done, "; ".join([*notes, *([report.control.note] if report.control else [])]))
+
+    with _live_view(loaded, estimator or [], shown=view) as live:
+        with StopRequest().installed() as stop, progress("exposures", exposures) as tell:
+            session.record(
+                loaded, camera, mirror, output, estimators=estimator or [], exposures=exposures or 0, note=note,
+                calibration=calibration or "", inputs=played, control=control or "", force=force,
+                watch=live.show if live else None, overwrite=overwrite,
+                options=options, reconnect_s=reconnect, stop=stop, progress=told, report=report,
+            )  # fmt: skip
+        _print_session(report, output, as_json)
+    stop.raise_if_asked()
+    if any(each.failed for each in report.estimation.values()):
+        raise typer.Exit(EstimatorError.exit_code)
+
+
+def _print_dry_run(found: "DryRun", as_json: bool) -> None:
+    for warning in found.warnings:
+        warn(warning)
+    if as_json:
+        print(json.dumps(found.facts | {"warnings": found.warnings}))
+        return
+    for name, text in found.facts.items():
+        stdout.print(f"{name:<12}{text}", markup=False)
+    stdout.print(
+        "dry run: all of this is good; no input was sent to the mirror, and nothing was recorded", markup=False
+    )
+
+
+def _print_session(report: "Report", output: Path, as_json: bool) -> None:
+    from aolink.cli.tables import sessions as tables
+
+    for warning in report.warnings:
+        warn(warning)
+    if as_json:
+        print(json.dumps(tables.session_as_json(report), allow_nan=False), flush=True)
+    else:
+        stdout.print(tables.session(report))
+        written = report.files[0] if report.files else output
+        parts = f" in {len(report.files)} files" if len(report.files) > 1 else ""
+        text = f"{written}: {report.exposures} exposures{parts}, {report.ended}; look at it: {program()} view {written}"
+        stdout.print(text, markup=False)
+
+
+def _live_view(
+    rig: "Rig", estimators: Sequence[str], true_scene: "NDArray[np.uint16] | None" = None, *, shown: bool
+) -> "AbstractContextManager[LiveView | None]":
+    """What shows exposures in the viewer, or None."""
+    if not shown:
+        return nullcontext()
+    from aolink import viewing
+
+    return viewing.live_viewer(rig, estimators, true_scene)
+
+
+@app.command(
+    epilog="Example: aolink replay session.mcap --rate 1 --estimator moments --view"
+    "  |  aolink replay session.mcap --to-rig --camera /dev/pts/3 --mirror /dev/pts/4 -o again.mcap"
+)
+def replay(
+    file: FileArgument,
+    estimator: EstimatorOption = None,
+    rate: Annotated[
+        float, typer.Option(min=0, metavar="X", help="X times as fast as it was recorded; 0 for as fast as it goes.")
+    ] = 0.0,
+    start: Annotated[float, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")] = 0.0,
+    end: Annotated[float | None, typer.Option(metavar="S", help="End at this time.")] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Say what this controller would have commanded, served by the first -e; and on a simulated rig what"
+            " would have come of it.",
+        ),
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show it live in Rerun.")] = False,
+    to_rig: Annotated[
+        bool, typer.Option("--to-rig", help="Send its commands to a rig, and record a new session.")
+    ] = False,
+    camera: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the camera, with --to-rig.")] = None,
+    mirror: Annotated[str | None, typer.Option(metavar="PORT", help="Port of the mirror, with --to-rig.")] = None,
+    key: KeyOption = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", metavar="FILE", help="The new recording, with --to-rig.")
+    ] = None,
+    overwrite: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Replay a recording through the estimators as if it were live, or send its commands to a rig.
+
+    Exposures that an estimator skipped in the session are skipped again; `aolink estimate` skips none.
+    """
+    from aolink.estimation.registry import DEFAULT_ESTIMATOR
+
+    recording = open_recording(file)
+    names = list(dict.fromkeys(estimator or recording.estimators or [DEFAULT_ESTIMATOR]))
+    get_ready(recording.rig, names)
+    if to_rig:
+        if control:
+            raise typer.BadParameter("--to-rig sends the recorded commands: `aolink record --control` closes a loop")
+        if not (output and _are_driven(recording.rig, camera, mirror)):
+            raise typer.BadParameter(
+                "--to-rig needs -o FILE, --camera PORT and --mirror PORT, or [devices] in its rig file"
+            )
+        to = with_key(recording.rig, camera, mirror, key)
+        _replay_to_rig(recording, names, *to, output, overwrite=overwrite, as_json=as_json)
+        return
+    if camera or mirror or key or output:
+        raise typer.BadParameter("--camera, --mirror, --key and -o are for --to-rig")
+    if control:
+        if view or rate or start or end is not None:
+            raise typer.BadParameter("--control takes the whole recording at once: leave out --view, --rate and times")
+        _replay_control(recording, control, names[0], as_json=as_json)
+        return
+    from aolink.cli.tables import scores as tables
+    from aolink.estimation import Scorer
+    from aolink.session.replay import replay as replay_recording
+
+    scorers = {name: Scorer() for name in names}
+    live_view = _live_view(recording.rig, names, recording.true_scene, shown=view)
+    with live_view as live, StopRequest().installed() as stop:
+        total = recording.n_frames
+        with progress("replay", total if end is None and not start else None) as tell:
+            series = replay_recording(
+                recording, names, rate=rate, start_s=start, end_s=math.inf if end is None else end, stop=stop
+            )
+            for number, (exposure, estimates) in enumerate(series, 1):
+                for estimate in estimates:
+                    scorers[estimate.estimator].add(exposure, estimate)
+                if live is not None:
+                    live.show(exposure, estimates)
+                tell(number)
+        scores = {name: scorer.result() for name, scorer in scorers.items()}
+        if as_json:
+            print(json.dumps(tables.scores_as_json(scores), allow_nan=False), flush=True)
+        else:
+            stdout.print(tables.scores(scores))
+    stop.raise_if_asked()
+    check_measured(file, scores)
+
+
+def _replay_control(recording: "Recording", controller: str, estimator: str, *, as_json: bool) -> None:
+    from aolink.cli.tables import control as tables
+    from aolink.jobs.closed_loop import replayed
+
+    with StopRequest().installed() as stop, progress("replay", None) as tell:
+        result = replayed(recording, controller, estimator, stop, tell)
+    stop.raise_if_asked()
+    if as_json:
+        print(json.dumps(tables.replayed_as_json(result), allow_nan=False))
+    else:
+        stdout.print(tables.replayed(result))
+
+
+def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
+    """Whether a port or the rig file says what drives each of the devices."""
+    return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
+
+
+def _replay_to_rig(
+    recording: "Recording",
+    names: list[str],
+    rig: "Rig",
+    camera: str | None,
+    mirror: str | None,
+    output: Path,
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    from aolink import session
+    from aolink.cli.tables import recordings as tables
+    from aolink.cli.tables import sessions
+    from aolink.recording.compare import compare
+    from aolink.recording.reader import Recording
+    from aolink.recording.topics import TOPICS
+    from aolink.session.replay import RecordedCommands
+
+    commands = RecordedCommands(recording)
+    with StopRequest().installed() as stop, progress("exposures", commands.exposures) as tell:
+        report = session.record(
+            rig, camera, mirror, output, estimators=names, exposures=commands.exposures,
+            inputs=commands.inputs, note=f"commands of {recording.path.name}", overwrite=overwrite, stop=stop,
+            progress=tell,
+        )  # fmt: skip
+    for warning in report.warnings:
+        warn(warning)
+    only = [row.name for row in TOPICS if row.repeatable]
+    found = compare(recording, Recording(output), only=only, relative_to_start=True)
+    if as_json:
+        print(json.dumps(tables.comparison_as_json(found, same_rig=True), allow_nan=False))
+    else:
+        stdout.print(sessions.session(report))
+        stdout.print(tables.comparison(found))
+        stdout.print(f"{output}: {report.exposures} exposures, {report.ended}", markup=False)
+    stop.raise_if_asked()
+
+
+@app.command(epilog="Example: aolink demo --rig section-vi-lively --out /tmp")
+def demo(
+    rig: Annotated[str, typer.Option(help="Rig file or name.")] = "section-vi",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="The folder in which to make a new, dated one.")] = Path(),
+    exposures: Annotated[int, typer.Option(min=2, help="How many exposures.")] = 300,
+    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the rig file's seed.")] = None,
+    real_time: Annotated[bool, typer.Option("--real-time", help="Run in real time and measure latencies.")] = False,
+    control: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Close the loop, and compare with the open one and the integrator."),
+    ] = None,
+) -> None:
+    """Run everything with a simulated rig: record, estimate, estimate again, compare, draw."""
+    from aolink.cli.tables import scores, sessions
+    from aolink.jobs.demo import new_folder, possible_estimators, run_demo
+    from aolink.recording.reader import Recording
+    from aolink.recording.reestimate import scored
+
+    loaded = load_checked(rig)
+    folder = new_folder(out)
+    get_ready(loaded, possible_estimators(loaded))
+    stop = StopRequest()
+    try:
+        with progress_bar(stderr, exposures) as tell:
+            result = run_demo(
+                loaded, rig, folder, exposures=exposures, seed=seed, real_time=real_time,
+                control=control or "", stoppable=stop.installed, progress=tell,
+            )  # fmt: skip
+    except Interrupted as interrupted:
+        raise Interrupted(interrupted.number, f"what was made until then is in {folder}") from None
+    if not stop():
+        recording = Recording(result.recording)
+        stdout.print(scores.scores(scored(recording, recording.estimators)))
+    stdout.print(sessions.session(result.report))
+    for line in sessions.demo_summary(result, program()):
+        stdout.print(line, markup=False)
+    stop.raise_if_asked()
+    if result.differences:
+        raise typer.Exit(1)
