@@ -45,8 +45,8 @@ def _of_run(run: wire.Applied | wire.CommandBlock | Run, rig: Rig) -> str:
     if count != run.n_steps * rig.n_inputs:
         return "u has not the inputs of its steps"
     u = np.frombuffer(run.u, "<f8") if isinstance(run, Run) else np.asarray(run.u)
-    # The sum of squares says so of all of them in one pass, and is NaN where one of them is.
-    return "" if float(u @ u) <= _MOST_INPUT**2 else "u has an input that is no number, or beyond all"
+    largest = np.abs(u).max(initial=0.0)  # NaN where one of them is
+    return "" if largest <= _MOST_INPUT else "u has an input that is no number, or beyond all"
 
 
 def _of_exposure(info: pb.ExposureInfo, rig: Rig) -> str:
