@@ -195,6 +195,22 @@ COMPARED = (*(each.name for each in fields(Estimate) if each.compare), "path", "
 """Fields that agree in two estimates that are the same."""
 
 
+LARGE = 256
+"""Covariances of more rows are in single precision, so that recordings keep them in a quarter of the bytes."""
+
+
+def in_single_precision(covariance: FloatArray) -> FloatArray:
+    """Large covariances (axes, n, n), symmetric and rounded to single precision; others as they are.
+
+    A variance is off by 6e-8 of itself then.
+    """
+    if covariance.shape[-1] <= LARGE:
+        return covariance
+    rounded = covariance.astype(np.float32)
+    lower = np.tri(covariance.shape[-1], dtype=bool)
+    return np.where(lower, rounded, rounded.swapaxes(-1, -2)).astype(np.float64)
+
+
 def coefficient_roots(estimate: Estimate) -> list[FloatArray]:
     """A root R of each axis's coefficient covariance R R', axes times (n_coefficients, n)."""
     return [psd_root(each) for each in estimate.coefficient_covariance]

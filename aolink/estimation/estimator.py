@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from aolink.estimation.alignment import Shifted, considered, matters, share_of_shift
 from aolink.estimation.batch import Batch
-from aolink.estimation.estimate import Estimate, Status
+from aolink.estimation.estimate import Estimate, Status, in_single_precision
 from aolink.estimation.frames.measure import Measured, Measurements
 from aolink.estimation.kalman.filter import Filter, Posterior
 from aolink.estimation.kalman.two_states import Run
@@ -134,7 +134,8 @@ class Estimator:
         self.several = posterior.several
         self.posterior = posterior
         reasons = [*([remark] if remark else []), *reasons, *_status_reasons(posterior)]
-        coefficients, covariance = posterior.coefficients.mean, posterior.coefficients.covariance
+        coefficients, n = posterior.coefficients.mean, self.rig.plant.n_states
+        covariance = in_single_precision(posterior.coefficients.covariance)
         return Estimate(
             estimator=self.name,
             frame_id=exposure.frame_id,
@@ -143,9 +144,9 @@ class Estimator:
             status=_worst(posterior.status),
             reason="; ".join(reasons),
             start_state=posterior.start.mean,
-            start_covariance=posterior.start.covariance,
+            start_covariance=covariance[:, :n, :n],
             end_state=posterior.end.mean,
-            end_covariance=posterior.end.covariance,
+            end_covariance=in_single_precision(posterior.end.covariance),
             coefficients=coefficients,
             coefficient_covariance=covariance,
             inputs=exposure.inputs,

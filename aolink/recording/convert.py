@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import zstandard
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 from numpy.typing import NDArray
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 from aolink.assembly import Frame
 from aolink.errors import RecordingError
 from aolink.estimation import ExposureModel
-from aolink.estimation.estimate import AlignmentError, Estimate, Status
+from aolink.estimation.estimate import LARGE, AlignmentError, Estimate, Status, in_single_precision
 from aolink.exposure import Exposure, Truth
+from aolink.limits import limits
 from aolink.recording import schemas_pb2 as pb
 from aolink.wire import messages_pb2 as wire
 
@@ -148,12 +150,55 @@ def estimate_message(estimate: Estimate) -> pb.Estimate:
         nis=estimate.nis,
     )
     for name in ("end_covariance", "coefficient_covariance"):
-        _fill(message, name, getattr(estimate, name))
+        covariance = getattr(estimate, name)
+        if covariance.shape[-1] > LARGE and np.array_equal(covariance, in_single_precision(covariance)):
+            setattr(message, f"packed_{name}", packed(covariance))
+        else:
+            _fill(message, name, covariance)
     if estimate.alignment is not None:
         message.alignment_steps = estimate.alignment.steps
         _fill(message, "alignment_coefficients", estimate.alignment.coefficients)
         _fill(message, "alignment_end_state", estimate.alignment.end_state)
     return message
+
+
+def packed(covariance: NDArray[np.float64]) -> bytes:
+    """Symmetric matrices (axes, n, n) of numbers in single precision, as schemas.proto says."""
+    numbers = np.ascontiguousarray(covariance[:, _lower(covariance.shape[-1])], dtype="<f4")
+    planes = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, 4).T)
+    return zstandard.ZstdCompressor(level=1).compress(planes.tobytes())
+
+
+def is_packed(data: bytes, axes: int, n: int) -> bool:
+    """Whether that is what bytes say that they hold, and memory has room for it."""
+    try:
+        size = zstandard.get_frame_parameters(data).content_size
+    except zstandard.ZstdError:
+        return False
+    return 8 * axes * n * n <= limits().chunk_bytes and size == 2 * axes * n * (n + 1)
+
+
+def _unpacked(data: bytes, axes: int, n: int) -> NDArray[np.float64]:
+    """Inverse of `packed`."""
+    try:
+        planes = np.frombuffer(zstandard.decompress(data) if is_packed(data, axes, n) else b"", np.uint8)
+        numbers = np.ascontiguousarray(planes.reshape(4, -1).T).view("<f4").reshape(axes, -1)
+        lower = np.zeros((axes, n, n))
+        lower[:, _lower(n)] = numbers
+    except (zstandard.ZstdError, ValueError):
+        raise RecordingError("an estimate in the file has the wrong size: the file is damaged") from None
+    return np.where(_lower(n), lower, lower.swapaxes(-1, -2))
+
+
+@lru_cache(maxsize=8)
+def _lower(n: int) -> NDArray[np.bool_]:
+    """Where the lower triangle of a matrix is."""
+    return np.tri(n, dtype=bool)
+
+
+def _covariance(message: pb.Estimate, name: str, axes: int, n: int) -> NDArray[np.float64]:
+    data: bytes = getattr(message, f"packed_{name}")
+    return _unpacked(data, axes, n) if data else _array(getattr(message, name), axes, n, n)
 
 
 def _fill(message: Message, field: str, values: NDArray[np.float64]) -> None:
@@ -175,7 +220,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
     """Inverse of `estimate_message`; the path is that of the inputs of its exposure."""
     axes, n, c, m = message.axes, message.n_states, message.n_coefficients, message.n_measurements
     coefficients = _array(message.coefficients, axes, c)
-    covariance = _array(message.coefficient_covariance, axes, c, c)
+    covariance = _covariance(message, "coefficient_covariance", axes, c)
     if message.innovation_variance:
         spread = _array(message.innovation_variance, axes, m)
     else:
@@ -194,7 +239,7 @@ def estimate_from_message(message: pb.Estimate, model: ExposureModel, exposure: 
         start_state=coefficients[:, :n].copy(),
         start_covariance=start_covariance,
         end_state=_array(message.end_state, axes, n),
-        end_covariance=_array(message.end_covariance, axes, n, n),
+        end_covariance=_covariance(message, "end_covariance", axes, n),
         coefficients=coefficients,
         coefficient_covariance=covariance,
         inputs=exposure.inputs,

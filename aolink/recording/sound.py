@@ -8,6 +8,7 @@ from google.protobuf.message import Message
 
 from aolink.estimation.estimate import Status
 from aolink.recording import schemas_pb2 as pb
+from aolink.recording.convert import is_packed
 from aolink.rig import Rig
 from aolink.wire import messages_pb2 as wire
 from aolink.wire.runs_pb2 import Run
@@ -71,13 +72,18 @@ def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
     axes, n, c, m = message.axes, message.n_states, message.n_coefficients, message.n_measurements
     spread = message.innovation_variance or message.innovation_covariance
     lengths = (
-        (message.end_state, (axes * n,)), (message.end_covariance, (axes * n * n,)),
-        (message.coefficients, (axes * c,)), (message.coefficient_covariance, (axes * c * c,)),
-        (message.innovation, (axes * m,)), (spread, (axes * m, axes * m * m)), (message.nis, (axes,)),
+        (message.end_state, (axes * n,)), (message.coefficients, (axes * c,)), (message.innovation, (axes * m,)),
+        (spread, (axes * m, axes * m * m)), (message.nis, (axes,)),
     )  # fmt: skip
-    if (axes, n) != (rig.plant.axes, rig.plant.n_states) or c < n:
-        return "the states are not the rig's"
-    if not all(len(values) in expected for values, expected in lengths):
+    covariances = (
+        (message.end_covariance, message.packed_end_covariance, n),
+        (message.coefficient_covariance, message.packed_coefficient_covariance, c),
+    )
+    whole = (
+        is_packed(packed, axes, size) if packed else len(numbers) == axes * size**2
+        for numbers, packed, size in covariances
+    )
+    if not (all(len(values) in expected for values, expected in lengths) and all(whole)):
         return "it has not as many numbers as it says"
     if not message.estimator.isprintable():
         return "its estimator's name is no text"

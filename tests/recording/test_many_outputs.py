@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 
 from aolink.estimation import run
-from aolink.estimation.estimate import coefficient_roots, motion
+from aolink.estimation.estimate import coefficient_roots, in_single_precision, motion
 from aolink.estimation.model.factored import FactoredModel
 from aolink.jobs.demo import simulated_rig
 from aolink.recording import convert
@@ -79,6 +81,10 @@ def test_a_plant_of_hundreds_of_states_is_recorded_as_patterns_and_courses(tmp_p
         np.testing.assert_allclose(
             estimate.path, path_of_z + estimate.model.response(estimate.inputs).path[0], atol=1e-10
         )
+        assert estimate.end_covariance.shape == (1, 288, 288)
+        message = convert.estimate_message(estimate)
+        assert message.ByteSize() < {"o3": 0.31e6, "profile": 0.5e6}[name]  # of 1.3 and 4.5 MB as doubles
+        assert not len(message.end_covariance) + len(message.coefficient_covariance)
     mix = np.eye(2, 200)
     mixed, root = motion(estimate, mix, coefficient_roots(estimate))
     np.testing.assert_allclose(mixed, estimate.path[:2], atol=1e-12)
@@ -99,6 +105,40 @@ def test_a_whole_innovation_covariance_of_an_older_file_is_read() -> None:
     del message.innovation_variance[:]
     read = convert.estimate_from_message(message, estimate.model, exposures[0])
     np.testing.assert_array_equal(read.innovation_covariance[0], whole)
+
+
+def large_covariances(count: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    root = np.random.default_rng(1).standard_normal((2, count, count))
+    return root @ root.swapaxes(-1, -2)
+
+
+def test_large_covariances_are_symmetric_and_in_single_precision_and_others_as_they_are() -> None:
+    given = large_covariances(300)
+    rounded = in_single_precision(given)
+    np.testing.assert_allclose(rounded, given, rtol=6e-8)
+    np.testing.assert_array_equal(rounded, rounded.swapaxes(-1, -2))
+    np.testing.assert_array_equal(in_single_precision(rounded), rounded)
+    few = large_covariances(256)
+    assert in_single_precision(few) is few
+
+
+@pytest.mark.parametrize("count", [1, 2, 300])
+def test_packed_matrices_are_read_as_the_proto_file_says(count: int) -> None:
+    given = in_single_precision(large_covariances(count).astype(np.float32).astype(np.float64))
+    given = np.where(np.tri(count, dtype=bool), given, given.swapaxes(-1, -2))
+    planes = np.frombuffer(zstandard.decompress(convert.packed(given)), np.uint8).reshape(4, -1)
+    numbers = np.ascontiguousarray(planes.T).view("<f4")
+    rows, columns = np.tril_indices(count)
+    np.testing.assert_array_equal(numbers.reshape(2, -1), given[:, rows, columns])
+
+
+def test_what_is_packed_is_damage_where_it_is_not_what_it_says() -> None:
+    """Also what would not fit into memory: a frame of nothing but zeros is small."""
+    data = convert.packed(in_single_precision(large_covariances(300)))
+    zeros = zstandard.ZstdCompressor().compress(bytes(2 * 8000 * 8001))
+    assert convert.is_packed(data, 2, 300)
+    wrong = [(data, 2, 299), (data, 1, 300), (b"", 2, 300), (data[4:], 2, 300), (zeros, 1, 8000)]
+    assert not any(convert.is_packed(*each) for each in wrong)
 
 
 def test_a_truth_of_very_many_outputs_is_in_single_precision() -> None:

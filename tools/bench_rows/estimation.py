@@ -221,9 +221,12 @@ def spots_under_turbulence(effort: Effort) -> list[Row]:
 
 def membrane_in_real_time(effort: Effort) -> list[Row]:
     """An exposure of membrane-12x12, 288 states seen by 100 lenslets, at 5 Hz; and what memory it takes."""
+    import lz4.frame
+
     from aolink.estimation import make_estimator
     from aolink.estimation.model.dense import DenseModel
     from aolink.plant.alike import alike_systems
+    from aolink.recording.convert import estimate_message
     from aolink.simulation.model import simulate
 
     rig = load_rig("membrane-12x12")
@@ -249,10 +252,14 @@ def membrane_in_real_time(effort: Effort) -> list[Row]:
     together = statistics.median(sum(each) for each in zip(*times.values(), strict=True))
     rows.append(Row("the three of them together", f"{1e3 * together:.0f} ms", "5 Hz: 200 ms", 0.2 / together, 1))
     tracemalloc.start()
-    for estimator in estimators.values():
-        estimator.step(exposures[-1])
+    newest = {name: estimator.step(exposures[-1]) for name, estimator in estimators.items()}
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
+    for name, estimate in newest.items():
+        recorded = len(lz4.frame.compress(estimate_message(estimate).SerializeToString())) / 1e6  # as in a chunk
+        doubles = (estimate.end_covariance.nbytes + estimate.coefficient_covariance.nbytes) / 1e6
+        what = f"an estimate of {name}, recorded"
+        rows.append(Row(what, f"{recorded:.2f} MB", f"limit 0.3 MB; as doubles {doubles:.1f}", 0.3 / recorded, 1))
     systems, steps = alike_systems(rig.plant), rig.timing.exposure_steps
     assert systems is not None
     coefficients = rig.n_inputs * DenseModel(systems.one, steps).n_coefficients
