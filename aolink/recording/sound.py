@@ -83,6 +83,8 @@ def _of_estimate(message: pb.Estimate, rig: Rig) -> str:
         is_packed(packed, axes, size) if packed else len(numbers) == axes * size**2
         for numbers, packed, size in covariances
     )
+    if (axes, n) != (rig.plant.axes, rig.plant.n_states) or c < n:
+        return "the states are not the rig's"
     if not (all(len(values) in expected for values, expected in lengths) and all(whole)):
         return "it has not as many numbers as it says"
     if not message.estimator.isprintable():
