@@ -166,7 +166,10 @@ def packed(covariance: NDArray[np.float64]) -> bytes:
     """Symmetric matrices (axes, n, n) of numbers in single precision, as schemas.proto says."""
     numbers = np.ascontiguousarray(covariance[:, _lower(covariance.shape[-1])], dtype="<f4")
     planes = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, 4).T)
-    return zstandard.ZstdCompressor(level=1).compress(planes.tobytes())
+    # Bytes of exponents and of mantissas are coded apart, for they are distributed differently.
+    frame = zstandard.ZstdCompressor(level=1).compressobj(size=planes.nbytes)
+    blocks = (frame.compress(each.tobytes()) + frame.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for each in planes)
+    return b"".join(blocks) + frame.flush()
 
 
 def is_packed(data: bytes, axes: int, n: int) -> bool:
