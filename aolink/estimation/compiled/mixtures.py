@@ -238,8 +238,9 @@ def importance_corrected(
 ) -> None:  # fmt: skip
     """The proposal (axes, components, ...) becomes the mixture that fits the posterior, in place.
 
-    As `aolink.estimation.pixels.importance.importance_corrected`; ``uniform`` (rounds, points) and ``normal`` (rounds,
-    points, n) are the points' random numbers. Points, which are many, lie along the last dimension of every array here.
+    By adaptive multiple importance sampling, as `aolink.estimation.pixels.importance` says. ``uniform`` (rounds,
+    points) and ``normal`` (rounds, points, n) are the points' random numbers. Points, which are many, lie along the
+    last dimension of every array here.
     """
     axes, count, n = mean.shape
     states = prior_mean.shape[2]

@@ -28,11 +28,11 @@ class Plane(NamedTuple):
     basis: FloatArray
     """The exposure basis at the nodes, (outputs, n, nodes)."""
     weights: FloatArray
-    """Each node's share of the exposure over the area of a pixel, (nodes,)."""
+    """Each node's share of the exposure, (nodes,)."""
     across: FloatArray
-    """Taylor coefficients of the light in columns of pixels about points of a pixel, (terms, points, 4, reach)."""
+    """Taylor coefficients of the densities of columns of pixels about points of a pixel, (terms, points, 4, reach)."""
     down: FloatArray
-    """The same in rows of pixels."""
+    """The same of rows of pixels."""
     terms: FloatArray
     """Factors of the products, (terms,)."""
     low: float
