@@ -25,6 +25,8 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 """The environment variables that set the number of threads of linear algebra libraries."""
 _PATIENCE_S = 3.0
 """How long a process may take to end in good order when it has been asked to."""
+_FEEDER_S = 1.0
+"""How long the thread that writes calls to processes may take to end."""
 _FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
 """A terminal sends these to every process of a command. The parent decides what they mean for its workers."""
 
@@ -134,5 +136,11 @@ def _end(pool: ProcessPoolExecutor) -> None:
         process.join(max(0.0, deadline - time.monotonic()))
         process.kill()
         process.join(_PATIENCE_S)
-    if waiting is not None and not waiting._reader.closed:
-        waiting._reader.close()  # before Python 3.11.5 nobody does, and a call larger than a pipe is written for ever
+    if waiting is None:
+        return
+    # The thread that writes calls closes the pipe to the processes at its end. Before Python 3.11.5 a call larger than
+    # the pipe keeps it from that for ever, for nobody reads: then the pipe is closed here. Never by both at once.
+    if (feeder := waiting._thread) is not None:
+        feeder.join(_FEEDER_S)
+    if not waiting._reader.closed:
+        waiting._reader.close()

@@ -47,11 +47,11 @@ def test_another_device_on_the_port_ends_the_session(
         simulated_rig("section-vi", "--real-time", "--seed", seed) as (_, other),
         pulled_line(mirror, tmp_path / "mirror", once_latched) as line,
     ):
+        pull = pulling(line, after=2)
 
         def swap(exposures: int) -> None:
-            if exposures == 2:
-                line.device_port = other
-                line.pull()
+            line.device_port = other
+            pull(exposures)
 
         with pytest.raises(DeviceError, match=why):
             record(RIG, camera, line.port, path, reconnect_s=20, progress=swap)
