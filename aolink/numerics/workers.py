@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import select
 import signal
 import threading
 import time
@@ -25,8 +26,9 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 """The environment variables that set the number of threads of linear algebra libraries."""
 _PATIENCE_S = 3.0
 """How long a process may take to end in good order when it has been asked to."""
-_FEEDER_S = 1.0
-"""How long the thread that writes calls to processes may take to end."""
+_CALLS_S = 0.05
+"""How long to wait at a time for calls that no process will take any more."""
+_PIECE = 1 << 20
 _FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
 """A terminal sends these to every process of a command. The parent decides what they mean for its workers."""
 
@@ -61,13 +63,17 @@ def processes(count: int) -> Iterator[ProcessPoolExecutor]:
         resource_tracker.ensure_running()
     try:
         with _Pool(count, mp_context=get_context("spawn"), initializer=end_with_parent) as pool:
+            calls = os.dup(_inside(pool)._call_queue._reader.fileno())
             try:
                 yield pool
             except BaseException:
-                _end(pool)
+                _end(pool, calls)
                 raise
-            if pool._broken:  # a process that began while the pool broke would be waited for without end
-                _end(pool)
+            else:
+                if pool._broken:  # a process that began while the pool broke would be waited for without end
+                    _end(pool, calls)
+            finally:
+                os.close(calls)
     finally:
         for name, value in environment.items():
             if value is None:
@@ -125,9 +131,14 @@ def _until_ended(function: Callable[..., Result], *arguments: Any, **options: An
         os._exit(end.code if isinstance(end.code, int) else 1)
 
 
-def _end(pool: ProcessPoolExecutor) -> None:
-    running = list((pool._processes or {}).values())
-    waiting = getattr(pool, "_call_queue", None)
+def _inside(pool: ProcessPoolExecutor) -> Any:
+    """The pool with those of its parts that the standard library does not declare."""
+    return pool
+
+
+def _end(pool: ProcessPoolExecutor, calls: int) -> None:
+    """End the processes of a pool, whose calls wait in the pipe ``calls``."""
+    running, manager = list((pool._processes or {}).values()), _inside(pool)._executor_manager_thread
     for process in running:
         process.terminate()
     pool.shutdown(wait=False, cancel_futures=True)
@@ -136,11 +147,9 @@ def _end(pool: ProcessPoolExecutor) -> None:
         process.join(max(0.0, deadline - time.monotonic()))
         process.kill()
         process.join(_PATIENCE_S)
-    if waiting is None:
-        return
-    # The thread that writes calls closes the pipe to the processes at its end. Before Python 3.11.5 a call larger than
-    # the pipe keeps it from that for ever, for nobody reads: then the pipe is closed here. Never by both at once.
-    if (feeder := waiting._thread) is not None:
-        feeder.join(_FEEDER_S)
-    if not waiting._reader.closed:
-        waiting._reader.close()
+    # The pool's own threads end when all calls are in the pipe. One that is larger than the pipe would keep them from
+    # that for ever, for nobody reads (Python before 3.11.5): so it is read here, by a descriptor that only we close.
+    deadline = time.monotonic() + _PATIENCE_S
+    while manager is not None and manager.is_alive() and time.monotonic() < deadline:
+        if select.select([calls], [], [], _CALLS_S)[0] and os.read(calls, _PIECE):
+            deadline = time.monotonic() + _PATIENCE_S

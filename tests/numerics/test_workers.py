@@ -86,11 +86,20 @@ def test_workers_that_have_nothing_to_do_end_as_well(tmp_path: Path) -> None:
     assert all_end(workers)
 
 
-def test_a_pool_ends_with_calls_waiting_that_are_larger_than_a_pipe(tmp_path: Path) -> None:
+# What the thread that writes calls does meanwhile: it writes the first one, or has been made and not been started yet.
+BUSY = ""
+NOT_STARTED = (
+    "    import threading, time\n"
+    "    start = threading.Thread.start\n"
+    "    threading.Thread.start = lambda self: (time.sleep(0.5 if 'Feeder' in self.name else 0), start(self))[1]\n"
+)
+
+
+@pytest.mark.parametrize("meanwhile", [BUSY, NOT_STARTED], ids=["busy", "not started"])
+def test_a_pool_ends_with_calls_waiting_that_are_larger_than_a_pipe(tmp_path: Path, meanwhile: str) -> None:
     program = (
         "from aolink.numerics.workers import processes\n"
-        "if __name__ == '__main__':\n"
-        "    with processes(1) as pool:\n"
+        "if __name__ == '__main__':\n" + meanwhile + "    with processes(1) as pool:\n"
         "        for _ in range(4):\n"
         "            pool.submit(len, bytes(10_000_000))\n"
         "        raise SystemExit(7)\n"
