@@ -24,17 +24,19 @@ class Batch:
         self._plant = rig.plant
         kinds = {(each.n_steps, each.start_offset, each.inputs.shape) for each in exposures}
         self.model: ExposureModel | None = None
-        """The model that all exposures share, None if they differ; `responses` and `finite` exist only if they share
-        one."""
+        """The model that all exposures share, None if they differ; `responses` exist only if they share one."""
+        self.finite: list[bool]
+        """Whether all inputs of an exposure are numbers."""
         if len(kinds) > 1:
+            self.finite = [bool(np.isfinite(each.inputs).all()) for each in exposures]
             return
         ((n_steps, offset, _),) = kinds
-        inputs = np.array([each.inputs for each in exposures])
+        # One exposure of many axes is megabytes, and not copied.
+        inputs = exposures[0].inputs[None] if len(exposures) == 1 else np.array([each.inputs for each in exposures])
+        self.finite = np.isfinite(inputs).all(axis=(1, 2)).tolist()
         self.model = exposure_model(rig.plant, n_steps, offset)
         self.responses = self.model.responses(inputs)
         """Responses of all axes of the first exposure, then of the second, (exposures * axes, ...)."""
-        self.finite: list[bool] = np.isfinite(inputs).all(axis=(1, 2)).tolist()
-        """Whether all inputs of an exposure are numbers."""
 
     def model_of(self, k: int) -> ExposureModel:
         """The model of one exposure."""

@@ -128,7 +128,7 @@ class Estimator:
     def _stepped(self, batch: Batch, k: int, measured: Measured) -> Estimate:
         """The estimate of exposure k, which may have gaps and flaws."""
         exposure, model = batch.exposures[k], batch.model_of(k)
-        reasons = self._bridge(exposure)
+        reasons = self._bridge(exposure, batch.finite[k])
         taken, remark = measured
         posterior = self.filter.step(model, batch.response_to(k), taken)
         self.several = posterior.several
@@ -157,8 +157,11 @@ class Estimator:
             components=posterior.components,
         )
 
-    def _bridge(self, exposure: Exposure) -> list[str]:
-        """Predict to the start of an exposure; returns reasons to doubt its step numbers or inputs."""
+    def _bridge(self, exposure: Exposure, finite: bool) -> list[str]:
+        """Predict to the start of an exposure; returns reasons to doubt its step numbers or inputs.
+
+        ``finite`` says whether its inputs are all numbers.
+        """
         lead, reasons = exposure.lead_inputs, []
         gap = len(lead) if self._next_step is None else exposure.first_step - self._next_step
         if gap < 0:
@@ -168,7 +171,7 @@ class Estimator:
             reasons.append(f"inputs of {gap - len(lead)} of the {gap} steps before it are not known: held")
             lead = np.concatenate([np.tile(self._last_input, (gap - len(lead), 1)), lead])
         self.filter.bridge(lead[len(lead) - gap :])
-        if not (np.isfinite(exposure.inputs).all() and np.isfinite(lead).all()):
+        if not (finite and np.isfinite(lead).all()):
             reasons.append("an input is not a number: taken as zero")
         self._next_step = exposure.first_step + exposure.n_steps
         self._last_input = exposure.inputs[-1]

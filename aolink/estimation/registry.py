@@ -136,6 +136,9 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
         )
 
     def made(rig: Rig) -> Estimator:
+        # What the first exposure would load or compile is ready before the session.
+        steps = rig.timing.exposure_steps
+        exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
         return Estimator(rig, name, row.build(rig, chosen))
 
     if rig.plant.wandering is None or not row.wanders:

@@ -103,8 +103,8 @@ def measure_spots(
         kept = of_spot[:, :, None, None]
         seen = replace(seen, density=np.where(kept, seen.density, 0.0), mask=seen.mask & kept)
     reasons = [
-        (np.count_nonzero(spot_windows(sensor, ~arrived)), f"of {pixels.size} pixels are missing"),
-        (np.count_nonzero(spot_windows(sensor, saturated)), f"of {pixels.size} pixels are at an end of the scale"),
+        (_count(sensor, ~arrived), f"of {pixels.size} pixels are missing"),
+        (_count(sensor, saturated), f"of {pixels.size} pixels are at an end of the scale"),
         (np.count_nonzero(whole & ~lit), f"of {len(lit)} profiles show no spot"),
     ]
     remark = ", ".join(f"{count} {what}" for count, what in reasons if count)
@@ -136,6 +136,11 @@ def measure_spots(
     if not usable.all():
         measured = replace(_spread(measured, usable), usable=usable)
     return measured, remark
+
+
+def _count(sensor: SpotSensor, pixels: BoolArray) -> int:
+    """How many of these pixels, (rows, columns), are in windows: in most frames there are none."""
+    return int(np.count_nonzero(spot_windows(sensor, pixels))) if pixels.any() else 0
 
 
 def _seen(sensor: SpotSensor, plant: Plant, pixels: NDArray[np.uint16], good: BoolArray) -> SpotWindows:

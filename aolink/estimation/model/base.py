@@ -19,6 +19,7 @@ it is (1/N) [sum_i g(theta_i) + f g(theta_N) - f g(theta_0)]. Start state, end s
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,8 +37,6 @@ from aolink.rig import Plant
 class InputResponse:
     """The response of outputs and end state to the inputs of one exposure, and the means over it that moments need."""
 
-    path: FloatArray
-    """c, response of the outputs, (axes, n_outputs, n_steps)."""
     end: FloatArray
     """d, response of the end state, (axes, n_states)."""
     mean: FloatArray
@@ -46,12 +45,19 @@ class InputResponse:
     """b, mean of C A^i weighted with c_i, (axes, n_outputs, n_states)."""
     square: FloatArray
     """s, mean of c squared, (axes, n_outputs)."""
+    whole: Callable[[], FloatArray]
+    """What gives c: the paper's estimators need no more of it than its means."""
+
+    @cached_property
+    def path(self) -> FloatArray:
+        """c, response of the outputs, (axes, n_outputs, n_steps)."""
+        return self.whole()
 
     def of(self, some: slice) -> InputResponse:
         """The response of some of the axes."""
         return InputResponse(
-            path=self.path[some], end=self.end[some], mean=self.mean[some], slope=self.slope[some],
-            square=self.square[some],
+            end=self.end[some], mean=self.mean[some], slope=self.slope[some], square=self.square[some],
+            whole=lambda: self.path[some],
         )  # fmt: skip
 
 

@@ -19,6 +19,8 @@ _MOST_NOISE_MODES = 24
 # Share of the noise path (rms) that may be left out.
 _NOISE_LEFT_OUT = 0.02
 _TIME_BLOCK = 256
+# Most states of a plant that is stepped through an exposure by compiled code; products of matrices are faster for more.
+_FEW_STATES = 8
 
 
 class DenseModel(ExposureModel):
@@ -31,6 +33,7 @@ class DenseModel(ExposureModel):
         # paths of the states are computed then.
         few = plant.n_outputs > plant.n_states and not self.n_unmodelled
         self._few = replace(plant, C=np.eye(plant.n_states)) if few else plant
+        self._constants = [_constant(each) for each in (plant.A, plant.B, plant.C, self._state_rows)]
 
     @property
     def state_rows(self) -> FloatArray:
@@ -99,11 +102,48 @@ class DenseModel(ExposureModel):
         return np.tensordot(mixed, paths[:, :, :count], axes=1)
 
     def responses(self, inputs: FloatArray) -> InputResponse:
+        if not inputs.any():
+            return self._at_rest(len(inputs) * self.plant.axes)
+        found = (self._stepped if self.plant.n_states <= _FEW_STATES else self._by_blocks)(inputs)
+        if not self.moved:
+            return found
+        # Inputs have done nothing yet in the first step.
+        late = self.moved * self.last_response(found.end)
+        return replace(
+            found, mean=found.mean + late, square=found.square + late * late / self.moved,
+            slope=found.slope + late[..., None] * self.last_rows,
+        )  # fmt: skip
+
+    def _at_rest(self, axes: int) -> InputResponse:
+        """The response to no inputs."""
+        n, outputs = self.plant.n_states, self.plant.n_outputs
+        none = np.zeros((axes, outputs))
+        return InputResponse(
+            end=np.zeros((axes, n)), mean=none, slope=np.zeros((axes, outputs, n)), square=none,
+            whole=lambda: np.zeros((axes, outputs, self.n_steps)),
+        )  # fmt: skip
+
+    def _stepped(self, inputs: FloatArray) -> InputResponse:
+        """`responses` by compiled steps; c is only written where it is asked for."""
+        from aolink.estimation.compiled.responses import responses  # not before an estimator needs it
+
+        axes, n, outputs = len(inputs) * self.plant.axes, self.plant.n_states, self.plant.n_outputs
+        given = [*self._constants, _constant(inputs)]
+        end, mean, slope, square = (np.empty((*rows, axes)) for rows in ((n,), (outputs,), (outputs, n), (outputs,)))
+
+        def stepped(path: FloatArray) -> FloatArray:
+            responses(*given, end, mean, slope, square, path)
+            return path
+
+        stepped(np.empty((0, outputs, self.n_steps)))
+        return InputResponse(
+            end=end.T, mean=mean.T, slope=np.moveaxis(slope, -1, 0), square=square.T,
+            whole=lambda: stepped(np.empty((axes, outputs, self.n_steps))),
+        )  # fmt: skip
+
+    def _by_blocks(self, inputs: FloatArray) -> InputResponse:
+        """`responses` by products of matrices over blocks of steps."""
         path, end = input_response(self.plant, by_axis(self.plant, inputs))
-        if not path.any():
-            none = np.zeros(path.shape[:2])
-            slope = np.zeros((*path.shape[:2], self.plant.n_states))
-            return InputResponse(path=path, end=end, mean=none, slope=slope, square=none)
         mean, square = batched.mean_over_path(path), batched.mean_over_path(path * path)
         if self._few is self.plant:
             # Column by column, so that the products lie in memory as they are summed.
@@ -111,12 +151,7 @@ class DenseModel(ExposureModel):
             slope = np.stack(columns, axis=-1)
         else:
             slope = np.matmul(path[:, :, None], self.state_rows)[:, :, 0] / self.n_steps
-        if self.moved:
-            # Inputs have done nothing yet in the first step.
-            late = self.moved * self.last_response(end)
-            mean, square = mean + late, square + late * late / self.moved
-            slope = slope + late[..., None] * self.last_rows
-        return InputResponse(path=path, end=batched.batch_last(end), mean=mean, slope=slope, square=square)
+        return InputResponse(end=batched.batch_last(end), mean=mean, slope=slope, square=square, whole=lambda: path)
 
     def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
         path = input_path.copy()
@@ -149,3 +184,10 @@ class DenseModel(ExposureModel):
     def _columns(self) -> FloatArray:
         """The basis column by column, (n_coefficients, n_outputs, n_steps)."""
         return np.ascontiguousarray(self.basis.transpose(2, 0, 1))
+
+
+def _constant(values: FloatArray) -> FloatArray:
+    """The same values as all callers of compiled code give them, so that it is compiled once."""
+    view = np.ascontiguousarray(values).view()
+    view.flags.writeable = False
+    return view

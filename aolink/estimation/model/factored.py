@@ -194,7 +194,7 @@ class FactoredModel(ExposureModel):
             last = self.last_response(end)
             mean, square = mean + self.moved * last, square + self.moved * last * last
             slope = slope + self.moved * last[..., None] * self.last_rows
-        return InputResponse(path=path, end=end, mean=mean, slope=slope, square=square)
+        return InputResponse(end=end, mean=mean, slope=slope, square=square, whole=lambda: path)
 
     def _mean_slopes(self, path: FloatArray) -> FloatArray:
         """Mean of each output times the rows of its states over the fast steps, (axes, n_outputs, n_states)."""

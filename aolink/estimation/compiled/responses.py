@@ -1,0 +1,103 @@
+"""Responses of plants of few states to their inputs: the plant stepped through the exposure, several axes abreast.
+
+NumPy would run through memory for each of the means; here some axes at a time stay in the processor's cache until their
+exposure ends. The twin is `aolink.plant.lifting.input_response`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from aolink.estimation.compiled.small import compiled
+from aolink.numerics.arrays import FloatArray
+
+# Axes abreast, of few and of many. There are always so many, some of them empty: the last ones are computed as all are.
+_FEW, _MANY = 16, 64
+
+
+@compiled
+def responses(
+    A: FloatArray, B: FloatArray, C: FloatArray, rows: FloatArray, inputs: FloatArray,
+    end: FloatArray, mean: FloatArray, slope: FloatArray, square: FloatArray, path: FloatArray,
+) -> None:  # fmt: skip
+    """End state, and means over the exposure, of the response from rest.
+
+    Parameters
+    ----------
+    A, B, C:
+        The plant's, (n, n), (n, n_inputs), (n_outputs, n).
+    rows:
+        C A^i, (n_outputs, n_steps, n).
+    inputs:
+        (exposures, n_steps, axes * n_inputs). What is not a number is taken as zero.
+    end, mean, slope, square:
+        Filled with d (n, exposures * axes), and with the means of c (n_outputs, .), of C A^i times c_i
+        (n_outputs, n, .) and of c squared (n_outputs, .).
+    path:
+        Filled with c, (exposures * axes, n_outputs, n_steps), unless it has no axes.
+    """
+    n, n_u, n_y = len(A), B.shape[1], len(C)
+    n_steps, axes = inputs.shape[1], inputs.shape[2] // n_u
+    batch = len(inputs) * axes
+    abreast = _FEW if batch <= _FEW else _MANY
+    state, ahead, u = np.empty((n, abreast)), np.empty((n, abreast)), np.zeros((n_u, abreast))
+    c, sums, squares = np.empty(abreast), np.empty((n_y, abreast)), np.empty((n_y, abreast))
+    weighted = np.empty((n_y, n, abreast))
+    exposure, column = np.zeros(abreast, dtype=np.intp), np.zeros(abreast, dtype=np.intp)
+    for first in range(0, batch, abreast):
+        count = min(abreast, batch - first)
+        for a in range(count):
+            exposure[a], column[a] = divmod(first + a, axes)
+        together = n_u == 1 and exposure[0] == exposure[abreast - 1] and count == abreast
+        u[:] = 0.0
+        state[:] = 0.0
+        sums[:] = 0.0
+        squares[:] = 0.0
+        weighted[:] = 0.0
+        for i in range(n_steps):
+            if together:
+                for a in range(abreast):
+                    u[0, a] = inputs[exposure[0], i, column[0] + a]
+            else:
+                for j in range(n_u):
+                    for a in range(count):
+                        u[j, a] = inputs[exposure[a], i, column[a] * n_u + j]
+            for j in range(n_u):
+                for a in range(abreast):
+                    u[j, a] = u[j, a] if abs(u[j, a]) < math.inf else 0.0
+            for o in range(n_y):
+                for a in range(abreast):
+                    c[a] = C[o, 0] * state[0, a]
+                for j in range(1, n):
+                    for a in range(abreast):
+                        c[a] += C[o, j] * state[j, a]
+                for a in range(abreast):
+                    sums[o, a] += c[a]
+                    squares[o, a] += c[a] * c[a]
+                for j in range(n):
+                    for a in range(abreast):
+                        weighted[o, j, a] += rows[o, i, j] * c[a]
+                if len(path):
+                    for a in range(count):
+                        path[first + a, o, i] = c[a]
+            for j in range(n):
+                for a in range(abreast):
+                    ahead[j, a] = B[j, 0] * u[0, a] + A[j, 0] * state[0, a]
+                for k in range(1, n_u):
+                    for a in range(abreast):
+                        ahead[j, a] += B[j, k] * u[k, a]
+                for k in range(1, n):
+                    for a in range(abreast):
+                        ahead[j, a] += A[j, k] * state[k, a]
+            state, ahead = ahead, state
+        share = 1.0 / n_steps
+        for a in range(count):
+            for j in range(n):
+                end[j, first + a] = state[j, a]
+            for o in range(n_y):
+                mean[o, first + a] = sums[o, a] * share
+                square[o, first + a] = squares[o, a] * share
+                for j in range(n):
+                    slope[o, j, first + a] = weighted[o, j, a] * share
