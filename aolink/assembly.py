@@ -279,8 +279,9 @@ class InputHistory:
         """Whether one report is of these steps and no other report is of any of them: no command matters then."""
         if not self._applied:
             return False
-        (start, u), *others = self._applied
-        return start == first and len(u) == n_steps and all(other >= first + n_steps for other, _ in others)
+        start, u = self._applied[0]
+        after = first + n_steps
+        return start == first and len(u) == n_steps and all(other >= after for other, _ in self._applied[1:])
 
 
 def _after(end: int, blocks: _Blocks) -> _Blocks:
@@ -348,12 +349,16 @@ class Assembler:
             lead_inputs=lead,
             start_offset=frame.exposure_offset_ns / self._fast_step_ns,
             inputs_assumed=assumed + lead_assumed,
-            **{name: getattr(frame, name) for name in _OF_FRAME},
+            frame_id=frame.frame_id,
+            first_step=frame.first_step,
+            pixels=frame.pixels,
+            mask=frame.mask,
+            chunks_lost=frame.chunks_lost,
+            device_start_ns=frame.device_start_ns,
+            device_end_ns=frame.device_end_ns,
+            host_start_ns=frame.host_start_ns,
+            host_receive_ns=frame.host_receive_ns,
+            clock_sigma_ns=frame.clock_sigma_ns,
+            alignment_sigma_ns=frame.alignment_sigma_ns,
+            slopes=frame.slopes,
         )
-
-
-_OF_FRAME = (
-    "frame_id", "first_step", "pixels", "mask", "chunks_lost", "device_start_ns", "device_end_ns", "host_start_ns",
-    "host_receive_ns", "clock_sigma_ns", "alignment_sigma_ns", "slopes",
-)  # fmt: skip
-"""What an exposure has from its frame as it is."""

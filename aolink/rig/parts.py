@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -109,7 +110,7 @@ class Timing:
     exposure_offset: float = 0.0
     """How far into its first fast step an exposure starts, in fast steps, below one; it ends equally far into one."""
 
-    @property
+    @cached_property
     def fast_step_ns(self) -> int:
         return round(self.fast_step_s * 1e9)
 
