@@ -121,7 +121,7 @@ def log_spot_paths(
     strips = []
     for exposure in known:
         path = by_frame[exposure.frame_id]
-        some = np.unique(np.linspace(0, path.shape[1] - 1, _POINTS_OF_SPOT).astype(int))
+        some = _drawn(path.shape[1], _POINTS_OF_SPOT)
         inside = np.clip((path[:, some] - sensor.field[0]) / sensor.pixel_width, 0, width)
         spots = inside.reshape(sensor.spots, 2, -1).swapaxes(1, 2) + corner[:, None]
         strips.append(list(spots.astype(np.float32)))
@@ -182,7 +182,7 @@ def log_page(
                     edges: tuple[FloatArray, ...] = extremes(path, _SWINGS_IN_ROW)
                     places = (np.arange(len(edges[0])) + 0.5) / len(edges[0])
                 else:
-                    some = _points_in_row(len(path))
+                    some = _drawn(len(path), _POINTS_IN_ROW)
                     edges, places = (path[some],), (some + 0.5) / len(path)
                 for edge in edges:
                     x = np.clip((edge - sensor.field[0]) / sensor.pixel_width, 0, n)
@@ -251,16 +251,16 @@ def log_path_profile(
     """
     place = Panels(sensor, top)
     known = [e for e in exposures if e.frame_id in by_frame]
-    colour, field = colour_of(name), sensor.field
+    colour, field, edges, centres = colour_of(name), sensor.field, sensor.edges, sensor.centres
     lines, stairs, profiles = [], [], []
     for exposure in known:
         path = by_frame[exposure.frame_id]
-        some = np.unique(np.linspace(0, len(path) - 1, POINTS).astype(int))
+        some = _drawn(len(path), POINTS)
         shares = np.clip((some + 0.5) / len(path), 0, 1)
         lines.append([place.path(np.stack([np.clip(path[some], *field), shares], axis=1))])
         stairs.append([place.histogram(_histogram(sensor, path, _LIGHT * top))])
-        predicted = light * _predicted(sensor, path) / top
-        profiles.append([place.intensity(np.stack([sensor.centres, np.minimum(predicted, _MOST)], axis=1))])
+        predicted = light * _predicted(sensor, edges, path) / top
+        profiles.append([place.intensity(np.stack([centres, np.minimum(predicted, _MOST)], axis=1))])
     _send_strips(drawing, f"profile/path/{name}", timebase, known, lines, colour, 1.2)
     _send_strips(drawing, f"profile/histogram/{name}", timebase, known, stairs, colour, 1.2)
     _send_strips(drawing, f"profile/predicted/{name}", timebase, known, profiles, colour, 1.5)
@@ -318,10 +318,10 @@ class Panels:
         return np.stack([points[:, 0], base - _PANELS[number] * self._width * points[:, 1]], axis=1, dtype=np.float32)
 
 
-def _predicted(sensor: Sensor, path: FloatArray) -> FloatArray:
+def _predicted(sensor: Sensor, edges: FloatArray, path: FloatArray) -> FloatArray:
     """Density in each pixel after an exposure, as `exposure_density` has it, near enough to be drawn."""
-    u = (sensor.edges - path[:, None]) / math.sqrt(2 * sensor.kernel.variance)
-    return np.asarray(np.diff(np.interp(u, _ERF_AT, _ERF).mean(axis=0) / 2) / np.diff(sensor.edges))
+    u = (edges - path[:, None]) / math.sqrt(2 * sensor.kernel.variance)
+    return np.asarray(np.diff(np.interp(u, _ERF_AT, _ERF).mean(axis=0)) / (2 * sensor.pixel_width))
 
 
 def _histogram(sensor: Sensor, path: FloatArray, top: float) -> FloatArray:
@@ -346,9 +346,9 @@ def _ticks(low: float, high: float) -> list[float]:
 
 
 @lru_cache(maxsize=8)
-def _points_in_row(n_steps: int) -> NDArray[np.int64]:
-    """Which steps of a path are drawn in its row of the history."""
-    return np.unique(np.linspace(0, n_steps - 1, min(_POINTS_IN_ROW, n_steps)).astype(np.int64))
+def _drawn(n_steps: int, most: int) -> NDArray[np.int64]:
+    """Which steps of a path are drawn, at most so many."""
+    return np.unique(np.linspace(0, n_steps - 1, min(most, n_steps)).astype(np.int64))
 
 
 def _send_strips(

@@ -165,6 +165,13 @@ def some_rows(values: NDArray[np.float64], count: int) -> IntArray:
     rows, lines = values.shape
     if rows <= count:
         return np.arange(rows)
-    parts = np.array_split(np.arange(rows), max(1, count // (2 * lines)))
-    ends = [part[find(values[part], axis=0)] for part in parts for find in (np.argmin, np.argmax)]
-    return np.unique(np.concatenate([*ends, [0, rows - 1]]))
+    parts = max(1, count // (2 * lines))
+    length, longer = divmod(rows, parts)
+    kept = [np.array([0, rows - 1])]
+    # All parts of one length at once: the first ones have a row more.
+    for first, of, size in ((0, longer, length + 1), (longer * (length + 1), parts - longer, length)):
+        if of:
+            some = values[first : first + of * size].reshape(of, size, lines)
+            starts = first + size * np.arange(of)[:, None]
+            kept += [(starts + find(some, axis=1)).ravel() for find in (np.argmin, np.argmax)]
+    return np.unique(np.concatenate(kept))
