@@ -11,7 +11,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -21,7 +21,7 @@ from aolink.batch import Settings, estimate_file
 from aolink.jobs import batch
 from aolink.numerics.workers import processes as pool_of
 from bench_rows.recording import record_long
-from bench_rows.row import Effort, Row, median_s, resident_mb, timed
+from bench_rows.row import Effort, Row, resident_mb, timed
 
 _TINY = 10_000
 
@@ -174,7 +174,7 @@ def cluster_workers(effort: Effort) -> Row:
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
         for k in range(8):
-            record_long(folder / f"{k}.mcap", effort.of(200, 5))
+            record_long(folder / f"{k}.mcap", effort.of(600, 5))
         sources = [str(folder / f"{k}.mcap") for k in range(8)]
         (folder / "out").mkdir()
         todo = [
@@ -196,22 +196,23 @@ def cluster_workers(effort: Effort) -> Row:
                 client.wait_for_workers(count)
             return address
 
-        def work(address: str) -> float:
+        def work(address: str, some: Sequence[Any] = todo) -> float:
             """Time that the workers were busy, s."""
-            done = list(run_on(address, todo))
+            done = list(run_on(address, some))
             assert not any(each.error for each in done)
             return math.fsum(row["seconds"] for each in done for row in each.rows)
 
-        def plain(pool: ProcessPoolExecutor) -> None:
-            assert not any(each.error for each in pool.map(batch.do, todo))
+        def plain(pool: ProcessPoolExecutor, some: Sequence[Any] = todo) -> None:
+            assert not any(each.error for each in pool.map(batch.do, some))
 
         small, large = cluster(1), cluster(2)
         alone, pair = (stack.enter_context(pool_of(count)) for count in (1, 2))
-        median_s(lambda: plain(alone), 1, lambda: plain(pair))  # they load what they need
-        median_s(lambda: work(small), 1, lambda: work(large))
+        for address, pool in ((small, alone), (large, pair)):  # they load what they need
+            plain(pool, todo[:2])
+            work(address, todo[:2])
         busy: list[float] = []
         runs = (lambda: work(small), lambda: busy.append(work(large)), lambda: plain(alone), lambda: plain(pair))
-        rounds = [[timed(run) for run in runs] for _ in range(effort.of(5))]
+        rounds = [[timed(run) for run in runs] for _ in range(effort.of(2))]
         one, two, process, processes = (statistics.median(each) for each in zip(*rounds, strict=True))
     share = statistics.median(busy) / (2 * two)
     return Row(
