@@ -104,14 +104,14 @@ def linearised_light(line: Line, path: FloatArray, basis: FloatArray, f: FloatAr
 
 
 @inlined
-def log_likelihood_of(line: Line, row: int, f: FloatArray) -> float:
-    pad = line.table.shape[2]
-    total, product, quiet = 0.0, 1.0, 1.0 / line.read_noise
-    for p in range(line.y.shape[1]):
-        if line.usable[row, p]:
-            e = line.y[row, p] - f[pad + p]
-            if line.gain and f[pad + p] > 0.0:
-                R = line.read_noise + line.gain * f[pad + p]
+def log_likelihood_of(y: FloatArray, usable: BoolArray, f: FloatArray, read_noise: float, gain: float) -> float:
+    """Log-likelihood of pixels of which f is expected, all (pixels,)."""
+    total, product, quiet = 0.0, 1.0, 1.0 / read_noise
+    for p in range(len(y)):
+        if usable[p]:
+            e = y[p] - f[p]
+            if gain and f[p] > 0.0:
+                R = read_noise + gain * f[p]
                 total += e * e / R
                 # One logarithm of a product: one for each pixel would take longer than all else here.
                 product *= R * quiet
@@ -136,12 +136,13 @@ def path_of(offset: FloatArray, basis: FloatArray, t: FloatArray, path: FloatArr
 @compiled
 def log_likelihoods_of_lines(line: Line, row: int, t: FloatArray, begin: int, end: int, out: FloatArray) -> None:
     """Log-likelihoods of the points ``begin`` to ``end`` of t (n, points) in one row."""
+    pad = line.table.shape[2]
     path = np.empty(len(line.weights))
-    f = np.empty(line.y.shape[1] + 2 * line.table.shape[2])
+    f = np.empty(line.y.shape[1] + 2 * pad)
     for k in range(begin, end):
         path_of(line.inputs[row], line.basis, t[:, k], path)
         expected_light(line, path, f)
-        out[k] = log_likelihood_of(line, row, f)
+        out[k] = log_likelihood_of(line.y[row], line.usable[row], f[pad:], line.read_noise, line.gain)
 
 
 @inlined

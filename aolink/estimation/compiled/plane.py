@@ -6,12 +6,11 @@ series, and a pixel's light is the product of the two; where the kernel lies asl
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from aolink.estimation.compiled.line import LARGE, place
+from aolink.estimation.compiled.line import log_likelihood_of, place
 from aolink.estimation.compiled.small import compiled
 from aolink.numerics.arrays import BoolArray, FloatArray
 
@@ -73,30 +72,11 @@ def log_likelihoods_of_spots(seen: Plane, row: int, t: FloatArray, begin: int, e
                     for r in range(max(0, -top), min(len(rows), side - top)):
                         for c in range(max(0, -left), min(len(columns), side - left)):
                             f[top + r, left + c] += rows[r] * columns[c]
-            out[k] += _log_likelihood(seen.y[row, spot], seen.usable[row, spot], f, seen.read_noise, seen.gain)
+            light, usable = seen.y[row, spot].ravel(), seen.usable[row, spot].ravel()
+            out[k] += log_likelihood_of(light, usable, f.ravel(), seen.read_noise, seen.gain)
 
 
 @compiled
 def _taylor(series: FloatArray, d: float, factor: float, out: FloatArray) -> None:
     for p in range(len(out)):
         out[p] = factor * (series[0, p] + d * (series[1, p] + d * (series[2, p] + d * series[3, p])))
-
-
-@compiled
-def _log_likelihood(y: FloatArray, usable: BoolArray, f: FloatArray, read_noise: float, gain: float) -> float:
-    total, product, quiet = 0.0, 1.0, 1.0 / read_noise
-    for r in range(y.shape[0]):
-        for c in range(y.shape[1]):
-            e = y[r, c] - f[r, c]
-            if not usable[r, c]:
-                continue
-            if gain and f[r, c] > 0.0:
-                R = read_noise + gain * f[r, c]
-                total += e * e / R
-                product *= R * quiet
-                if product > LARGE:
-                    total += math.log(product)
-                    product = 1.0
-            else:
-                total += e * e * quiet
-    return -0.5 * (total + math.log(product))
