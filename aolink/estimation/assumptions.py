@@ -91,9 +91,9 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
             f" were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
         )
 
-    if plant.wandering is not None:
+    if plant.wandering is not None and plant.wandering.parameter == "frequency":
         between = swings[swings > 0] * timing.frame_period_steps / timing.exposure_steps
-        reach = 0.5 * plant.wandering.frequency * between
+        reach = 0.5 * plant.wandering.largest * between
         for each in between[np.abs(between - np.round(2 * between) / 2) < reach]:
             yield (
                 "plant.wandering",

@@ -55,8 +55,8 @@ class AlignmentError:
 
 
 @dataclass(frozen=True, eq=False)
-class WanderingFrequency:
-    """The plant's frequency, in the frequency of its matrices."""
+class WanderingValue:
+    """A quantity that drifts, in what the rig file says of it."""
 
     mean: FloatArray
     """(axes,)"""
@@ -137,7 +137,7 @@ class Estimate:
     """Where camera and mirror count by different clocks."""
     components: Components | None = field(default=None, compare=False, repr=False)
     """Where the estimator carries a mixture; recordings do not have them. `smooth` uses them."""
-    frequency: WanderingFrequency | None = field(default=None, compare=False)
+    wandering: WanderingValue | None = field(default=None, compare=False)
     """Where the rig has ``plant.wandering`` and the estimator follows it; recordings do not have it."""
 
     @property

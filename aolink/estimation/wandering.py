@@ -1,13 +1,13 @@
-"""A plant whose frequency wanders: copies of an estimator at several frequencies, weighed by what they predict.
+"""A quantity that wanders: copies of an estimator at several values of it, weighed by what they predict.
 
-Each copy has the plant of one relative frequency s, all of whose motion runs s times as fast with the same spread:
-A -> A^s, and a process noise that leaves the stationary covariance as it is. The frequency is a Markov chain over the
-copies, a random walk in log s. Each frame's likelihood under a copy weighs it (multiple models: Magill, IEEE Trans.
-Autom. Control 10 (1965); with a chain over them: Blom, Bar-Shalom, ibid. 33 (1988)). States are not mixed between
-copies, as the latter do: a plant that forgets its state brings each copy's estimate near to what its own frequency
-allows, and a mixture of Gaussians as well as a Gaussian can stay with its copy.
+Each copy has one relative value s of a frequency, a gain, a width or a noise. At a frequency s all motion of the plant
+runs s times as fast with the same spread: A -> A^s, and a process noise that leaves the stationary covariance as it
+is. The value is a Markov chain over the copies, a random walk in log s. Each frame's likelihood under a copy weighs it
+(multiple models: Magill, IEEE Trans. Autom. Control 10 (1965); with a chain over them: Blom, Bar-Shalom, ibid. 33
+(1988)). States are not mixed between copies, as the latter do: a plant that forgets its state brings each copy's
+estimate near to what its own value allows, and a mixture of Gaussians as well as a Gaussian can stay with its copy.
 
-Each axis has a frequency of its own. An estimate is the mixture of the copies' estimates, by its mean and covariance.
+Each axis has a value of its own. An estimate is the mixture of the copies' estimates, by its mean and covariance.
 Its path is written in the basis of the plant as it is in the rig file, so a recording needs no other: the noise inside
 an exposure takes up the difference.
 """
@@ -17,13 +17,14 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from scipy import linalg
 
 from aolink.errors import EstimatorError
 from aolink.estimation.batch import Batch
-from aolink.estimation.estimate import Estimate, WanderingFrequency
+from aolink.estimation.estimate import Estimate, WanderingValue
 from aolink.estimation.estimator import Estimator
 from aolink.estimation.kalman.filter import Posterior
 from aolink.estimation.model.base import ExposureModel
@@ -32,13 +33,15 @@ from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.numerics.covariance import psd_root
 from aolink.plant.alike import MANY_STATES
-from aolink.rig import Plant, Rig, Wandering
+from aolink.rig import Plant, Rig, Wandering, Wanders
 
 # Neighbours are apart by this many damping ratios of the least damped resonance, as far as the number of copies allows.
 _APART = 2.0
 _FEWEST, _MOST = 9, 21
+# How far apart neighbours of the other quantities are in the logarithm, as far as the number of copies allows.
+_SPACING = {"gain": 0.05, "process_noise": 0.15, "kernel_width": 0.03, "sensor_noise": 0.05}
 # A frame's evidence is raised to this power: it is approximate, and not quite of the same windows in all copies, and
-# what is wrong in it would add up while a frequency stays where it is.
+# what is wrong in it would add up while a value stays where it is.
 _TRUST = 0.5
 # Where another copy's path has no exact coefficients, it is met to this part of the kernel's standard deviation.
 _MET = 0.01
@@ -62,11 +65,11 @@ class WanderingEstimator(Estimator):
         wandering = rig.plant.wandering
         assert wandering is not None
         logs = _grid(rig.plant, wandering)
-        rigs = [dataclasses.replace(rig, plant=at_frequency(rig.plant, math.exp(each))) for each in logs]
+        rigs = [at_value(rig, wandering.parameter, math.exp(each)) for each in logs]
         self._each = [make(each) for each in rigs]
         nominal = self._each[len(logs) // 2]
         super().__init__(rig, nominal.name, nominal.filter)
-        self._copied = [part for each in rigs for part in (each, each.plant)]
+        self._copied = [part for each in rigs for part in (each, each.plant, each.sensor)]
         self._logs, self._wandering = logs, wandering
         self._log_weight = np.full((rig.plant.axes, len(logs)), -math.log(len(logs)))
         self._last_step: int | None = None
@@ -114,12 +117,39 @@ class WanderingEstimator(Estimator):
         end, end_covariance = _mixed(w, *(np.stack(each, axis=1) for each in zip(*ends, strict=True)))
         log_mean = w @ self._logs
         spread = (w * (self._logs - log_mean[:, None]) ** 2).sum(axis=1) + (self._logs[1] - self._logs[0]) ** 2 / 12
-        frequency = np.exp(log_mean)
+        value = np.exp(log_mean)
         return dataclasses.replace(
             heaviest, start_state=mean[:, :n], start_covariance=covariance[:, :n, :n], end_state=end,
             end_covariance=end_covariance, coefficients=mean, coefficient_covariance=covariance, model=nominal.model,
-            components=None, frequency=WanderingFrequency(frequency, frequency * np.sqrt(spread)),
+            components=None, wandering=WanderingValue(value, value * np.sqrt(spread)),
         )  # fmt: skip
+
+
+def at_value(rig: Rig, parameter: Wanders, relative: float) -> Rig:
+    """A rig with another frequency, gain, width or noise, so many times the file's.
+
+    Raises EstimatorError: its plant cannot run faster or slower.
+    """
+    plant, sensor = rig.plant, rig.sensor
+    if relative == 1.0:
+        return rig
+    if parameter == "frequency":
+        return dataclasses.replace(rig, plant=at_frequency(plant, relative))
+    if parameter == "gain":
+        return dataclasses.replace(rig, plant=dataclasses.replace(plant, B=relative * plant.B))
+    if parameter == "process_noise":
+        return dataclasses.replace(
+            rig, plant=dataclasses.replace(plant, process_noise=relative**2 * plant.process_noise)
+        )
+    if parameter == "sensor_noise":
+        noisy: Any = dataclasses.replace(sensor, noise_density=relative**2 * sensor.noise_density)
+        return dataclasses.replace(rig, sensor=noisy)
+    kernel = sensor.kernel
+    matrix: Any = kernel.matrix and tuple(tuple(relative * each for each in row) for row in kernel.matrix)
+    wide: Any = dataclasses.replace(
+        sensor, kernel=dataclasses.replace(kernel, sigma=relative * kernel.sigma, matrix=matrix)
+    )
+    return dataclasses.replace(rig, sensor=wide)
 
 
 def at_frequency(plant: Plant, relative: float) -> Plant:
@@ -148,15 +178,18 @@ def at_frequency(plant: Plant, relative: float) -> Plant:
 
 
 def _grid(plant: Plant, wandering: Wandering) -> FloatArray:
-    """Logarithms of the copies' relative frequencies; the one in the middle is zero."""
+    """Logarithms of the copies' relative values; the one in the middle is zero."""
     if plant.n_states > MANY_STATES:
         raise EstimatorError(
             f"plant.wandering is for at most {MANY_STATES} states, this plant has {plant.n_states}: leave it out"
         )
-    half = math.log1p(wandering.frequency)
-    rates = np.log(np.linalg.eigvals(plant.A).astype(complex))
-    damping = float((-rates.real / np.maximum(np.abs(rates), 1e-12)).min())
-    wanted = half / (_APART * max(damping, 1e-6))
+    half = math.log1p(wandering.largest)
+    if wandering.parameter == "frequency":
+        rates = np.log(np.linalg.eigvals(plant.A).astype(complex))
+        damping = float((-rates.real / np.maximum(np.abs(rates), 1e-12)).min())
+        wanted = half / (_APART * max(damping, 1e-6))
+    else:
+        wanted = half / _SPACING[wandering.parameter]
     side = int(min(max(math.ceil(wanted), _FEWEST // 2), _MOST // 2))
     return np.asarray(half * np.arange(-side, side + 1) / side)
 
@@ -175,8 +208,8 @@ def _evidence(posterior: Posterior) -> FloatArray:
 
 def _in_basis(nominal: Estimate, other: Estimate, tolerance: float) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance of another copy's path as coefficients of the nominal basis."""
-    if other is nominal:
-        return nominal.coefficients, nominal.coefficient_covariance
+    if other.model is nominal.model:  # what wanders is the camera's
+        return other.coefficients, other.coefficient_covariance
     model, theirs = nominal.model, other.model
     n = nominal.end_state.shape[1]
     own, basis = (each.basis.reshape(-1, each.n_coefficients) for each in (model, theirs))

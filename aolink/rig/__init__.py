@@ -2,7 +2,7 @@
 
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.rig.file import Rig, builtin_rigs, load_rig, parse_rig
-from aolink.rig.parts import Control, Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, Wandering
+from aolink.rig.parts import Control, Drive, Faults, Light, MirrorDriver, Plant, Simulation, Timing, Wandering, Wanders
 from aolink.rig.sensor_tables import CalibrationTable
 from aolink.rig.tables import parse_light, with_faults
 
@@ -21,6 +21,7 @@ __all__ = [
     "SpotSensor",
     "Timing",
     "Wandering",
+    "Wanders",
     "builtin_rigs",
     "load_rig",
     "parse_light",

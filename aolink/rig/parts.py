@@ -42,12 +42,18 @@ class UnmodelledSlopes:
         return self.sd**2 * share, self.sd**2 * (1 - share)
 
 
+Wanders = Literal["frequency", "gain", "process_noise", "kernel_width", "sensor_noise"]
+"""What may drift: all frequencies of the plant, its response to inputs, the standard deviation of its noise, the width
+of the kernel, the standard deviation of the camera's read-out noise."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Wandering:
-    """How far and how fast the plant's frequencies drift from those of its matrices, all by the same factor."""
+    """Which quantity drifts from what the rig file says, by one factor, how far and how fast."""
 
-    frequency: float
-    """Largest relative change, up or down."""
+    parameter: Wanders
+    largest: float
+    """Largest relative change up; down it is the same factor."""
     rate_per_minute: float
     """Standard deviation of the relative change in a minute; it goes on as a random walk."""
 
@@ -78,7 +84,7 @@ class Plant:
     unmodelled: UnmodelledSlopes | None = None
     """What estimators expect of the outputs beside C x(k); None for nothing."""
     wandering: Wandering | None = None
-    """Which drift of its frequencies estimators follow; None for none."""
+    """Which drift estimators follow; None for none."""
     disturbance_states: int = 0
     """How many states, the last ones, are those of the disturbance's model, which no input reaches."""
 

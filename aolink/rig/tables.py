@@ -26,6 +26,7 @@ from aolink.rig.parts import (
     Timing,
     UnmodelledSlopes,
     Wandering,
+    Wanders,
 )
 from aolink.rig.sensor_tables import read_grid
 from aolink.rig.toml_table import Table, shape_text
@@ -38,8 +39,10 @@ _MOST_INPUTS = 10_000
 # of all coefficients: for 512 it is 2 MB an exposure.
 _MOST_UNMODELLED = 512
 _MOST_FAULT_S = 60.0
-# Of a frequency: a plant that is so unlike its matrices wants to be identified.
-_MOST_WANDERING = 0.2
+# Largest relative changes that are followed: a plant that is more unlike its matrices wants to be identified.
+_WANDERING: dict[Wanders, float] = {
+    "frequency": 0.2, "gain": 0.5, "process_noise": 3.0, "kernel_width": 0.5, "sensor_noise": 3.0,
+}  # fmt: skip
 
 
 def read_plant(table: Table, root: Table, optics: Optics | None, timing: Timing) -> Plant:
@@ -85,9 +88,16 @@ def _unmodelled(table: Table, fast_step_s: float) -> UnmodelledSlopes:
 
 
 def _wandering(table: Table) -> Wandering:
+    given = [name for name in _WANDERING if table.has(name)]
+    if len(given) != 1:
+        raise RigError(
+            f"plant.wandering has {' and '.join(given) or 'nothing that drifts'}: give one of {', '.join(_WANDERING)}"
+        )
+    (name,) = given
     return Wandering(
-        frequency=table.number("frequency", above=0.0, high=_MOST_WANDERING),
-        rate_per_minute=table.number("rate_per_minute", above=0.0, high=_MOST_WANDERING),
+        parameter=name,
+        largest=table.number(name, above=0.0, high=_WANDERING[name]),
+        rate_per_minute=table.number("rate_per_minute", above=0.0, high=_WANDERING[name]),
     )
 
 

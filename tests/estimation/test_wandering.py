@@ -11,38 +11,39 @@ from scipy.linalg import expm
 from aolink.errors import EstimatorError, RigError
 from aolink.estimation import make_estimator
 from aolink.estimation.batch import Batch
-from aolink.estimation.estimate import WanderingFrequency
-from aolink.estimation.wandering import at_frequency
+from aolink.estimation.estimate import WanderingValue
+from aolink.estimation.wandering import at_frequency, at_value
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.rig import Wandering, load_rig, parse_rig
 from aolink.simulation.model import simulate
 from tests.kinds import must_be, truth_of
 
 JITTER = load_rig("jitter")
-WANDERING = Wandering(frequency=0.05, rate_per_minute=0.01)
+WANDERING = Wandering(parameter="frequency", largest=0.05, rate_per_minute=0.01)
 
 
 def wandering(rig, how=WANDERING):
     return dataclasses.replace(rig, plant=dataclasses.replace(rig.plant, wandering=how))
 
 
-def drifting(rig, factors, seed):
-    """Exposures of a plant whose relative frequency is another in each."""
+def drifting(rig, factors, seed, parameter="frequency", drive=1.0):
+    """Exposures of a rig of which one quantity is another in each."""
     state, inputs, steps, out = None, rig.drive.inputs, rig.timing.exposure_steps, []
     for k, factor in enumerate(factors):
-        plant = at_frequency(rig.plant, float(factor))
+        other = at_value(rig, parameter, float(factor))
+        plant = other.plant
         if state is not None:
             nothing = np.zeros_like(plant.A)
             plant = dataclasses.replace(plant, initial_mean=state, initial_covariance=nothing)
-        u = inputs(k * steps, steps, rig.timing.fast_step_s)
-        (one,) = simulate(dataclasses.replace(rig, plant=plant), 1, seed=1000 * seed + k, inputs=u)
+        u = drive * inputs(k * steps, steps, rig.timing.fast_step_s)
+        (one,) = simulate(dataclasses.replace(other, plant=plant), 1, seed=1000 * seed + k, inputs=u)
         state = truth_of(one).end_state[0]
         out.append(dataclasses.replace(one, frame_id=k, first_step=k * steps))
     return out
 
 
-def frequency(estimate):
-    return must_be(WanderingFrequency, estimate.frequency)
+def found_in(estimate):
+    return must_be(WanderingValue, estimate.wandering)
 
 
 def judged(exposures, estimates):
@@ -87,8 +88,8 @@ def test_a_wrong_frequency_is_found_and_intervals_hold(off):
         [estimator.step(exposure) for exposure in exposures]
         for estimator in (make_estimator(JITTER, "moments"), make_estimator(wandering(JITTER), "moments"))
     )
-    assert all(each.frequency is None for each in fixed)
-    found, sd = np.array([(frequency(each).mean[0], frequency(each).sd[0]) for each in following]).T
+    assert all(each.wandering is None for each in fixed)
+    found, sd = np.array([(found_in(each).mean[0], found_in(each).sd[0]) for each in following]).T
     assert sd[0] > 0.02
     assert sd[-10:].max() < 0.01
     assert (np.abs(found - truth) / sd)[20:].max() < 3
@@ -103,7 +104,7 @@ def test_batches_give_the_same_bits(off):
     one, other = (make_estimator(wandering(JITTER), "moments") for _ in range(2))
     for a, b in zip(other.steps(Batch(JITTER, exposures[:6])), map(one.step, exposures[:6]), strict=True):
         assert a.path.tobytes() == b.path.tobytes()
-        assert frequency(a).mean.tobytes() == frequency(b).mean.tobytes()
+        assert found_in(a).mean.tobytes() == found_in(b).mean.tobytes()
 
 
 def test_frames_that_cannot_be_used_leave_the_frequency_as_uncertain_as_it_was(off):
@@ -114,7 +115,7 @@ def test_frames_that_cannot_be_used_leave_the_frequency_as_uncertain_as_it_was(o
     dark = dataclasses.replace(exposures[12], mask=np.zeros_like(exposures[12].mask))
     after = estimator.step(dark)
     assert after.status.name == "INPUT_INVALID"
-    assert frequency(before).sd[0] <= frequency(after).sd[0] < 1.1 * frequency(before).sd[0]
+    assert found_in(before).sd[0] <= found_in(after).sd[0] < 1.1 * found_in(before).sd[0]
     assert np.isfinite(after.path).all()
     assert np.isfinite(after.path_sd).all()
 
@@ -127,12 +128,42 @@ def test_pixels_find_it_as_well():
         ),
     )  # fmt: skip
     exposures = drifting(rig, np.full(30, 0.98), 5)
-    estimator = make_estimator(wandering(rig, Wandering(frequency=0.03, rate_per_minute=0.01)), "profile")
+    estimator = make_estimator(
+        wandering(rig, Wandering(parameter="frequency", largest=0.03, rate_per_minute=0.01)), "profile"
+    )
     estimates = [estimator.step(exposure) for exposure in exposures]
-    found = frequency(estimates[-1])
+    found = found_in(estimates[-1])
     assert abs(found.mean[0] - 0.98) < 3 * found.sd[0]
     assert found.sd[0] < 0.01
     assert judged(exposures[10:], estimates[10:])[1] > 0.88
+
+
+@pytest.mark.parametrize(
+    ("parameter", "truth", "name", "drive", "within"),
+    [
+        ("gain", 1.2, "moments", 8.0, 0.2),
+        ("process_noise", 1.8, "moments", 1.0, 0.4),
+        ("process_noise", 0.6, "profile", 1.0, 0.15),
+        ("kernel_width", 1.15, "profile", 1.0, 0.1),
+        ("sensor_noise", 1.6, "profile", 1.0, 0.15),
+        ("sensor_noise", 0.6, "moments", 1.0, 0.15),
+    ],
+)
+def test_other_quantities_are_found_too_and_intervals_hold(parameter, truth, name, drive, within):
+    rig = load_rig("section-vi-lively")
+    exposures = drifting(rig, np.full(60, truth), 1, parameter, drive)
+    following = wandering(
+        rig, Wandering(parameter=parameter, largest=1.5 if "noise" in parameter else 0.3, rate_per_minute=0.02)
+    )
+    fixed, estimates = (
+        [estimator.step(exposure) for exposure in exposures]
+        for estimator in (make_estimator(rig, name), make_estimator(following, name))
+    )
+    found = found_in(estimates[-1])
+    assert abs(found.mean[0] - truth) < within
+    (wrong, _), (right, held) = (judged(exposures[20:], each[20:]) for each in (fixed, estimates))
+    assert right < 1.02 * wrong
+    assert held > 0.88
 
 
 def test_the_papers_estimators_take_the_plant_as_it_is():
@@ -162,6 +193,11 @@ def test_the_rig_file_says_so():
     assert parse_rig(text).plant.wandering is None
     with pytest.raises(RigError, match=r"plant\.wandering\.frequency"):
         parse_rig(text.replace("[timing]", table.replace("0.05", "0.5") + "\n[timing]"))
+    other = parse_rig(text.replace("[timing]", table.replace("frequency", "sensor_noise") + "\n[timing]"))
+    assert must_be(Wandering, other.plant.wandering).parameter == "sensor_noise"
+    for wrong in (table + "gain = 0.1\n", table.replace("frequency = 0.05", "")):
+        with pytest.raises(RigError, match="give one of frequency, gain, process_noise, kernel_width, sensor_noise"):
+            parse_rig(text.replace("[timing]", wrong + "\n[timing]"))
 
 
 def test_a_frequency_that_nothing_is_seen_of_becomes_uncertain(off):
@@ -175,6 +211,6 @@ def test_a_frequency_that_nothing_is_seen_of_becomes_uncertain(off):
         dark = np.zeros_like(exposures[40].mask)
         first_step = exposures[40].first_step + round(minutes * 60 / JITTER.timing.fast_step_s)
         lost = dataclasses.replace(exposures[40], mask=dark, first_step=first_step)
-        spread.append(float(frequency(estimator.step(lost)).sd[0]))
+        spread.append(float(found_in(estimator.step(lost)).sd[0]))
     assert spread[0] < 0.01
     assert spread[1] > 2 * spread[0]

@@ -53,8 +53,8 @@ class Posterior:
     components: Components | None = None
     """Where the posterior is a mixture."""
     log_evidence: FloatArray | None = None
-    """Log-likelihood of what was measured, up to what is the same for all plants, (axes,), NaN where nothing was; None
-    where innovation and covariance say it."""
+    """Log-likelihood of what was measured, up to what is the same for all plants and cameras, (axes,), NaN where
+    nothing was; None where innovation and covariance say it."""
 
     @property
     def start(self) -> Gaussian:

@@ -6,6 +6,7 @@ leaves the prediction, and after several of them the filter starts again from th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
@@ -26,6 +27,7 @@ from aolink.estimation.pixels.likelihood import PixelView, Reduction
 from aolink.numerics import batched
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.numerics.workers import in_threads, thread_count
+from aolink.optics.camera import effective_noise_density
 from aolink.optics.sensor import BaseSensor
 from aolink.rig import Plant
 
@@ -180,6 +182,9 @@ class MixtureFilter(Filter):
             components = [(p, *each.posterior.arrays) for p, each in zip(parts, done, strict=True)]
             new = _spread([each.innovation for each in done], seen, axes)
             log_evidence[seen] = np.concatenate([log_evidence[:0], *(each.log_evidence for each in done)])
+            # The pixels' own noise is left out of their likelihoods, being the same at all points of one camera.
+            pixels = np.count_nonzero(measured.mask.reshape(axes, -1), axis=1)
+            log_evidence -= 0.5 * pixels * math.log(effective_noise_density(self.sensor) / self.sensor.pixel_size)
             trusted = new.believed[seen] | (not self._gate)
             took = seen[trusted]
             status[seen], self._missed[seen] = gate_status(trusted, lost[seen], self._missed[seen])
