@@ -15,7 +15,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.errors import AolinkError, RecordingError
+from aolink.errors import AolinkError, RecordingError, RigError
 
 VARIABLE = "AOLINK_LIMITS"
 _FREE_RECORDS = 100_000
@@ -156,3 +156,32 @@ def load_array(source: Path | bytes) -> NDArray[Any]:
             raise ValueError(f"it is cut off: {shape} numbers are announced")
         file.seek(0)
         return np.asarray(np.load(file, allow_pickle=False))
+
+
+def load_table(path: Path) -> NDArray[np.float64]:
+    """The numbers of a .csv file with commas, of a .npy file, or of a .npz file with one array.
+
+    Raises
+    ------
+    RigError
+        It is above the limit of unpacked bytes.
+    ValueError
+        It holds something else.
+    OSError
+        The file cannot be read.
+    """
+    if path.suffix == ".npz":
+        arrays = load_archive(path, RigError)
+        if len(arrays) != 1:
+            raise ValueError(f"it holds {len(arrays)} arrays, expected one")
+        (found,) = arrays.values()
+    elif path.suffix == ".csv":
+        if (size := path.stat().st_size) > limits().unpacked_bytes:
+            raise exceeded(f"{path} has {size} bytes", "unpacked_bytes", RigError)
+        found = np.loadtxt(path, delimiter=",", ndmin=2)
+    else:
+        found = load_array(path)
+    try:
+        return np.asarray(found, dtype=np.float64)
+    except TypeError as error:
+        raise ValueError(str(error)) from None

@@ -48,8 +48,6 @@ _REACH = 3.0
 """How far an object may go from one frame to the next, in its standard deviations."""
 _FAINT = 0.3
 """Share of an object's usual light below which it is lost."""
-_MOST_LOST = 5
-"""Frames without an object after which it is not looked for."""
 _SAMPLES = 100
 """Frames in which the objects' light is fitted."""
 STRAY = 1 / 8

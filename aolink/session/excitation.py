@@ -12,7 +12,7 @@ from scipy.signal import max_len_seq
 
 from aolink.devices.limits import CommandLimits
 from aolink.errors import DeviceError, RigError
-from aolink.limits import exceeded, limits, load_archive, load_array
+from aolink.limits import load_table
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
@@ -229,16 +229,8 @@ def _of_file(path: Path, rig: Rig) -> Excitation:
 def _table(path: Path, n_inputs: int) -> FloatArray:
     """The inputs of a file, (n_steps, n_inputs). Raises RigError."""
     try:
-        if path.suffix == ".csv":
-            if (size := path.stat().st_size) > limits().unpacked_bytes:
-                raise exceeded(f"{path} has {size} bytes", "unpacked_bytes", RigError)
-            found = np.loadtxt(path, delimiter=",", ndmin=2)
-        elif path.suffix == ".npz":
-            (found,) = load_archive(path, RigError).values()
-        else:
-            found = load_array(path)
-        u = np.asarray(found, dtype=np.float64)
-    except (OSError, ValueError, TypeError) as error:
+        u = load_table(path)
+    except (OSError, ValueError, EOFError) as error:
         raise RigError(
             f"{path} is not a table of inputs: {error}; expected a recording (.mcap), or a .csv, .npy or .npz file with"
             " one array"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RigError
-from aolink.limits import load_archive, load_array
+from aolink.limits import load_table
 from aolink.optics.turbulence import FrozenFlow
 from aolink.optics.wavefront import zernike_modes
 from aolink.rig import Rig
@@ -77,16 +77,7 @@ def _recorded(rig: Rig, name: str) -> FloatArray:
     """Slopes from a .npy, .npz (its only array) or .csv file, beside the rig file where its path is relative."""
     path = rig.path_of(name, "disturbance.recorded")
     try:
-        if path.suffix == ".csv":
-            found = np.loadtxt(path, delimiter=",", ndmin=2)
-        elif path.suffix == ".npz":
-            arrays = load_archive(path, RigError)
-            if len(arrays) != 1:
-                raise ValueError(f"it holds {len(arrays)} arrays, expected one")
-            (found,) = arrays.values()
-        else:
-            found = load_array(path)
-        slopes = np.asarray(found, dtype=np.float64)
+        slopes = load_table(path)
     except OSError as error:
         raise RigError(f"disturbance.recorded: cannot read {path}: {(error.strerror or str(error)).lower()}") from None
     except (ValueError, EOFError) as error:

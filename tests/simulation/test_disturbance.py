@@ -106,6 +106,15 @@ def test_recorded_disturbances_that_do_not_fit_are_refused(tmp_path, content, sa
         RigModel(rig)
 
 
+def test_a_table_that_is_above_the_limit_is_refused(tmp_path, monkeypatch):
+    np.savetxt(tmp_path / "wind.csv", np.zeros((100, 2)), delimiter=",")
+    rig = parse_rig(TILT.toml.split("[disturbance]")[0] + '[disturbance]\nrecorded = "wind.csv"\n', tmp_path)
+    RigModel(rig)
+    monkeypatch.setenv("AOLINK_LIMITS", "unpacked_bytes=1000")
+    with pytest.raises(RigError, match=r"wind\.csv has \d+ bytes, which is above the limit of 1000"):
+        RigModel(rig)
+
+
 def test_steps_do_not_depend_on_how_they_are_asked_for():
     one, other = (DisturbancePlayer(SH, np.random.default_rng(5)) for _ in range(2))
     whole = one.slopes(0, 500)
