@@ -120,8 +120,8 @@ class Scorer:
 
     def __init__(self) -> None:
         self._exposures = self._states = 0
-        self._start, self._end, self._path = _Sum(), _Sum(), _Sum()
-        self._start_nees, self._end_nees, self._nis = _Sum(), _Sum(), _Sum()
+        self._start, self._end, self._path = RunningMean(), RunningMean(), RunningMean()
+        self._start_nees, self._end_nees, self._nis = RunningMean(), RunningMean(), RunningMean()
         self._measurements = self._estimated = self._measured = self._gated = 0
         self._looks = False
         self._unused = UnusedCounter()
@@ -179,7 +179,7 @@ def score(exposures: Sequence[Exposure], estimates: Sequence[Estimate], skip: in
     return scorer.result()
 
 
-class _Sum:
+class RunningMean:
     """A running mean; it carries along what rounding takes from a long sum (Kahan, as Neumaier has it)."""
 
     def __init__(self) -> None:
@@ -206,7 +206,7 @@ def _normalised(error: FloatArray, covariance: FloatArray) -> FloatArray:
     return np.asarray((error * weighted[..., 0]).sum(axis=1))
 
 
-def _consistency(values: _Sum, degrees: int) -> Consistency:
+def _consistency(values: RunningMean, degrees: int) -> Consistency:
     if not values.count:
         return Consistency(mean=math.nan, low=math.nan, high=math.nan)
     low, high = (chi_square_quantile(share, degrees) / values.count for share in (0.025, 0.975))

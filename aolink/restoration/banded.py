@@ -9,7 +9,7 @@ from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.restoration.psf import line_matrix
 
 # From this many lines on, products of blocks are faster than solving line by line.
-_MANY_LINES = 64
+MANY_LINES = 64
 # Smallest block, pixels; and multiplications in one product of blocks: linear algebra's own threads would wait for
 # each other longer than a smaller one takes.
 _BLOCK, _PRODUCT = 16, 250_000
@@ -125,7 +125,7 @@ def _row_blocks(n_lines: int, one: int) -> list[slice]:
 
 def _solved(bands: FloatArray, right: FloatArray) -> FloatArray:
     """x with A x = right for each line (lines, size); it may be written into ``right``."""
-    if len(right) < _MANY_LINES:
+    if len(right) < MANY_LINES:
         return np.asarray(linalg.solveh_banded(bands, right.T, lower=True, check_finite=False).T)
     # A is block tridiagonal: D_0, D_1, .. and below them E_0, E_1, ..; eliminated from the first on,
     # S_i+1 = D_i+1 - G_i E_i', G_i = E_i S_i^-1.

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from aolink.estimation import Scorer, Status, make_estimator, run, score
-from aolink.estimation.score import _Sum
+from aolink.estimation.score import RunningMean
 from aolink.simulation.model import simulate
 
 
@@ -94,7 +94,7 @@ def test_a_scorer_can_be_asked_at_any_time(scored):
 
 
 def test_a_long_sum_loses_nothing():
-    total = _Sum()
+    total = RunningMean()
     for _ in range(1000):
         total.add(np.array([1e16]))
         total.add(np.array([1.0]))

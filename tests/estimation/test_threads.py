@@ -42,7 +42,7 @@ membrane = load_rig("membrane-12x12")
 for estimates in run(membrane, simulate(membrane, 2), ["o3", "moments"]).values():
     for value in (estimates[-1].coefficients, estimates[-1].coefficient_covariance, estimates[-1].end_covariance):
         digest.update(value.tobytes())
-joint_pixels._LARGEST_SPREAD = 9.0  # pixels from the first exposure on
+joint_pixels.LARGEST_SPREAD = 9.0  # pixels from the first exposure on
 e = run(membrane, simulate(membrane, 1), ["profile"])["profile"][0]
 digest.update(e.coefficients.tobytes() + e.coefficient_covariance.tobytes() + e.nis.tobytes())
 print(digest.hexdigest())

@@ -12,7 +12,7 @@ from scipy import linalg
 
 from aolink.errors import RestorationError
 from aolink.restoration import Scanner, first_order, from_correlation, measured_correlation
-from aolink.restoration.banded import _MANY_LINES, smooth_lines
+from aolink.restoration.banded import MANY_LINES, smooth_lines
 from aolink.restoration.kalman import kalman, line_model, scene_from_states, smooth
 from aolink.restoration.psf import line_matrix
 from tests.restoration.scenes import DECAYING, LOPSIDED, UNIFORM
@@ -101,7 +101,7 @@ def test_predictor_filter_and_lag_are_conditional_expectations(scanner: Scanner)
 @pytest.mark.parametrize("values", [UNIFORM, DECAYING, DECAYING[::-1], LOPSIDED, np.ones(1)], ids=len)
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("varying", [False, True])
-@pytest.mark.parametrize("count", [3, _MANY_LINES + 1])
+@pytest.mark.parametrize("count", [3, MANY_LINES + 1])
 def test_smoother_banded_solve_and_dense_least_squares_agree(
     values: FloatArray, masked: bool, varying: bool, count: int
 ) -> None:
@@ -134,7 +134,7 @@ def test_a_pixel_that_was_not_seen_is_not_looked_at() -> None:
     ).all()
 
 
-@pytest.mark.parametrize("count", [3, _MANY_LINES + 1])
+@pytest.mark.parametrize("count", [3, MANY_LINES + 1])
 @pytest.mark.parametrize("scanner", [FIRST, THIRD], ids=["first", "third"])
 def test_known_pixels_before_the_line(scanner: Scanner, count: int) -> None:
     lines, m = make_lines(LOPSIDED, scanner, count), len(LOPSIDED) - 1

@@ -75,7 +75,7 @@ def residual(values: NDArray[np.float64]) -> float:
 
 
 def test_the_likeliest_model_of_a_process_of_second_order_has_its_spectrum() -> None:
-    from bench_rows.disturbances import STEP_S, _likeliest
+    from bench_rows.disturbances import STEP_S, likeliest
 
     true = ProcessSum((Process("second-order", (0.05, 0.02, 0.1)),))
     space, random = true.state_space(STEP_S), np.random.default_rng(2)
@@ -85,7 +85,7 @@ def test_the_likeliest_model_of_a_process_of_second_order_has_its_spectrum() -> 
         slopes[k] = space.C[0] @ state
         state = space.A @ state + space.B_w @ (root @ random.standard_normal(2))
     lags = np.array([0.0, 0.01, 0.03, 0.06])
-    found = sum(process.covariance(lags) for process in _likeliest(slopes).processes)
+    found = sum(process.covariance(lags) for process in likeliest(slopes).processes)
     np.testing.assert_allclose(found, true.processes[0].covariance(lags), atol=0.15 * 0.1**2)
 
 

@@ -79,7 +79,7 @@ def turbulence(kind: str, sd: float, steps: int, past: int, seed: int) -> Distur
     A = _autoregressive(slopes[:past], order)
     led = np.concatenate([np.full(order - 1, slopes[0]), slopes])
     states = np.lib.stride_tricks.sliding_window_view(led, order)[:, ::-1]
-    return Disturbance(slopes, states, A, np.eye(1, order), _likeliest(slopes[:past]))
+    return Disturbance(slopes, states, A, np.eye(1, order), likeliest(slopes[:past]))
 
 
 @lru_cache(maxsize=16)
@@ -131,7 +131,7 @@ def _autoregressive(slopes: FloatArray, order: int) -> FloatArray:
     return np.vstack([np.linalg.solve(normal, before.T @ after), np.eye(order - 1, order)])
 
 
-def _likeliest(slopes: FloatArray) -> ProcessSum:
+def likeliest(slopes: FloatArray) -> ProcessSum:
     frequency, power = signal.periodogram(slopes, 1 / STEP_S, window="hann", detrend="constant")
     used = slice(2, int(np.searchsorted(frequency, _HIGHEST_HZ)))  # the taper mixes the first two with the mean
     omega, power, sd = 2 * math.pi * frequency[used], power[used] / 2, slopes.std()

@@ -38,7 +38,7 @@ _ERRORS = {
 }
 """What the commonest error numbers mean."""
 _UNKNOWN_COMMAND = 2
-_SETTLING_S = 5.0
+SETTLING_S = 5.0
 """How long the stage may take to its safe position when it is opened."""
 _POLL_S = 0.02
 _MOST_LINES = 100
@@ -192,13 +192,13 @@ class PiMirror:
 
     def _settle(self) -> None:
         """Wait until the safe position is reached. Raises DeviceError where it is not."""
-        deadline = time.monotonic() + _SETTLING_S
+        deadline = time.monotonic() + SETTLING_S
         while (there := self._numbers("ONT?")) is not None and not there.all():
             if time.monotonic() > deadline:
                 positions = self._numbers("POS?")
                 raise DeviceError(
                     f"the PI axes {' '.join(self._axes)} do not reach their safe position"
-                    f" {self._offset + self._scale * self._park} in {_SETTLING_S:g} s, they are at {positions}: are"
+                    f" {self._offset + self._scale * self._park} in {SETTLING_S:g} s, they are at {positions}: are"
                     " they zeroed (ATZ) or referenced, and do the stage's parameters fit?"
                 )
             time.sleep(_POLL_S)

@@ -29,7 +29,7 @@ from aolink.optics.sensor import SpotSensor
 
 # Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
 # out, for many spots tell a displacement of all of them more finely.
-_LEFT_OUT = 0.05
+LEFT_OUT = 0.05
 # Random draws of all coefficients, to find the number of nodes.
 _DRAWS = 4
 
@@ -49,7 +49,7 @@ class JointPaths:
         variance = float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])
         energy = (model.patterns[:, n:] ** 2).sum(axis=0) * (model.functions**2).mean(axis=0)[model.course_of[n:]]
         rest = np.append(np.cumsum(energy[::-1])[::-1], 0.0) + model.noise.left_out.sum()
-        enough = np.flatnonzero(rest <= _LEFT_OUT**2 * variance * model.plant.n_outputs)
+        enough = np.flatnonzero(rest <= LEFT_OUT**2 * variance * model.plant.n_outputs)
         kept = int(enough[0]) if len(enough) else len(energy)
         self.widening = float(rest[kept]) / model.plant.n_outputs + model.unmodelled_rest
         """Mean variance of the path that is left out, which the kernel is to be widened by."""

@@ -48,7 +48,7 @@ PATH_REACH = 3.0
 KERNEL_REACH = 2.0
 # The path is averaged over blocks of steps so that there are no more than this; a mean over it stays exact.
 _MOST_NODES = 100
-_MOST_MEMORY = 1e3
+MOST_MEMORY = 1e3
 # Axes together: more of them do not fit into the processor's cache.
 _AT_ONCE = 8
 # NIS of moments that are divided by a light that its noise hides: they are gated.
@@ -332,7 +332,7 @@ def slowest(transition: FloatArray) -> FloatArray:
 
 def error_memory(rho: FloatArray) -> FloatArray:
     """(1 + rho) / (1 - rho), bounded: variance of a mean of errors correlated by rho, over that of independent ones."""
-    return np.asarray(np.minimum(_MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
+    return np.asarray(np.minimum(MOST_MEMORY, (1 + rho) / np.maximum(1 - rho, 1e-9)))
 
 
 def _closed_loop(model: ExposureModel, prior: Gaussian, H: FloatArray, R: FloatArray) -> FloatArray:

@@ -35,8 +35,8 @@ from aolink.estimation.pixels.tempering import fitted, tempered_points
 from aolink.numerics.arrays import BoolArray, FloatArray
 
 # Most rounds, and the effective sample size that is enough.
-_ROUNDS = 4
-_ENOUGH = 100.0
+ROUNDS = 4
+ENOUGH = 100.0
 # If less than this share of it is reached, points are tempered: number of components fitted to their end states.
 _TOO_FEW = 0.5
 _COMPONENTS = 6
@@ -44,8 +44,8 @@ _COMPONENTS = 6
 _SCATTERED = 2.5
 # Least effective sample size when a mixture is fitted; weights are raised to a power below one to reach it, since a fit
 # to a handful of points is too sure. And steps of the search for that power.
-_LEAST_EFFECTIVE = 128.0
-_HALVINGS = 6
+LEAST_EFFECTIVE = 128.0
+HALVINGS = 6
 # Points of a round for each pair of coefficients, rounded up to a power of two. For one or two coefficients that would
 # be too few.
 _POINTS = 14
@@ -61,13 +61,13 @@ _EVIDENCE = 0.5
 # component soon finds its place; in the last fit more, with old covariances that a fit has made widened by the third
 # number: a covariance of few points is too narrow. (Twice as wide is too much: with twenty coefficients, where the old
 # covariances count as sixty points, intervals of 95 % held 98 to 99 %.)
-_PRIOR_POINTS = 2.0
-_LAST_PRIOR_POINTS = 3.0
-_LOOSENED = 1.2
+PRIOR_POINTS = 2.0
+LAST_PRIOR_POINTS = 3.0
+LOOSENED = 1.2
 # A component of the prior has to have this weight for its modes to count as scattered.
 _HEAVY = 0.05
 # A component of less than this weight is dropped.
-_NEGLIGIBLE = 1e-3
+NEGLIGIBLE = 1e-3
 
 
 def proposed(modes_weight: FloatArray, modes: Gaussian, wide_weight: FloatArray, wide: Gaussian) -> GaussianMixture:
@@ -90,7 +90,7 @@ def posterior(
     share of the usual one. A fit to less than half of that cannot be relied on: its weights are flattened, so that it
     is wide.
     """
-    wanted = np.full(len(prior.mean), share * _ENOUGH)
+    wanted = np.full(len(prior.mean), share * ENOUGH)
     fit, effective = importance_corrected(view, prior, proposal, share, wanted)
     return fit, np.asarray(effective >= _TOO_FEW * wanted)
 
@@ -119,13 +119,13 @@ def importance_corrected(
 ) -> tuple[GaussianMixture, FloatArray]:
     """A mixture fitted to weighted points, and their effective sample size, (axes,), which is to reach ``enough``."""
     n = view.reduced.size
-    numbers = [_quasi_random(points_of_round(n, share), n, k) for k in range(_ROUNDS)]
+    numbers = [quasi_random(points_of_round(n, share), n, k) for k in range(ROUNDS)]
     fit = proposal.copy()
     effective = np.empty(len(prior.mean))
     compiled_mixtures.importance_corrected(
         view.seen, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
-        np.stack([e for _, e in numbers]), enough, _LEAST_EFFECTIVE, _HALVINGS, n * _PRIOR_POINTS,
-        n * _LAST_PRIOR_POINTS, _LOOSENED, _NEGLIGIBLE, effective,
+        np.stack([e for _, e in numbers]), enough, LEAST_EFFECTIVE, HALVINGS, n * PRIOR_POINTS,
+        n * LAST_PRIOR_POINTS, LOOSENED, NEGLIGIBLE, effective,
     )  # fmt: skip
     return fit, effective
 
@@ -136,7 +136,7 @@ def points_of_round(n: int, share: float) -> int:
 
 
 @lru_cache(maxsize=32)
-def _quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArray]:
+def quasi_random(count: int, n: int, number: int) -> tuple[FloatArray, FloatArray]:
     """Sobol's points, shifted: one uniform number and n normal ones for each, (count,) and (count, n)."""
     from scipy.stats import qmc  # a third of what it takes to start, for this alone
 

@@ -36,9 +36,9 @@ from aolink.optics.sensor import SpotSensor
 
 _PASSES = 12
 # The objective, which is of hundreds of coefficients, changes by less than this at a mode.
-_CONVERGED = 0.3
+CONVERGED = 0.3
 # Rms of a path's prior, in standard deviations of the kernel, up to which there is one mode that matters.
-_LARGEST_SPREAD = 0.4
+LARGEST_SPREAD = 0.4
 # Relative to the information of a spot: one without pixels has none.
 _NO_LIGHT = 1e-9
 
@@ -138,7 +138,7 @@ def find_mode(
         return Points(np.array([objective]), (paths.score(near.score) - pull)[None], H[None], kept)
 
     # What a step would gain says when it is at a mode, before the pixels are linearised again.
-    (t,), found = minimise(at, start[None], passes - 1, _CONVERGED, foreseen=_CONVERGED, solve=_solve)
+    (t,), found = minimise(at, start[None], passes - 1, CONVERGED, foreseen=CONVERGED, solve=_solve)
     assert found.linearised is not None
     return Mode(t, found.hessian[0], float(found.objective[0]), found.linearised[0])
 
@@ -162,7 +162,7 @@ class JointProfile(JointObservation):
         self, paths: JointPaths, prior: Gaussian, windows: SpotWindows
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         before, P, view = prior.mean, prior.covariance, JointPixels(self.sensor, paths, windows)
-        if paths.rms_spread(P) <= _LARGEST_SPREAD * np.sqrt(view.kernel_variance):
+        if paths.rms_spread(P) <= LARGEST_SPREAD * np.sqrt(view.kernel_variance):
             mode = find_mode(view, before, paths.prior_information(P), before)
             t, after, at = mode.t, information.covariance(mode.precision), mode.at
         else:

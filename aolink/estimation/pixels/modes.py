@@ -106,7 +106,7 @@ def find_modes(
     """
     axes, count, n = starts.shape
     if (line := view.line) is not None:
-        return _found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0, passes, converged)
+        return found_compiled(line, prior, starts, np.full(axes, count), 0, 0.0, passes, converged)
     if prior.mean.ndim == 2:
         prior = Gaussian(
             np.repeat(prior.mean[:, None], count, axis=1), np.repeat(prior.covariance[:, None], count, axis=1)
@@ -129,10 +129,11 @@ def find_modes(
     )  # fmt: skip
 
 
-def _found_compiled(
+def found_compiled(
     line: Line, prior: Gaussian, starts: FloatArray, of_axis: Indices, whole: int, reversed_precision: float,
     passes: int = _PASSES, converged: float = _CONVERGED,
 ) -> Modes:  # fmt: skip
+    """`find_modes` for line sensors, in compiled code."""
     axes, count, n = starts.shape
     count += 3 if reversed_precision else 0
     found = Modes.none(axes, count, n)
@@ -154,7 +155,7 @@ def modes_of(view: PixelView, prior: Gaussian, wide: Gaussian) -> Modes:
     many = squares[:, 0] > _WIDE_PATH * view.kernel_variance
     if (line := view.line) is not None:
         of_axis = np.where(many, starts.shape[1], 3)
-        return _found_compiled(line, prior, starts, of_axis, view.whole_nodes, _reversed_precision(view))
+        return found_compiled(line, prior, starts, of_axis, view.whole_nodes, precision_of_reversal(view))
     found = find_modes(view, prior, starts[:, :3])
     if len(some := np.flatnonzero(many)):
         found = with_more(found, some, find_modes(view.part(some), prior.part(some), starts[some, 3:]))
@@ -224,7 +225,8 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
     return whitened(prior, np.concatenate([mean, pairs], axis=1)), values[:, ::-1]
 
 
-def _reversed_precision(view: PixelView) -> float:
+def precision_of_reversal(view: PixelView) -> float:
+    """How firmly a path that is looked for is held to the reversal of another, one over slope units squared."""
     return 1 / (_REVERSED_TO**2 * view.kernel_variance)
 
 
@@ -238,7 +240,7 @@ def reversed_starts(view: PixelView, prior: Gaussian, points: FloatArray) -> Flo
     nodes, outputs = view.whole_nodes, view.outputs
     rows = view.rows.reshape(outputs, -1, view.reduced.size)[:, :nodes].reshape(outputs * nodes, -1)
     weights = view.nodes.weights[:nodes] / view.nodes.weights[:nodes].sum()
-    precision = np.tile(weights, outputs) * _reversed_precision(view)
+    precision = np.tile(weights, outputs) * precision_of_reversal(view)
     B = batched.matmul(np.broadcast_to(rows, (len(L), *rows.shape)), L)
     path = view.paths(points)[..., :nodes]
     mirrored = 2 * (path @ weights)[..., None] - path

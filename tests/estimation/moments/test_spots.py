@@ -226,7 +226,7 @@ def test_copies_that_do_not_hang_together_are_as_one_plant_that_holds_them_all(m
         initial_covariance=double(plant.initial_covariance), axes=1,
     )  # fmt: skip
     # How long errors last is one number for a whole copy, two copies have one each.
-    monkeypatch.setattr(windowed, "_MOST_MEMORY", 1.0)
+    monkeypatch.setattr(windowed, "MOST_MEMORY", 1.0)
     apart = run(two, exposures, ["moments"])["moments"]
     together = run(dataclasses.replace(two, plant=joint), exposures, ["moments"])["moments"]
     for a, b in zip(apart, together, strict=True):

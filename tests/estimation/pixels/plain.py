@@ -63,7 +63,7 @@ def importance_corrected(view, prior, proposal, share, enough):
     t = np.zeros((len(prior.mean), 0, n))
     target, effective = np.zeros(t.shape[:2]), np.zeros(len(t))
     fit, going_on = proposal, np.ones(len(t), dtype=bool)
-    for k in range(importance._ROUNDS):
+    for k in range(importance.ROUNDS):
         new = _drawn(proposal, points, k)
         proposals.append(proposal)
         t = np.concatenate([t, new], axis=1)
@@ -71,15 +71,15 @@ def importance_corrected(view, prior, proposal, share, enough):
         log_weight = target - log_sum(np.stack([q.log_density(t) for q in proposals], axis=1), axis=1)
         log_weight -= log_sum(log_weight, axis=1)[:, None]
         effective = np.where(going_on, np.exp(-log_sum(2 * log_weight, axis=1)), effective)
-        tempered = _tempered(log_weight, importance._LEAST_EFFECTIVE)
-        loosened = replace(proposal, covariance=proposal.covariance * (importance._LOOSENED if k else 1.0))
-        last = _refitted(proposal, t, tempered, loosened, n * importance._LAST_PRIOR_POINTS)
+        tempered = _tempered(log_weight, importance.LEAST_EFFECTIVE)
+        loosened = replace(proposal, covariance=proposal.covariance * (importance.LOOSENED if k else 1.0))
+        last = _refitted(proposal, t, tempered, loosened, n * importance.LAST_PRIOR_POINTS)
         some = np.flatnonzero(going_on)
         fit = fit.replaced(some, last.part(some))
         going_on &= effective < enough
         if not going_on.any():
             break
-        proposal = _refitted(proposal, t, tempered, proposal, n * importance._PRIOR_POINTS)
+        proposal = _refitted(proposal, t, tempered, proposal, n * importance.PRIOR_POINTS)
     return fit, effective
 
 
@@ -88,7 +88,7 @@ def _tempered(log_weight, least):
     least = min(least, log_weight.shape[1] / 2)
     low, high = np.zeros(len(log_weight)), np.ones(len(log_weight))
     power = high
-    for _ in range(importance._HALVINGS):
+    for _ in range(importance.HALVINGS):
         w = power[:, None] * log_weight
         enough = -log_sum(2 * (w - log_sum(w, axis=1)[:, None]), axis=1) >= math.log(least)
         low, high = np.where(enough, power, low), np.where(enough, high, power)
@@ -101,7 +101,7 @@ def _tempered(log_weight, least):
 def _drawn(proposal, count, number):
     """Points of a mixture, (axes, count, n); those of each round have a number."""
     axes, _, n = proposal.mean.shape
-    u, e = importance._quasi_random(count, n, number)
+    u, e = importance.quasi_random(count, n, number)
     total = np.cumsum(np.exp(proposal.log_weight), axis=1)
     component = np.minimum((total[:, None] < u[:, None] * total[:, -1:, None]).sum(axis=2), total.shape[1] - 1)
     rows = np.arange(axes)[:, None]
@@ -122,6 +122,6 @@ def _refitted(mixture, points, log_weight, beside, prior_points):
     spread = batched.long_matmul(batched.transpose(away * share[..., None]), away) / safe[..., None]
     trust = (effective / (effective + prior_points))[..., None, None]
     covariance = batched.symmetric(trust * spread + (1 - trust) * beside.covariance)
-    mass = np.where(mass > importance._NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
+    mass = np.where(mass > importance.NEGLIGIBLE * np.add.reduce(mass, axis=1)[:, None], mass, 0.0)
     with np.errstate(divide="ignore"):
         return GaussianMixture(np.log(mass / np.add.reduce(mass, axis=1)[:, None]), mean, covariance)

@@ -168,8 +168,8 @@ def test_reversals_of_the_best_are_those_of_the_twin(pair):
     prior = view.reduced.prior(state)
     starts, _ = spread_starts(in_numpy, prior, broad(in_numpy, prior))
     starts = np.ascontiguousarray(starts[:, :3])
-    found = modes._found_compiled(
-        view.line, prior, starts, np.full(AXES, 3), view.whole_nodes, modes._reversed_precision(view), passes=0
+    found = modes.found_compiled(
+        view.line, prior, starts, np.full(AXES, 3), view.whole_nodes, modes.precision_of_reversal(view), passes=0
     )
     own = find_modes(in_numpy, prior, starts, passes=0)
     best = own.mean[np.arange(AXES), np.argmin(found.objective[:, :3], axis=1)]

@@ -155,7 +155,7 @@ def test_slopes_are_those_of_finite_differences(rig, frame):
 
 @pytest.mark.long
 def test_the_mode_and_its_covariance_are_those_of_the_dense_search(rig, frame, monkeypatch):
-    monkeypatch.setattr(joint_pixels, "_CONVERGED", 1e-4)
+    monkeypatch.setattr(joint_pixels, "CONVERGED", 1e-4)
     paths = JointPaths(frame.model, rig.sensor)
     before = whole_prior(frame, paths.size)
     dense = dense_view(rig, frame, paths)
@@ -198,8 +198,8 @@ def test_o3_is_the_dense_filter_in_every_step(small_membrane, monkeypatch):
 @pytest.mark.parametrize("flux", ["known", "measured"])
 def test_moments_are_the_dense_ones_but_for_errors_that_spots_share(rig, frame, flux, monkeypatch):
     """All coefficients, the same nodes, and no errors shared: then both are the same least squares."""
-    monkeypatch.setattr(windowed, "_MOST_MEMORY", 1.0)
-    monkeypatch.setattr(joint_paths, "_LEFT_OUT", 1e-4)
+    monkeypatch.setattr(windowed, "MOST_MEMORY", 1.0)
+    monkeypatch.setattr(joint_paths, "LEFT_OUT", 1e-4)
     joint_paths.joint_paths.cache_clear()
     paths = joint_paths.joint_paths(frame.model, rig.sensor)
     assert paths.size == frame.model.n_coefficients

@@ -395,7 +395,7 @@ def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
     view, state = seen(quiet(RIG, 0.003), width=0.5, seed=11)
     mean, covariance, effective = by_importance(view, state)
     assert effective > 200
-    monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
+    monkeypatch.setattr("aolink.estimation.pixels.importance.ENOUGH", np.inf)
     done, again = (updates.update(view, single(state), state, 7) for _ in range(2))
     assert done.coefficients.mean.tobytes() == again.coefficients.mean.tobytes()
     assert_near(done.coefficients, mean, covariance, 0.25, 0.2)
@@ -416,7 +416,7 @@ def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(update
     view, state = seen(dataclasses.replace(RIG, plant=plant), width=0.5)
     assert view.reduced.size == 1
     if temper:
-        monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
+        monkeypatch.setattr("aolink.estimation.pixels.importance.ENOUGH", np.inf)
     else:
         monkeypatch.delattr("aolink.estimation.pixels.importance.tempered_points")
     t = np.linspace(-3, 3, 60_001)
@@ -456,7 +456,7 @@ def test_a_frame_that_cannot_be_believed_is_not_tempered(updates, monkeypatch):
     view, state = seen(quiet(RIG, 0.001), width=0.3)
     lie = view.part(slice(None))
     lie.y = np.roll(np.abs(lie.y), 15, axis=1) + 3.0
-    monkeypatch.setattr("aolink.estimation.pixels.importance._ENOUGH", np.inf)
+    monkeypatch.setattr("aolink.estimation.pixels.importance.ENOUGH", np.inf)
     monkeypatch.delattr("aolink.estimation.pixels.importance.tempered_points")
     assert not updates.update(lie, single(state), state, 0).innovation.believed[0]
     with pytest.raises(NameError):
