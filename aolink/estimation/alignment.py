@@ -22,13 +22,10 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.estimate import AlignmentError, Estimate
 from aolink.exposure import Exposure
-
-FloatArray = NDArray[np.float64]
-
+from aolink.numerics.arrays import FloatArray
 
 _NEGLIGIBLE = 0.02
 """An alignment that is known to this part of a fast step changes no estimate that the model has right."""

@@ -18,7 +18,6 @@ from importlib.metadata import EntryPoint
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.compiled import make_ready
@@ -38,11 +37,10 @@ from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Engine, Options, checked_options, with_options
 from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.extensions import described, installed, loaded
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.plant.alike import MANY_STATES, alike_systems
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 GROUP = "aolink.estimators"
 """The entry points by which other packages add estimators."""

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.estimate import Estimate
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 def rms_by_axis(values: FloatArray, axes: int) -> FloatArray:

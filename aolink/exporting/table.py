@@ -7,19 +7,18 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.estimate import Estimate
 from aolink.exporting.common import Progress, clock_of, needed, no_progress, time_ns, together
 from aolink.exporting.series import Series
 from aolink.exporting.summary import estimate_scalars, path_rms, rms_by_axis
 from aolink.exposure import Exposure, Truth
+from aolink.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Kind = Literal["text", "integer", "number", "time", "numbers"]
-FloatArray = NDArray[np.float64]
 ByAxis = Sequence[Any] | FloatArray
 
 

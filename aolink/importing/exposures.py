@@ -19,10 +19,9 @@ from aolink.assembly import Frame as RigFrame
 from aolink.errors import ImportingError
 from aolink.exposure import Exposure, Exposures, Truth
 from aolink.importing.film import Film, Frame
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from aolink.wire.messages_pb2 import Applied
-
-FloatArray = NDArray[np.float64]
 
 _CLOSE = 0.01
 """Rates and exposure times that differ by a smaller share are the same."""

@@ -7,15 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize, signal
 
 from aolink.errors import ImportingError
 from aolink.importing.exposures import Settings
 from aolink.importing.film import Film
 from aolink.importing.tracking import STRAY, Survey, find_objects, reach, survey
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 _COUNTS = 62_000
 """Counts of the brightest pixel of a resting spot with its noise; there are 65,535."""

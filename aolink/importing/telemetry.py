@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
 from aolink.importing.film import Film
 from aolink.importing.readers import array_film
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 
 def aot_film(path: Path) -> Film:

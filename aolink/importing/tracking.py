@@ -29,14 +29,12 @@ from aolink.importing.exposures import (
     rig_frame,
 )
 from aolink.importing.film import Film
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.kernel import pixel_masses
 from aolink.optics.maxima import cut_windows, find_maxima, flatten, spot_sd
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _EDGE = 4.0
 """Standard deviations of an object that it is from an edge of the picture, and from another object, at first."""

@@ -9,13 +9,13 @@ from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.devices.drivers import KINDS, NATIVE, check_driver
 from aolink.devices.interfaces import lacks_of
 from aolink.errors import AolinkError
 from aolink.estimation.assumptions import broken_assumptions, peak_snr
 from aolink.estimation.frames.moments import least_significance, spot_significance
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import SpotSensor
 from aolink.plant.check import nominal_path
@@ -23,8 +23,6 @@ from aolink.plant.lifting import lift
 from aolink.plant.observability import observability
 from aolink.rig import Rig
 from aolink.units import with_unit
-
-FloatArray = NDArray[np.float64]
 
 _FASTEST_STEP_S, _SLOWEST_STEP_S = 1e-6, 0.05
 """A mirror that takes commands at more than 1 MHz or at less than 20 Hz is not a fast mirror on a serial line."""

@@ -8,9 +8,10 @@ import numpy as np
 
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
+from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import Overview, need_exposures
 from aolink.plotting.session import thinned, time_label
-from aolink.plotting.style import FloatArray, TimeUnit, axes_or_new, legend_above
+from aolink.plotting.style import TimeUnit, axes_or_new, legend_above
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.recording.schemas_pb2 import Estimation, Latency

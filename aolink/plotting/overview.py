@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.colours import by_rank
 from aolink.errors import ExportError
@@ -17,10 +16,11 @@ from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
 from aolink.exporting.series import Series
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.numerics.chi_square import chi_square_quantile
 from aolink.optics.camera import to_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
-from aolink.plotting.style import FloatArray, TimeUnit, extremes, hides_swings
+from aolink.plotting.style import TimeUnit, extremes, hides_swings
 
 NIS_COVERAGE = 0.95
 """Probability that a consistent estimator's NIS lies inside the bounds drawn."""
@@ -32,8 +32,6 @@ _KERNELS = 4.0
 """What is drawn reaches this many of the kernel's standard deviations beyond the paths."""
 _NONE = -1
 """In the place of a status where there is no estimate."""
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

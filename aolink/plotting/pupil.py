@@ -14,10 +14,11 @@ from aolink.estimation.frames.spots import profiles
 from aolink.exporting.common import check_frame
 from aolink.exporting.series import Series
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import SpotSensor
-from aolink.plotting.style import FloatArray, colour_bar, figure_or_new
+from aolink.plotting.style import colour_bar, figure_or_new
 from aolink.rig import Rig
 
 if TYPE_CHECKING:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from aolink.errors import ExportError
+from aolink.numerics.arrays import FloatArray
 from aolink.plotting.exposure import exposure_with_estimates
-from aolink.plotting.style import FloatArray, figure_or_new
+from aolink.plotting.style import figure_or_new
 from aolink.recording.reader import Recording
 
 if TYPE_CHECKING:

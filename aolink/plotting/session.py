@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Status
+from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import NIS_COVERAGE, Overview, limits_of, need_exposures, nis_bounds
-from aolink.plotting.style import FloatArray, TimeUnit, axes_or_new, colour, colour_bar, legend_above
+from aolink.plotting.style import TimeUnit, axes_or_new, colour, colour_bar, legend_above
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,16 +7,15 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.colours import estimator_colour
 from aolink.exporting.common import needed
+from aolink.numerics.arrays import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-FloatArray = NDArray[np.float64]
 TimeUnit = Literal["s", "steps"]
 """What a time axis counts: seconds, or fast steps."""
 

@@ -19,7 +19,7 @@ from aolink.numerics.arrays import BoolArray
 from aolink.restoration.banded import dense, normal_bands
 from aolink.restoration.psf import Psf, line_matrix
 
-FloatArray = NDArray[np.floating[Any]]
+FloatingArray = NDArray[np.floating[Any]]
 
 _THREADS = 2
 _MOST_STEPS = 400
@@ -43,15 +43,17 @@ class Solver(Protocol):
         """Where the frame lies in the scene."""
         ...
 
-    def project(self, images: FloatArray) -> FloatArray:
+    def project(self, images: FloatingArray) -> FloatingArray:
         """H'W applied to images, the size of the scene."""
         ...
 
-    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
+    def solve(
+        self, right: FloatingArray, start: FloatingArray | None = None, tolerance: float = _TOLERANCE
+    ) -> FloatingArray:
         """The scene x with (H'WH + kappa L) x = right; ``tolerance`` is relative to the root of kappa x'L x."""
         ...
 
-    def guess(self, images: FloatArray) -> FloatArray | None:
+    def guess(self, images: FloatingArray) -> FloatingArray | None:
         """A scene to start from, if that helps; ``images`` hold likely values where nothing was measured."""
         ...
 
@@ -65,11 +67,11 @@ def difference_spectrum(n: int) -> NDArray[np.float64]:
 class LineSolver:
     """Blur along the rows, all pixels measured: exact. Cosines down the columns, one eigenbasis along the rows."""
 
-    C: FloatArray
+    C: FloatingArray
     """Matrix that blurs a line, (columns, columns + m)."""
-    vectors: FloatArray
+    vectors: FloatingArray
     """Eigenvectors of C'C + kappa Dx'Dx, (columns + m, columns + m)."""
-    inverse: FloatArray
+    inverse: FloatingArray
     """One over their eigenvalues plus kappa times those of Dy'Dy, (rows, columns + m)."""
     first: int
     """Element of a line at which the frame starts."""
@@ -78,13 +80,13 @@ class LineSolver:
     def frame(self) -> tuple[slice, slice]:
         return slice(None), slice(self.first, self.first + len(self.C))
 
-    def project(self, images: FloatArray) -> FloatArray:
+    def project(self, images: FloatingArray) -> FloatingArray:
         return np.asarray(images.astype(self.C.dtype, copy=False) @ self.C)
 
-    def guess(self, images: FloatArray) -> None:
+    def guess(self, images: FloatingArray) -> None:
         """It needs none."""
 
-    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
+    def solve(self, right: FloatingArray, start: FloatingArray | None = None, tolerance: float = 0.0) -> FloatingArray:
         # A second thread for the cosines would cost more than it saves: that of the products is still awake.
         z = fft.dct(right, axis=-2, norm="ortho") @ self.vectors
         z *= self.inverse
@@ -117,21 +119,21 @@ def line_solver(psf: Psf, shape: tuple[int, int], kappa: float, single: bool = F
 class DenseSolver:
     """Any blur on the plane and any mask of a small frame: exact, by the Cholesky factor of the whole matrix."""
 
-    H: FloatArray
+    H: FloatingArray
     """Matrix that blurs a scene, zero where nothing was measured, (pixels, scene's pixels)."""
-    factor: FloatArray
+    factor: FloatingArray
     """Lower Cholesky factor of (H'WH + kappa L), (scene's pixels, scene's pixels)."""
     shape: tuple[int, int]
     """Rows and columns of the scene."""
     frame: tuple[slice, slice]
 
-    def project(self, images: FloatArray) -> FloatArray:
+    def project(self, images: FloatingArray) -> FloatingArray:
         return np.asarray(images.reshape(len(images), -1) @ self.H).reshape(-1, *self.shape)
 
-    def guess(self, images: FloatArray) -> None:
+    def guess(self, images: FloatingArray) -> None:
         """It needs none."""
 
-    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = 0.0) -> FloatArray:
+    def solve(self, right: FloatingArray, start: FloatingArray | None = None, tolerance: float = 0.0) -> FloatingArray:
         flat = right.reshape(len(right), -1).T
         return np.asarray(linalg.cho_solve((self.factor, True), flat, check_finite=False)).T.reshape(right.shape)
 
@@ -174,20 +176,22 @@ class IterativeSolver:
     """Any blur on the plane and any mask, by preconditioned conjugate gradients."""
 
     kappa: float
-    blur: Callable[[FloatArray], FloatArray]
-    blur_transposed: Callable[[FloatArray], FloatArray]
-    nearly: Callable[[FloatArray], FloatArray]
+    blur: Callable[[FloatingArray], FloatingArray]
+    blur_transposed: Callable[[FloatingArray], FloatingArray]
+    nearly: Callable[[FloatingArray], FloatingArray]
     """Preconditioner: a symmetric positive definite operator near the inverse."""
-    guess: Callable[[FloatArray], FloatArray]
+    guess: Callable[[FloatingArray], FloatingArray]
     seen: BoolArray | None
     frame: tuple[slice, slice]
     white: bool = False
     """I in the place of L: the scene's pixels are white, not its differences."""
 
-    def project(self, images: FloatArray) -> FloatArray:
+    def project(self, images: FloatingArray) -> FloatingArray:
         return self.blur_transposed(images if self.seen is None else np.where(self.seen, images, 0.0))
 
-    def solve(self, right: FloatArray, start: FloatArray | None = None, tolerance: float = _TOLERANCE) -> FloatArray:
+    def solve(
+        self, right: FloatingArray, start: FloatingArray | None = None, tolerance: float = _TOLERANCE
+    ) -> FloatingArray:
         x = self.nearly(right) if start is None else start.copy()
         prior = self.kappa * _dot(x, x if self.white else roughness(x))
         r = right - self._apply(x)
@@ -207,20 +211,20 @@ class IterativeSolver:
             p = z + rz / np.maximum(before, 1e-300) * p
         return x
 
-    def _apply(self, x: FloatArray) -> FloatArray:
+    def _apply(self, x: FloatingArray) -> FloatingArray:
         return self.project(self.blur(x)) + self.kappa * (x if self.white else roughness(x))
 
 
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+def _dot(a: FloatingArray, b: FloatingArray) -> FloatingArray:
     return np.asarray((a * b).sum(axis=(-2, -1), keepdims=True))
 
 
-def roughness(x: FloatArray) -> FloatArray:
+def roughness(x: FloatingArray) -> FloatingArray:
     """L x = (Dx'Dx + Dy'Dy) x."""
     return differences_transposed(np.diff(x, axis=-1), np.diff(x, axis=-2))
 
 
-def differences_transposed(along: FloatArray, down: FloatArray) -> FloatArray:
+def differences_transposed(along: FloatingArray, down: FloatingArray) -> FloatingArray:
     """Dx' along + Dy' down, from differences (.., rows, columns - 1) and (.., rows - 1, columns)."""
     out = np.empty((*along.shape[:-1], down.shape[-1]), along.dtype)
     out[..., 0] = 0
@@ -244,7 +248,7 @@ class Plane:
     """Rows and columns of the plane."""
     transfer: NDArray[np.complexfloating[Any]]
     """Of the blur, by `forward`."""
-    rough: FloatArray
+    rough: FloatingArray
     """Spectrum of L."""
 
     @classmethod
@@ -267,29 +271,31 @@ class Plane:
     def _threads(self) -> int:
         return _THREADS if self.scene[0] * self.scene[1] > _SMALL_FFT else 1
 
-    def forward(self, images: FloatArray, shape: tuple[int, int] | None = None) -> NDArray[np.complexfloating[Any]]:
+    def forward(self, images: FloatingArray, shape: tuple[int, int] | None = None) -> NDArray[np.complexfloating[Any]]:
         """The spectrum of images from the plane's first pixel on."""
         return np.asarray(fft.rfft2(images, shape or self.shape, workers=self._threads))
 
-    def backward(self, spectrum: NDArray[np.complexfloating[Any]], shape: tuple[int, int] | None = None) -> FloatArray:
+    def backward(
+        self, spectrum: NDArray[np.complexfloating[Any]], shape: tuple[int, int] | None = None
+    ) -> FloatingArray:
         """The whole plane with a spectrum, which is overwritten."""
         return np.asarray(fft.irfft2(spectrum, shape or self.shape, workers=self._threads, overwrite_x=True))
 
     def through(
-        self, images: FloatArray, factor: NDArray[np.inexact[Any]], shape: tuple[int, int] | None = None
-    ) -> FloatArray:
+        self, images: FloatingArray, factor: NDArray[np.inexact[Any]], shape: tuple[int, int] | None = None
+    ) -> FloatingArray:
         """The scene's pixels of images whose spectrum is multiplied by a factor."""
         spectrum = self.forward(images, shape)
         spectrum *= factor
         return self.backward(spectrum, shape)[..., : self.scene[0], : self.scene[1]]
 
-    def placed(self, images: FloatArray) -> FloatArray:
+    def placed(self, images: FloatingArray) -> FloatingArray:
         """Images where the frame lies in the blurred plane, cut to the scene's size; zero around it."""
         padded = np.zeros((*images.shape[:-2], *self.scene))
         padded[..., *self.blurred] = images
         return padded
 
-    def guess(self, images: FloatArray, kappa: float, share: float = 1.0, white: bool = False) -> FloatArray:
+    def guess(self, images: FloatingArray, kappa: float, share: float = 1.0, white: bool = False) -> FloatingArray:
         """The periodic solution for images continued from their last pixel to their first beyond the frame."""
         padded, (above, left) = self.placed(images), (n - 1 for n in self.taps.shape)
         down = (np.arange(1, above + 1) / (above + 1))[:, None]
@@ -301,14 +307,18 @@ class Plane:
         return self.through(padded, transfer.conj() * inverse, self.scene)
 
 
-def _roughness_spectrum(shape: tuple[int, int]) -> FloatArray:
+def _roughness_spectrum(shape: tuple[int, int]) -> FloatingArray:
     y, x = fft.fftfreq(shape[0])[:, None], fft.rfftfreq(shape[1])[None]
     return np.asarray(4 * np.sin(np.pi * y) ** 2 + 4 * np.sin(np.pi * x) ** 2)
 
 
 def inverse_spectrum(
-    transfer: NDArray[np.complexfloating[Any]], rough: FloatArray, kappa: float, share: float = 1.0, white: bool = False
-) -> FloatArray:
+    transfer: NDArray[np.complexfloating[Any]],
+    rough: FloatingArray,
+    kappa: float,
+    share: float = 1.0,
+    white: bool = False,
+) -> FloatingArray:
     """One over that of (H'H + kappa L), or with I in the place of L; of the plane's pixels a share is measured."""
     # A floor for the mean, which the differences do not hold.
     prior = 1.0 if white else np.maximum(rough, rough[rough > 0].min() / 4)

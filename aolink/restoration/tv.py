@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from aolink.numerics.arrays import BoolArray
 from aolink.restoration.markov import Plane, Solver, differences_transposed, inverse_spectrum, single_is_enough
 
-FloatArray = NDArray[np.floating[Any]]
+FloatingArray = NDArray[np.floating[Any]]
 
 # Weight of total variation in square roots of lambda, for Laplacian differences about as large as Gaussian ones.
 WEIGHT = 1.2
@@ -35,11 +35,11 @@ _TOLERANCE = 3e-3
 
 def total_variation(
     make_solver: Callable[[float], Solver],
-    images: FloatArray,
+    images: FloatingArray,
     noise_variance: float,
     difference_weight: float,
     iterations: int = ITERATIONS,
-) -> tuple[FloatArray, Solver]:
+) -> tuple[FloatingArray, Solver]:
     """Minimise |image - H scene|^2 / (2 s^2) + w sum |gradient of scene|, w = 1.2 sqrt(lambda).
 
     Parameters
@@ -79,7 +79,7 @@ def total_variation(
     return x, solver
 
 
-def _shrinkage(along: FloatArray, down: FloatArray, threshold: float) -> tuple[FloatArray, FloatArray]:
+def _shrinkage(along: FloatingArray, down: FloatingArray, threshold: float) -> tuple[FloatingArray, FloatingArray]:
     """What differences along rows (..., rows, columns - 1) and down columns (..., rows - 1, columns) keep.
 
     A pixel has four gradients, of a difference to its left or right and one above or below, and keeps
@@ -94,7 +94,7 @@ def _shrinkage(along: FloatArray, down: FloatArray, threshold: float) -> tuple[F
     np.square(down, out=upright[..., 1:-1, :])
     left, right, above, below = across[..., :-1], across[..., 1:], upright[..., :-1, :], upright[..., 1:, :]
 
-    def lost(one: FloatArray, other: FloatArray) -> FloatArray:
+    def lost(one: FloatingArray, other: FloatingArray) -> FloatingArray:
         """A quarter of what a gradient of these squares loses."""
         size = one + other
         np.maximum(size, threshold * threshold, out=size)
@@ -137,7 +137,7 @@ def plane_total_variation(
     difference_weight: float,
     seen: BoolArray | None = None,
     iterations: int = PLANE_ITERATIONS,
-) -> FloatArray:
+) -> FloatingArray:
     """Minimise |W (image - H scene)|^2 / (2 s^2) + w sum |gradient of scene|, with w of `plane_weight`.
 
     The splits are u = H scene, on a plane that goes round, of which the data weigh the pixels of the frame that were
@@ -164,11 +164,11 @@ def plane_total_variation(
     real, complex_ = (np.dtype(np.float32), np.dtype(np.complex64)) if single else (np.dtype(float), np.dtype(complex))
     transfer: NDArray[np.complexfloating[Any]] = plane.transfer.astype(complex_)
     share = kappa / _PLANE_PENALTY
-    solve: FloatArray = inverse_spectrum(plane.transfer, plane.rough, share).astype(real)
+    solve: FloatingArray = inverse_spectrum(plane.transfer, plane.rough, share).astype(real)
     back = transfer.conj()
-    weight: FloatArray = np.zeros(plane.shape, real)
+    weight: FloatingArray = np.zeros(plane.shape, real)
     weight[plane.blurred] = 1.0 if seen is None else seen
-    data: FloatArray = np.zeros((len(images), *plane.shape), real)
+    data: FloatingArray = np.zeros((len(images), *plane.shape), real)
     data[..., *plane.blurred] = images
     data *= weight
     part = 1 / (weight + _PLANE_PENALTY)
@@ -197,14 +197,14 @@ def plane_total_variation(
     return x[..., :rows, :columns]
 
 
-def _next(x: FloatArray, axis: int) -> FloatArray:
+def _next(x: FloatingArray, axis: int) -> FloatingArray:
     """Each pixel's next one less itself, round the plane."""
     out = np.roll(x, -1, axis)
     out -= x
     return out
 
 
-def _before(x: FloatArray, axis: int) -> FloatArray:
+def _before(x: FloatingArray, axis: int) -> FloatingArray:
     """The transpose of `_next`."""
     out = np.roll(x, 1, axis)
     out -= x

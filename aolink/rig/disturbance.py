@@ -8,15 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from aolink.errors import RigError
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.optics.mirror import second_order
 from aolink.optics.turbulence import Layer
 from aolink.rig.toml_table import Table, shape_text
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

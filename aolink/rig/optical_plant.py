@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.errors import RigError
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.lenslets import Lenslets
 from aolink.optics.mirror import Membrane, MirrorPlant, VoltageLaw, mirror_plant, second_order, square_pads
 from aolink.rig.toml_table import Table
-
-FloatArray = NDArray[np.float64]
 
 _LEAST_LIGHT = 0.5
 

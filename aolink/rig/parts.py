@@ -7,11 +7,9 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.mirror import VoltageLaw
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

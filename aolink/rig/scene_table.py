@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.errors import RestorationError, RigError
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.pictures import read_picture
 from aolink.optics.scene import SceneSensor
 from aolink.rig.sensor_tables import read_kernel
 from aolink.rig.toml_table import Table, named_file
-
-FloatArray = NDArray[np.float64]
-
 
 _SHIPPED = Path(__file__).parent.parent / "rigs"
 

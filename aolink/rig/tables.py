@@ -8,9 +8,9 @@ from dataclasses import asdict, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from aolink.errors import RigError
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
 from aolink.rig.disturbance import DisturbanceModel
 from aolink.rig.optical_plant import Optics, read_membrane, read_tip_tilt, read_voltage
@@ -30,8 +30,6 @@ from aolink.rig.parts import (
 )
 from aolink.rig.sensor_tables import read_grid
 from aolink.rig.toml_table import Table, shape_text
-
-FloatArray = NDArray[np.float64]
 
 # One row of inputs, and their limits, must fit into a message of the protocol.
 _MOST_INPUTS = 10_000

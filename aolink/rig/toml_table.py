@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.errors import RigError
+from aolink.numerics.arrays import FloatArray
 
-FloatArray = NDArray[np.float64]
 _Read = TypeVar("_Read")
 
 _KEYS = """

@@ -6,15 +6,13 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.errors import RigError
 from aolink.limits import load_table
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.turbulence import FrozenFlow
 from aolink.optics.wavefront import zernike_modes
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 # Steps are made in blocks that begin at multiples of this, so that no bit depends on which steps are asked for.
 _BLOCK = 64

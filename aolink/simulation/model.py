@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.exposure import Exposure, Picture, Truth, step_shares
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.optics.camera import pixel_noise_sd, shot_gain, to_counts
 from aolink.optics.frame import frame_density
 from aolink.rig import Rig, load_rig
 from aolink.simulation.disturbance import DisturbancePlayer
 from aolink.simulation.scene import SceneCamera
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,12 +7,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.scene import framed, framed_columns, framed_rows, scene_motion
 from aolink.optics.sensor import Kernel
 from aolink.rig import Rig
 from aolink.rig.scene_table import read_scene_picture
-
-FloatArray = NDArray[np.float64]
 
 _FLAT = 0.5
 """Intensity of even light."""

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from aolink.colours import Colour, estimator_colour
 from aolink.estimation.frames.spots import profiles
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import pixel_noise_sd, to_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
 from aolink.plotting.style import extremes, hides_swings
@@ -26,7 +27,6 @@ from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH
 from aolink.viewing.series import POINTS, Drawing
 from aolink.viewing.timebase import Timebase
 
-FloatArray = NDArray[np.float64]
 Paths = Mapping[str, Mapping[int, FloatArray]]
 """Name (``truth`` or an estimator's) and frame id -> spot position at each fast step, slope units, (n_steps,)."""
 

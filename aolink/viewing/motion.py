@@ -13,13 +13,12 @@ from aolink.colours import estimator_colour
 from aolink.estimation.estimate import Estimate
 from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure, Truth
+from aolink.numerics.arrays import FloatArray
 from aolink.plotting.overview import NIS_COVERAGE, nis_bounds
 from aolink.plotting.style import BAND, extremes, hides_swings
 from aolink.viewing.palette import TRUTH
 from aolink.viewing.series import Drawing, Style, send_axes, send_line
 from aolink.viewing.timebase import Timebase
-
-FloatArray = NDArray[np.float64]
 
 MOST_STATES = 8
 """Of a plant with more the first ones are drawn: all of them are in the recording."""

@@ -16,8 +16,6 @@ from aolink.rig import Rig
 from aolink.viewing.series import Drawing
 from aolink.viewing.timebase import Timebase
 
-FloatArray = NDArray[np.float64]
-
 _COLOURS = {"viridis": "Viridis", "magma": "Magma", "RdBu_r": "Spectral"}
 """Rerun's colour maps that come nearest to those of `MAPS`."""
 _SHARE = 98

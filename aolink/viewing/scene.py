@@ -21,7 +21,6 @@ from aolink.viewing.timebase import Timebase
 if TYPE_CHECKING:
     from aolink.restoration import RestoredPictures
 
-FloatArray = NDArray[np.float64]
 
 SCENE = "scene/image"
 TRUE_SCENE = "scene/true"

@@ -11,6 +11,7 @@ import rerun as rr
 from numpy.typing import ArrayLike, NDArray
 
 from aolink.colours import Colour
+from aolink.numerics.arrays import IntArray
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
 from aolink.viewing.palette import STATUS_COLOURS
@@ -22,8 +23,6 @@ POINTS = 32
 """That a path is drawn with in a long session: more than its exposure has columns on a screen."""
 _SECOND = 0.55
 """Opacity of the second of two lines that belong together, and of those that something is compared with."""
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from aolink.errors import ViewerError
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import IntArray
 from aolink.rig import Rig
 
 FAST_STEP = "fast_step"
 TIME = "time"
 FRAME = "frame"
-
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

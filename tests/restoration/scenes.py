@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 DECAYING = np.exp(-np.arange(12) / 3.0) / np.exp(-np.arange(12) / 3.0).sum()
 UNIFORM = np.full(7, 1 / 7)

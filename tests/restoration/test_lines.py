@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.errors import RestorationError
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Scanner, first_order, from_correlation, measured_correlation
 from aolink.restoration.banded import MANY_LINES, smooth_lines
 from aolink.restoration.kalman import kalman, line_model, scene_from_states, smooth
 from aolink.restoration.psf import line_matrix
 from tests.restoration.scenes import DECAYING, LOPSIDED, UNIFORM
-
-FloatArray = NDArray[np.float64]
 
 NOISE = 0.01
 FIRST = first_order(0.9, 1.0)

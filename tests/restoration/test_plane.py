@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import fft, linalg
 
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, block_matching, non_local_means
 from aolink.restoration.markov import (
     DenseSolver,
@@ -32,8 +33,6 @@ from aolink.restoration.tv import (
     total_variation,
 )
 from tests.restoration.scenes import LOPSIDED, UNIFORM, blocks, blur_matrix, blurred, psnr, roughness_matrix
-
-FloatArray = NDArray[np.float64]
 
 SHAPE = (11, 14)
 CORNER = np.array([[0.0, 0.1, 0.2], [0.1, 0.3, 0.0], [0.25, 0.0, 0.05]])

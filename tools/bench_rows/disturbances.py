@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, optimize, signal
 
 from aolink.identification import Process, ProcessSum
+from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
 from aolink.optics.turbulence import FrozenFlow, Layer
-
-FloatArray = NDArray[np.float64]
 
 STEP_S = 1e-3
 PUPIL_M = 0.5

@@ -12,7 +12,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from aolink.control import ControllerRow
@@ -20,12 +19,11 @@ from aolink.control.loop import centroids
 from aolink.exposure import Exposure, residual_rms
 from aolink.identification import ProcessSum, identified_text, maxima, readings, space_of
 from aolink.jobs.closed_loop import closed_loop
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig, load_rig, parse_rig
 from bench_rows.disturbances import STEP_S, Disturbance, line, together, turbulence
 from bench_rows.rivals import PREDICTORS, predicted, with_true_state
 from bench_rows.row import Effort, Row
-
-FloatArray = NDArray[np.float64]
 
 GAINS = (0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.3)
 _KERNEL_SD = 0.1 / math.sqrt(2)

@@ -8,14 +8,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from skimage import restoration
 
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration import restore
 from aolink.restoration.markov import line_solver
 from bench_rows.pictures import NOISE_SD, Case, psnr
-
-FloatArray = NDArray[np.float64]
 
 _PAD = 40
 

@@ -7,15 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from skimage import color, data, transform
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Kernel
 from aolink.restoration import Psf, motion_psf
 from aolink.rig import load_rig
 from bench_rows.row import Effort
-
-FloatArray = NDArray[np.float64]
 
 PICTURES = ("camera", "astronaut", "brick", "coins", "text", "moon", "page")
 FRESH = ("chelsea", "coffee", "rocket")

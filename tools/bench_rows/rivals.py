@@ -6,17 +6,16 @@ import copy
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pyrtc.predictive import ModalPredictor, make_predictor
 from scipy import linalg
 
 from aolink.control import ControllerRow, Seen
 from aolink.control.lqg import LQG
 from aolink.control.modes import reached, response_at_rest
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from bench_rows.disturbances import Disturbance
 
-FloatArray = NDArray[np.float64]
 PREDICTORS = ("ar_kalman", "least_squares")
 
 

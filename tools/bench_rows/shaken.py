@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, restore
 from bench_rows.pictures import NOISE_SD, psnr, wide_scene
 from bench_rows.row import Effort, Row
 
-FloatArray = NDArray[np.float64]
 Solve = Callable[["Shaken", float], FloatArray]
 
 PICTURES = ("camera", "chelsea", "coins")

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from aolink.estimation import Estimate, run
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import pixel_noise_sd, to_counts, to_density
 from aolink.optics.sensor import Sensor
 from aolink.rig import Rig
 from aolink.simulation.model import simulate
-
-FloatArray = NDArray[np.float64]
 
 _RESAMPLES = 1000
 

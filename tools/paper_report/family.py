@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.estimation.assumptions import (
@@ -26,13 +25,12 @@ from aolink.estimation.assumptions import (
 )
 from aolink.estimation.driver import SkippedInputs
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Kernel, Sensor, SpotSensor
 from aolink.plant.lifting import input_response
 from aolink.rig import Drive, Plant, Rig, Timing, load_rig
 from aolink.simulation.model import simulate
 from paper_report.ensemble import SensorRows
-
-FloatArray = NDArray[np.float64]
 
 SEEDS = {"tuning": range(100_000), "reporting": range(100_000, 200_000)}
 """By name; each judgement takes the first ones of its range."""

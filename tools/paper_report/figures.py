@@ -21,6 +21,7 @@ from aolink.colours import estimator_colour
 from aolink.estimation import Estimate, make_estimator, run
 from aolink.estimation.frames.moments import measure_moments
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.rig import Rig
 from paper_report.ensemble import Cell, Measured, clean_exposures, errors, side_by_side, with_pixel_noise
@@ -30,8 +31,6 @@ from paper_report.limit import NAMES, Found
 from paper_report.limit import Scene as LimitScene
 from paper_report.numbers import Effort, Remark1, Remark2
 from paper_report.verdict import JUDGED, SCENE_INSIDE, by_estimator, ratios
-
-FloatArray = NDArray[np.float64]
 
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,

@@ -11,16 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation import Estimate, make_estimator, smooth
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
 from paper_report.ensemble import SensorRows
 from paper_report.family import SEEDS, Scene, draw, exposures_of
-
-FloatArray = NDArray[np.float64]
 
 QUICK_NAMES = ("open-loop", "o1", "o3", "moments")
 PIXEL_NAMES = ("profile", "mixture")

@@ -14,6 +14,7 @@ from scipy import special
 
 from aolink.estimation import Estimate, make_estimator
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig, load_rig
 from aolink.simulation.model import simulate
@@ -21,8 +22,6 @@ from paper_report.blocks import Block, Heading, Picture, Table, Text
 from paper_report.ensemble import Measured, measure_errors, ratio, side_by_side, variant, with_pixel_noise
 from paper_report.numbers import Effort
 from paper_report.shake import shaken
-
-FloatArray = NDArray[np.float64]
 
 NAMES = ("open-loop", "o1", "o3", "moments", "profile", "mixture", "sampled")
 BETTER_THAN_O1 = ("moments", "profile", "mixture")

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation import make_estimator, smooth
 from aolink.exposure import Exposure
@@ -20,6 +19,7 @@ from aolink.importing.exposures import Settings
 from aolink.importing.first_rig import first_rig
 from aolink.importing.readers import array_film
 from aolink.importing.recording import import_film
+from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
@@ -27,8 +27,6 @@ from paper_report.ensemble import Measured, mean, ratio
 from paper_report.numbers import Effort
 from paper_report.spheres import centroids
 from paper_report.spot_films import random_walk, resonance, spot_film
-
-FloatArray = NDArray[np.float64]
 
 _SPOTS, _PITCH = 6, 48
 _WALK, _SHAKE = 0.45, 1.5

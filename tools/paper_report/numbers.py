@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import integrate
 
 from aolink.estimation import ESTIMATOR_NAMES, exposure_model, run
 from aolink.estimation.frames.moments import measure_moments
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import pixel_noise_sd, to_counts
 from aolink.optics.kernel import exposure_density
 from aolink.plant.lifting import input_response, lift
@@ -22,8 +22,6 @@ from aolink.rig import Plant, Rig
 from paper_report.ensemble import Measured, ensemble, mean, measure_errors, ratio, rms, variant
 from paper_report.judge import Plan, Size
 from paper_report.printed import FORMS, output_errors
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
 from aolink.estimation.frames.frame_data import Measurement
 from aolink.estimation.kalman.path_moments import predicted_moments
 from aolink.estimation.model.base import ExposureModel, InputResponse
-
-FloatArray = NDArray[np.float64]
+from aolink.numerics.arrays import FloatArray
 
 _FREQUENCIES = 512
 # The part of the weights that a constant input does not show is at most so many times the part that it does.

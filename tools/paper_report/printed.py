@@ -9,15 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation.frames.moments import measure_moments
 from aolink.estimation.model.base import ExposureModel
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.restoration import Psf, Scanner, first_order, largest_zero, restore
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text, as_html, as_markdown
-
-FloatArray = NDArray[np.float64]
 
 # What he does not print, and we state: the blur and the noise's variances.
 BLUR = 5

@@ -8,17 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from aolink.estimation import Estimate, run
 from aolink.exposure import Exposure
+from aolink.numerics.arrays import FloatArray
 from aolink.rig import Rig
 from paper_report.blocks import Block, Heading, Table, Text
 from paper_report.ensemble import Measured, ensemble, errors, mean, ratio, rms, variant
 from paper_report.numbers import Effort
-
-FloatArray = NDArray[np.float64]
 
 DAMPING, SD = 0.005, 0.2
 FREQUENCIES_HZ, DENSITIES = (5.0, 8.0, 12.0, 20.0), (0.1, 0.01, 0.001)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from aolink.estimation import ESTIMATOR_NAMES, make_estimator, smooth
 from aolink.exposure import Exposure
@@ -19,6 +18,7 @@ from aolink.importing.exposures import Settings
 from aolink.importing.first_rig import first_rig
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.frame import spot_windows
@@ -28,8 +28,6 @@ from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
 from paper_report.ensemble import Measured, ratio, rms
 from paper_report.numbers import Effort
-
-FloatArray = NDArray[np.float64]
 
 FILE = Path(__file__).parents[2] / "tests" / "data" / "diffusing_spheres.npz"
 _RATE_HZ = 24.0

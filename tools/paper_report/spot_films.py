@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import pixel_masses
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

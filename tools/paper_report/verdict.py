@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from aolink.numerics.arrays import FloatArray
 from paper_report.blocks import Block, Heading, Picture, Points, Table, Text
 from paper_report.family import SEEDS
 from paper_report.judge import LIMIT, NAMES, Row
 
-FloatArray = NDArray[np.float64]
 Rows = Mapping[str, Mapping[int, Row]]
 """By estimator and seed."""
 
