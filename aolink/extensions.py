@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from aolink.errors import AolinkError
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Row = TypeVar("Row", bound=_Named)
 
 
 @cache
@@ -29,6 +37,26 @@ def described(point: EntryPoint, kind: str) -> str:
     """An entry point as an error names it."""
     package = f" of {point.dist.name}" if point.dist else ""
     return f"the {kind} {point.name}{package} ({point.value})"
+
+
+def names_with(ours: Mapping[str, Any], group: str) -> tuple[str, ...]:
+    """Names of the rows of a registry, aolink's own and those of other packages, of which nothing is loaded for it."""
+    return (*ours, *(name for name in installed(group) if name not in ours))
+
+
+def row_named(name: str, ours: Mapping[str, Row], group: str, kind: str, error: type[AolinkError]) -> Row:
+    """The row of a registry that has a name; aolink's own comes first.
+
+    Raises ``error``: there is none, or the installed package that has it is broken.
+    """
+    if name in ours:
+        return ours[name]
+    if (point := installed(group).get(name)) is None:
+        raise error(f"there is no {kind} {name!r}: use one of {', '.join(names_with(ours, group))}")
+    row, expected = loaded(point, kind, error), type(next(iter(ours.values())))
+    if not isinstance(row, expected) or row.name != name:
+        raise error(f"{described(point, kind)} is {row!r}, expected a row of this name, {expected.__name__}")
+    return row
 
 
 @contextmanager

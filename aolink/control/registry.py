@@ -12,7 +12,7 @@ from aolink.control.controller import ControllerRow
 from aolink.control.fall_back import INTEGRATOR
 from aolink.control.lqg import LQG
 from aolink.errors import ControlError
-from aolink.extensions import described, installed, loaded
+from aolink.extensions import names_with, row_named
 from aolink.rig import Rig
 
 GROUP = "aolink.controllers"
@@ -30,7 +30,7 @@ _OURS = {
 
 def controller_names() -> tuple[str, ...]:
     """Names of all controllers; nothing of other packages is loaded for it."""
-    return (*_OURS, *(name for name in installed(GROUP) if name not in _OURS))
+    return names_with(_OURS, GROUP)
 
 
 def find_controller(name: str, rig: Rig) -> ControllerRow:
@@ -41,12 +41,7 @@ def find_controller(name: str, rig: Rig) -> ControllerRow:
     ControlError
         There is no such controller, the installed package that has it is broken, or it cannot work on this rig.
     """
-    if (row := _OURS.get(name)) is None:
-        if (point := installed(GROUP).get(name)) is None:
-            raise ControlError(f"there is no controller {name!r}: use one of {', '.join(controller_names())}")
-        row = loaded(point, "controller", ControlError)
-        if not isinstance(row, ControllerRow) or row.name != name:
-            raise ControlError(f"{described(point, 'controller')} is not a ControllerRow of this name")
+    row = row_named(name, _OURS, GROUP, "controller", ControlError)
     if reason := row.refusal(rig):
         raise ControlError(reason)
     return row

@@ -14,7 +14,6 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import EntryPoint
 from typing import Any
 
 import numpy as np
@@ -36,7 +35,7 @@ from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.options import Engine, Options, checked_options, with_options
 from aolink.estimation.pixels.joint_pixels import JointProfile
-from aolink.extensions import described, installed, loaded
+from aolink.extensions import names_with, row_named
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.plant.alike import MANY_STATES, alike_systems
@@ -75,36 +74,18 @@ class EstimatorRow:
 def estimator_row(name: str) -> EstimatorRow:
     """The row of an estimator, whose name may have its options. Raises EstimatorError: there is none, or the package
     that has it is broken."""
-    name = name.partition(":")[0]
-    if name in _OURS:
-        return _OURS[name]
-    if name in _others():
-        return _loaded(_others()[name])
-    known = ", ".join(row.name for row in estimator_rows())
-    raise EstimatorError(f"there is no estimator {name!r}: use one of {known}")
+    return row_named(name.partition(":")[0], _OURS, GROUP, "estimator", EstimatorError)
 
 
 def estimator_rows() -> tuple[EstimatorRow, ...]:
     """All rows by rank; with a warning for each that cannot be loaded."""
-    rows = list(_OURS.values())
-    for point in _others().values():
+    rows = []
+    for name in names_with(_OURS, GROUP):
         try:
-            rows.append(_loaded(point))
+            rows.append(estimator_row(name))
         except EstimatorError as error:
             warnings.warn(str(error), stacklevel=2)
     return tuple(sorted(rows, key=lambda row: (row.rank, row.name)))
-
-
-def _others() -> dict[str, EntryPoint]:
-    """Estimators of other packages, by name; the names that are ours stay ours."""
-    return {name: point for name, point in installed(GROUP).items() if name not in _OURS}
-
-
-def _loaded(point: EntryPoint) -> EstimatorRow:
-    row = loaded(point, "estimator", EstimatorError)
-    if not isinstance(row, EstimatorRow) or row.name != point.name:
-        raise EstimatorError(f"{described(point, 'estimator')} is not an EstimatorRow of this name")
-    return row
 
 
 def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:

@@ -9,14 +9,13 @@ from __future__ import annotations
 from functools import partial
 
 from aolink.errors import RestorationError
-from aolink.extensions import described, installed, loaded
+from aolink.extensions import names_with, row_named
 from aolink.restoration.lines import inverse, kalman_estimate, why_not_inverse, why_not_lines
 from aolink.restoration.method import Method
 from aolink.restoration.plane import gauss_markov, pnp, tv, why_not_pnp
 
 GROUP = "aolink.restorations"
 DEFAULT_METHOD = "tv"
-_KIND = "restoration method"
 
 
 def _on_lines(name: str, summary: str) -> Method:
@@ -26,7 +25,7 @@ def _on_lines(name: str, summary: str) -> Method:
     )  # fmt: skip
 
 
-_OWN = {
+_OURS = {
     row.name: row
     for row in (
         Method(
@@ -49,7 +48,7 @@ _OWN = {
 
 def method_names() -> tuple[str, ...]:
     """Names of all methods; nothing of other packages is loaded for it."""
-    return (*_OWN, *(name for name in installed(GROUP) if name not in _OWN))
+    return names_with(_OURS, GROUP)
 
 
 def find_method(name: str) -> Method:
@@ -60,22 +59,13 @@ def find_method(name: str) -> Method:
     RestorationError
         There is no such method, or the installed package that has it is broken.
     """
-    if row := _OWN.get(name):
-        return row
-    if (point := installed(GROUP).get(name)) is None:
-        raise RestorationError(f"method is {name!r}, expected one of {', '.join(method_names())}")
-    row = loaded(point, _KIND, RestorationError)
-    if not isinstance(row, Method) or row.name != name:
-        raise RestorationError(
-            f"{described(point, _KIND)} is {row!r}, expected an aolink.restoration.Method of that name"
-        )
-    return row
+    return row_named(name, _OURS, GROUP, "restoration method", RestorationError)
 
 
 def check_parameters(row: Method, given: dict[str, object]) -> None:
     """Raise RestorationError for a parameter that a method does not take."""
     for name in given:
         if name not in row.parameters:
-            takers = [each.name for each in _OWN.values() if name in each.parameters]
+            takers = [each.name for each in _OURS.values() if name in each.parameters]
             what = f"belongs to {', '.join(takers)}" if takers else "is a parameter of no method of aolink"
             raise RestorationError(f"{row.name} takes no {name}, which {what}: leave it out")

@@ -52,7 +52,7 @@ def test_it_may_refuse_a_rig(with_example: dict[str, str]) -> None:
     ("value", "why"),
     [
         ("nowhere.at_all:ROW", "cannot be loaded: ModuleNotFoundError"),
-        ("math:pi", "(math:pi) is not a ControllerRow of this name"),
+        ("math:pi", "(math:pi) is 3.14159"),
     ],
 )
 def test_a_broken_package_is_one_line_for_who_asks_for_it(

@@ -121,7 +121,7 @@ def test_an_installed_package_adds_an_estimator(aolink, with_example, tmp_path):
     ("value", "why"),
     [
         ("nowhere.at_all:ROW", "cannot be loaded: ModuleNotFoundError"),
-        ("math:pi", "(math:pi) is not an EstimatorRow of this name"),
+        ("math:pi", "(math:pi) is 3.14159"),
     ],
 )
 def test_a_broken_package_is_one_line_for_who_asks_for_it(aolink, with_example, tmp_path, value, why):

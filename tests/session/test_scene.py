@@ -426,7 +426,7 @@ def test_the_command_takes_a_recording_or_a_picture(wrong: list[str]) -> None:
 def test_a_method_that_does_not_exist(session: Path, tmp_path: Path) -> None:
     refused = CliRunner().invoke(app, ["deblur", str(session), "-o", str(tmp_path / "c.mcap"), "--method", "best"])
     assert isinstance(refused.exception, RestorationError)
-    assert "method is 'best', expected one of inverse, predictor" in str(refused.exception)
+    assert "there is no restoration method 'best': use one of inverse, predictor" in str(refused.exception)
 
 
 @pytest.mark.long
