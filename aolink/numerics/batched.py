@@ -11,7 +11,8 @@ import numpy as np
 from aolink.numerics.arrays import FloatArray
 
 _WRITTEN_OUT = 4
-_SMALL_PRODUCT = 100_000
+SMALL_PRODUCT = 100_000
+"""A product of matrices with so many multiplications is not shared among threads by any library."""
 
 
 def tile(matrix: FloatArray, axes: int) -> FloatArray:
@@ -105,7 +106,7 @@ def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
 def long_matmul(a: FloatArray, b: FloatArray) -> FloatArray:
     """(..., n, k) @ (k, m) or (..., k, m) for long n, in pieces so small that no library shares them among threads."""
     n, k, m = a.shape[-2], a.shape[-1], b.shape[-1]
-    rows = max(1, _SMALL_PRODUCT // (k * m))
+    rows = max(1, SMALL_PRODUCT // (k * m))
     if n <= rows:
         return matmul(a, b)
     whole = n // rows * rows

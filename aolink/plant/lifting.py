@@ -11,14 +11,12 @@ import numpy as np
 
 from aolink.numerics import single_thread
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.batched import SMALL_PRODUCT
 from aolink.numerics.block_diagonal import blockwise, components
 from aolink.plant.alike import alike_systems
 from aolink.rig import Plant
 
 _BLOCK_STEPS = 32
-
-
-_SMALL_PRODUCT = 100_000
 
 
 def output_rows(plant: Plant, n_steps: int) -> FloatArray:
@@ -123,6 +121,6 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
 
 def _times(blocks: FloatArray, matrix: FloatArray) -> FloatArray:
     """blocks @ matrix, axis by axis in pieces so small that BLAS uses one thread: no bit depends on their number."""
-    piece = max(1, _SMALL_PRODUCT // matrix.size)
+    piece = max(1, SMALL_PRODUCT // matrix.size)
     products = [blocks[:, k : k + piece] @ matrix for k in range(0, max(1, blocks.shape[1]), piece)]
     return products[0] if len(products) == 1 else np.concatenate(products, axis=1)

@@ -19,9 +19,8 @@ from aolink.files import check_target
 from aolink.rig import Rig
 from aolink.session import at_rest, controller
 from aolink.session.excitation import Excitation, check_inputs
-from aolink.session.loop import Inputs
+from aolink.session.loop import ANSWER_NS, Inputs
 
-_ANSWER_NS = 200_000_000
 _RECORD_BYTES = 3000
 """What an exposure takes in a recording beside its picture and inputs, at most."""
 
@@ -93,7 +92,7 @@ def dry_run(
 def _ask_clocks(devices: Sequence[Device], time: Time, stop: Callable[[], bool]) -> None:
     for device in [each for _ in range(WARM_UP_QUERIES) for each in devices]:
         device.query_clock(time.now_ns())
-        deadline_ns, answered = time.now_ns() + _ANSWER_NS, False
+        deadline_ns, answered = time.now_ns() + ANSWER_NS, False
         while not (answered or stop() or time.now_ns() >= deadline_ns):
             came = [event for happened in time.events(0.05) for event in happened.events]
             answered = time.virtual or any(isinstance(event, ClockSampled) for event in came)

@@ -49,7 +49,7 @@ _START_DELAY_S = 0.25
 """Real time: from the first command to its first step, at least; as long as a long queue, so that it is full then."""
 _START_TRIES = 5
 _STATISTICS_PERIOD_S = 1.0
-_ANSWER_NS = 200_000_000
+ANSWER_NS = 200_000_000
 """How long the start waits for the answer to one clock query."""
 _GRACE_S = 1.5
 """Real time: how long a frame may take after its exposure's end before it counts as lost."""
@@ -211,7 +211,7 @@ class SessionLoop:
             if stop():
                 return
             self._query_next_clock(self._time.now_ns())
-            deadline_ns = self._time.now_ns() + _ANSWER_NS
+            deadline_ns = self._time.now_ns() + ANSWER_NS
             while not self._receive(0.05) and not self._time.virtual and self._time.now_ns() < deadline_ns:
                 pass
         for device in self._devices:

@@ -9,11 +9,9 @@ import math
 
 import numpy as np
 
+from aolink.estimation.compiled.line import LARGE
 from aolink.estimation.compiled.small import compiled, compiled_sums
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
-
-# A product of variance ratios is replaced by its logarithm when it exceeds this.
-_LARGE = 1e200
 
 
 @compiled
@@ -121,7 +119,7 @@ def looked_at(
                 e = y[s, p] - light[p]
                 total += e * e / R
                 product *= R * quiet
-                if product > _LARGE:
+                if product > LARGE:
                     total += math.log(product)
                     product = 1.0
                 scores[p] = e / R + grows * (e * e / R - 1.0) / (2.0 * R)

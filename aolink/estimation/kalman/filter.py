@@ -23,7 +23,7 @@ from aolink.rig import Plant
 
 # A measurement that chi-square makes less likely than this is not used. It is wide: the paper's filters leave the
 # process noise inside an exposure out, and have every right to innovations larger than they expect.
-_GATE_PROBABILITY = 1e-9
+GATE_PROBABILITY = 1e-9
 PATIENCE = 3
 """After so many gated measurements in a row a filter starts again from the prediction without any."""
 # Relative change of a covariance that is rounding.
@@ -119,7 +119,7 @@ class BlurFilter(Filter):
         self._settled_under: FloatArray | None = None
         self._missed = np.zeros(plant.axes, dtype=np.int64)
         degrees = observation.n_measurements if observation else 0
-        self._gate = 2 * float(special.gammainccinv(degrees / 2, _GATE_PROBABILITY)) if gate and degrees else np.inf
+        self._gate = 2 * float(special.gammainccinv(degrees / 2, GATE_PROBABILITY)) if gate and degrees else np.inf
 
     @property
     def needs(self) -> Needs | None:

@@ -20,6 +20,7 @@ from scipy import special
 from aolink.estimation.compiled import modes as compiled_modes
 from aolink.estimation.compiled import moments as compiled_moments
 from aolink.estimation.compiled.line import Line
+from aolink.estimation.kalman.filter import GATE_PROBABILITY
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
@@ -52,7 +53,6 @@ _START_REACH = 1.3
 _REVERSED_TO = 0.2
 # Directions of the pixels, for each output, in which an innovation is given; in the others there is hardly but noise.
 _NEW_DIRECTIONS = 4
-_GATE_PROBABILITY = 1e-9
 # Information of a direction, as a share of the largest, that is rounding.
 _TELLS_NOTHING = 1e-13
 
@@ -287,7 +287,7 @@ def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
     # At the truth this is chi-square of all pixels and coefficients, and where the objective is least it is less.
     total = square + distance
     degrees = np.add.reduce(view.mask, axis=1) + n
-    believed = total <= 2 * special.gammainccinv(degrees / 2, _GATE_PROBABILITY)
+    believed = total <= 2 * special.gammainccinv(degrees / 2, GATE_PROBABILITY)
     covariance = (1 + values)[..., None] * np.eye(k)
     return Innovation(u, covariance, nis, believed & np.isfinite(nis))
 
