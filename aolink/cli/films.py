@@ -11,7 +11,7 @@ from aolink.cli.common import JsonOption, OutputOption, OverwriteOption, app, pr
 from aolink.errors import ImportingError
 
 if TYPE_CHECKING:
-    from aolink.importing.exposures import Settings
+    from aolink.importing.frames import Settings
 
 RateOption = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="Frames a second, where the film does not say it.")
@@ -44,7 +44,7 @@ def film_settings(
     rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
 ) -> "Settings":
     """The options of a command as settings. Raises ImportingError for a place that is none."""
-    from aolink.importing.exposures import Settings
+    from aolink.importing.frames import Settings
 
     if rate is not None and rate <= 0:
         raise ImportingError(f"--rate {rate:g} must be above 0")

@@ -40,7 +40,7 @@ from aolink.files import check_target, writing
 from aolink.signals import StopRequest
 
 if TYPE_CHECKING:
-    from aolink.importing.exposures import Settings
+    from aolink.importing.frames import Settings
     from aolink.rig import Rig
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,3 +69,26 @@ def grey(picture: Frame, what: object) -> Frame:
     if picture.ndim != 2 or picture.dtype.kind not in "biuf":
         raise ImportingError(f"{what} holds {picture.dtype} of shape {picture.shape}, expected a picture")
     return picture
+
+
+def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
+    """A film of frames in memory, (frames, rows, columns); (spots, frames, rows, columns) stand side by side.
+
+    Raises
+    ------
+    ImportingError
+        It has another shape, or no numbers.
+    """
+    if frames.ndim == 4:  # one film for each spot, all of the same times
+        spots, count, rows, columns = frames.shape
+        frames = np.moveaxis(frames, 0, 2).reshape(count, rows, spots * columns)
+        known["notes"] = (*known.get("notes", ()), f"the films of {spots} spots stand side by side in one picture")
+    if frames.ndim != 3 or min(frames.shape) < 1 or frames.dtype.kind not in "biuf":
+        raise ImportingError(
+            f"{name} holds {frames.dtype} of shape {frames.shape}, expected numbers as (frames, rows, columns)"
+        )
+    times = known.get("times_ns")
+    if times is not None and times.shape != (len(frames),):
+        raise ImportingError(f"{name} has {len(frames)} frames and times of shape {times.shape}: give one for each")
+    shape = (int(frames.shape[1]), int(frames.shape[2]))
+    return Film(name=name, shape=shape, dtype=frames.dtype, count=len(frames), frames=lambda: iter(frames), **known)

@@ -10,8 +10,8 @@ import numpy as np
 from scipy import optimize, signal
 
 from aolink.errors import ImportingError
-from aolink.importing.exposures import Settings
 from aolink.importing.film import Film
+from aolink.importing.frames import Settings
 from aolink.importing.tracking import STRAY, Survey, find_objects, reach, survey
 from aolink.numerics.arrays import FloatArray
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from aolink.errors import AolinkError, FrameError, ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film, Frame, grey
+from aolink.importing.film import Film, Frame, array_film, grey
 from aolink.limits import load_archive, unpacked
 from aolink.optics.frame_file import parse_fits_array, read_fits
 from aolink.optics.pictures import image_pixels, opened_image, read_picture
@@ -104,29 +104,6 @@ def _checked(film: Film, path: Path) -> Iterator[Frame]:
             count += 1
     if count != film.count:
         raise ImportingError(f"{path} announces {film.count} frames and has {count}: it is damaged")
-
-
-def array_film(frames: NDArray[Any], name: str, **known: Any) -> Film:
-    """A film of frames in memory, (frames, rows, columns); (spots, frames, rows, columns) stand side by side.
-
-    Raises
-    ------
-    ImportingError
-        It has another shape, or no numbers.
-    """
-    if frames.ndim == 4:  # one film for each spot, all of the same times
-        spots, count, rows, columns = frames.shape
-        frames = np.moveaxis(frames, 0, 2).reshape(count, rows, spots * columns)
-        known["notes"] = (*known.get("notes", ()), f"the films of {spots} spots stand side by side in one picture")
-    if frames.ndim != 3 or min(frames.shape) < 1 or frames.dtype.kind not in "biuf":
-        raise ImportingError(
-            f"{name} holds {frames.dtype} of shape {frames.shape}, expected numbers as (frames, rows, columns)"
-        )
-    times = known.get("times_ns")
-    if times is not None and times.shape != (len(frames),):
-        raise ImportingError(f"{name} has {len(frames)} frames and times of shape {times.shape}: give one for each")
-    shape = (int(frames.shape[1]), int(frames.shape[2]))
-    return Film(name=name, shape=shape, dtype=frames.dtype, count=len(frames), frames=lambda: iter(frames), **known)
 
 
 def _npy(path: Path) -> Film:

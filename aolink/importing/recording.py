@@ -12,8 +12,9 @@ from google.protobuf.message import Message
 
 from aolink.errors import ImportingError, RecordingError
 from aolink.files import check_target, open_unfinished, writing
-from aolink.importing.exposures import Account, ImportedExposure, Settings, imported
+from aolink.importing.exposures import imported
 from aolink.importing.film import Film
+from aolink.importing.frames import Account, ImportedExposure, Settings
 from aolink.recording import convert, topics
 from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.writer import begin_recording

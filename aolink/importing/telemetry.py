@@ -10,8 +10,7 @@ import numpy as np
 
 from aolink.errors import ImportingError
 from aolink.extensions import needs_extra
-from aolink.importing.film import Film
-from aolink.importing.readers import array_film
+from aolink.importing.film import Film, array_film
 from aolink.numerics.arrays import FloatArray
 
 

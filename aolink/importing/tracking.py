@@ -19,16 +19,8 @@ from scipy import optimize
 
 from aolink.errors import FrameError, ImportingError
 from aolink.exposure import Truth
-from aolink.importing.exposures import (
-    Account,
-    ImportedExposure,
-    Light,
-    Settings,
-    counts_of,
-    grouped,
-    rig_frame,
-)
 from aolink.importing.film import Film
+from aolink.importing.frames import Account, ImportedExposure, Light, Settings, counts_of, grouped, rig_frame
 from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.kernel import pixel_masses

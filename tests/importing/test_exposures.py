@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 import aolink
 from aolink.errors import AolinkError, ImportingError, RecordingError
-from aolink.importing.exposures import Account, Settings
-from aolink.importing.readers import array_film, open_film
+from aolink.importing.film import array_film
+from aolink.importing.frames import Account, Settings
+from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording
 from aolink.rig import Rig, load_rig

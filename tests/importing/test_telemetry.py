@@ -12,7 +12,7 @@ from aolink.errors import EstimatorError, ImportingError
 from aolink.estimation import run
 from aolink.exporting.files import export
 from aolink.exposure import Exposure, Exposures
-from aolink.importing.exposures import Account, Settings
+from aolink.importing.frames import Account, Settings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.recording.reader import Recording

@@ -10,9 +10,9 @@ import pytest
 
 from aolink.errors import ImportingError
 from aolink.estimation import run, smooth
-from aolink.importing.exposures import Settings
+from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig, fit_motion
-from aolink.importing.readers import array_film
+from aolink.importing.frames import Settings
 from aolink.importing.recording import import_film
 from aolink.importing.tracking import find_objects, survey
 from aolink.recording.reader import Recording

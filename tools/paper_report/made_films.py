@@ -15,9 +15,9 @@ import numpy as np
 
 from aolink.estimation import make_estimator, smooth
 from aolink.exposure import Exposure
-from aolink.importing.exposures import Settings
+from aolink.importing.film import array_film
 from aolink.importing.first_rig import first_rig
-from aolink.importing.readers import array_film
+from aolink.importing.frames import Settings
 from aolink.importing.recording import import_film
 from aolink.numerics.arrays import FloatArray
 from aolink.recording.reader import Recording

@@ -14,8 +14,8 @@ import numpy as np
 
 from aolink.estimation import ESTIMATOR_NAMES, make_estimator, smooth
 from aolink.exposure import Exposure
-from aolink.importing.exposures import Settings
 from aolink.importing.first_rig import first_rig
+from aolink.importing.frames import Settings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
 from aolink.numerics.arrays import FloatArray

@@ -1,0 +1,235 @@
+"""Frames of a film as a rig's camera would have read them: how they are read, when they are, in which exposure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from aolink.assembly import Frame as RigFrame
+from aolink.errors import ImportingError
+from aolink.exposure import Truth
+from aolink.importing.film import Film, Frame
+from aolink.numerics.arrays import FloatArray
+from aolink.rig import Rig
+
+_CLOSE = 0.01
+"""Rates and exposure times that differ by a smaller share are the same."""
+_IRREGULAR = 0.25
+"""Frame periods by which a frame may come too early or too late."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """How a film is read."""
+
+    rate_hz: float | None = None
+    """Frames a second, where the film does not say it or is wrong."""
+    exposure_s: float | None = None
+    """Exposure time of a frame, where the film does not say it or is wrong."""
+    start_ns: int | None = None
+    """When it began, ns since 1970, where the film does not say it or is wrong."""
+    gamma: float = 1.0
+    """What light was raised to the inverse of before it was stored: 2.2 for most JPEG and video."""
+    scale: float | None = None
+    """Counts for a pixel value of one; None: full scale becomes full scale."""
+    invert: bool = False
+    """Dark objects on a bright ground: light is what each frame's median exceeds a pixel by."""
+    subtract_median: bool = False
+    """Each frame's median is no light."""
+    frames_per_exposure: int = 1
+    """So many frames of a fast film become one exposure, their mean."""
+    track: int = 0
+    """So many objects are followed, each in a window of its own; 0: the frames are the rig's as they are."""
+    places: tuple[tuple[float, float], ...] = ()
+    """Where these are in the first frame, (x, y) in pixels; empty: the brightest ones that are not at an edge."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImportedExposure:
+    """What a session would have recorded of one exposure."""
+
+    frame: RigFrame
+    inputs: FloatArray
+    """What the mirror held from the end of the exposure before this one to the end of this, (steps, n_inputs)."""
+    truth: Truth | None = None
+    """What is known of the motion from the single frames."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Account:
+    """What a user should know of how a film was read."""
+
+    frames: int = 0
+    exposures: int = 0
+    saturated: int = 0
+    """Pixels at the end of their range in the film, which are masked."""
+    clipped: int = 0
+    """Pixels whose counts do not fit into the rig's range, which are masked as well."""
+    pixels: int = 0
+    notes: tuple[str, ...] = ()
+
+
+class Light:
+    """Pixel values as light: the gamma curve undone, background taken off, dark made bright."""
+
+    def __init__(self, film: Film, settings: Settings) -> None:
+        self._settings = settings
+        kind = film.dtype.kind
+        self.full_scale = float(np.iinfo(film.dtype.name).max) if kind in "iu" else 1.0
+        """The largest value that a pixel can hold."""
+        self._is_integer = kind in "iu"
+
+    def of(self, frame: Frame) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Light of a frame and where its pixels are saturated, (rows, columns) each."""
+        settings = self._settings
+        values = frame.astype(np.float64)
+        # An object that is dark is not harmed by a ground that is too bright.
+        bad = (values >= self.full_scale) & (self._is_integer and not settings.invert) | ~np.isfinite(values)
+        values[~np.isfinite(values)] = 0.0
+        if settings.gamma != 1.0:
+            values = self.full_scale * np.maximum(values / self.full_scale, 0.0) ** settings.gamma
+        if settings.subtract_median or settings.invert:
+            values -= np.median(values)
+        return (-values if settings.invert else values), bad
+
+
+def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.int64], list[str]]:
+    """Number of each frame in frame periods from the first on, (count,), and notes on what was assumed.
+
+    Raises
+    ------
+    ImportingError
+        Rate, times or exposure time contradict each other or the rig file; the message says what to change.
+    """
+    timing, K = rig.timing, settings.frames_per_exposure
+    notes = []
+    rate = film.rate_hz
+    if settings.rate_hz is not None:
+        if rate is not None and abs(rate / settings.rate_hz - 1) > _CLOSE:
+            notes.append(f"the film says {rate:g} frames/s; {settings.rate_hz:g} frames/s as given are taken")
+        rate = settings.rate_hz
+    periods = np.arange(film.count, dtype=np.int64)
+    if film.times_ns is not None and film.count > 1:
+        gaps = np.diff(film.times_ns) / 1e9
+        period = float(np.median(gaps))
+        if period <= 0 or (gaps <= 0).any():
+            late = int(np.argmax(gaps <= 0)) + 1
+            raise ImportingError(f"{film.name}: frame {late} is not later than the one before: its times are damaged")
+        if rate is not None and abs(rate * period - 1) > _CLOSE:
+            raise ImportingError(
+                f"{film.name}: {rate:g} frames/s contradict its times, which say {1 / period:.6g}: give --rate"
+                f" {1 / period:.6g}, or a file with the right times"
+            )
+        counts = np.rint(gaps / period).astype(np.int64)
+        off = np.abs(gaps / period - counts)
+        if (counts < 1).any() or (off > _IRREGULAR).any():
+            worst = int(np.argmax(np.where(counts < 1, np.inf, off)))
+            raise ImportingError(
+                f"{film.name}: frame {worst + 1} comes {gaps[worst]:.4g} s after the one before, at a frame period of"
+                f" {period:.4g} s: exposures must follow at a steady rate, only whole frames may be missing"
+            )
+        periods[1:] = np.cumsum(counts)
+        rate = 1 / period
+    own = K / (timing.frame_period_steps * timing.fast_step_s)
+    if rate is None:
+        notes.append(f"nothing says the frame rate: that of the rig file is assumed, {own:.6g} frames/s")
+    elif abs(rate / own - 1) > _CLOSE:
+        each = f"{K} frames" if K > 1 else "a frame"
+        whole = round(rate / own)
+        summed = f"give --sum {whole} as the rig file has it, " if K == 1 < whole == timing.exposure_steps else ""
+        raise ImportingError(
+            f"{film.name} has {rate:.6g} frames/s, and the rig file {rig.name} wants {each} every"
+            f" {timing.frame_period_steps * timing.fast_step_s:.6g} s, {own:.6g} frames/s: {summed}change its"
+            " [timing], or give the right --rate"
+        )
+    if K > 1 and (timing.exposure_steps, timing.frame_period_steps) != (K, K):
+        raise ImportingError(
+            f"--sum {K} makes exposures of {K} fast steps without dead time: set timing.exposure_steps = {K} and"
+            f" frame_period_steps = {K} in the rig file {rig.name}"
+        )
+    exposure_s = film.exposure_s
+    if settings.exposure_s is not None:
+        if exposure_s is not None and abs(exposure_s / settings.exposure_s - 1) > _CLOSE:
+            notes.append(f"the film says {exposure_s:g} s a frame; {settings.exposure_s:g} s as given are taken")
+        exposure_s = settings.exposure_s
+    if exposure_s is not None and K == 1:
+        own_s = timing.exposure_steps * timing.fast_step_s
+        if abs(exposure_s / own_s - 1) > _CLOSE:
+            raise ImportingError(
+                f"{film.name} was exposed for {exposure_s:.6g} s a frame, the rig file {rig.name} says {own_s:.6g} s:"
+                " change timing.exposure_steps, or give the right --exposure"
+            )
+    return periods, notes
+
+
+def counts_of(
+    counts: FloatArray, usable: NDArray[np.bool_], rig: Rig, account: Account
+) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Whole counts and the mask of the pixels that can be used, (rows, columns) each; the others are accounted for."""
+    whole = np.rint(counts)
+    outside = (whole < 0) | (whole > rig.sensor.full_scale)
+    account.pixels += whole.size
+    account.saturated += int(np.count_nonzero(~usable))
+    account.clipped += int(np.count_nonzero(outside & usable))
+    return np.clip(whole, 0, rig.sensor.full_scale).astype(np.uint16), usable & ~outside
+
+
+def default_scale(film: Film, rig: Rig) -> float:
+    """Counts for a pixel value of one: full scale becomes full scale, but numbers of 16 bits stay as they are."""
+    if film.dtype.kind in "iub" and film.dtype.itemsize > 1:
+        return 1.0
+    if film.dtype.kind == "b":
+        return float(rig.sensor.full_scale)
+    if film.dtype.kind in "iu":
+        return float(2.0 ** (rig.sensor.bit_depth - 8))
+    return float(rig.sensor.full_scale)
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Frames that become one exposure."""
+
+    first_period: int
+    """Frame periods from the start of the film to its first frame."""
+    first_frame: int
+    """Number of its first frame in the film, from 0."""
+    frames: list[Frame]
+
+
+def grouped(film: Film, count: int, periods: NDArray[np.int64]) -> Iterator[Group]:
+    """Frames by exposures; a film that lost a frame goes on with the next whole exposure."""
+    group: list[Frame] = []
+    first = 0
+    for k, frame in enumerate(film.frames()):
+        if group and periods[k] != periods[k - 1] + 1:
+            group = []
+        if not group:
+            if periods[k] % count:
+                continue  # exposures stay on one raster, as a camera's do
+            first = k
+        group.append(frame)
+        if len(group) == count:
+            yield Group(int(periods[first]), first, group)
+            group = []
+
+
+def rig_frame(
+    film: Film, rig: Rig, settings: Settings, period: int, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]
+) -> RigFrame:  # fmt: skip
+    """The frame of an exposure that begins so many of the rig's frame periods after the film."""
+    timing = rig.timing
+    first = period * timing.frame_period_steps
+    began_ns = settings.start_ns if settings.start_ns is not None else film.start_ns or 0
+    start_ns = began_ns + round(first * timing.fast_step_s * 1e9)
+    end_ns = start_ns + timing.exposure_steps * timing.fast_step_ns
+    return RigFrame(
+        frame_id=period + 1, first_step=first, last_step=first + timing.exposure_steps - 1, pixels=pixels, mask=mask,
+        chunks_lost=0, frames_lost_before=0, device_start_ns=first * timing.fast_step_ns,
+        device_end_ns=(first + timing.exposure_steps) * timing.fast_step_ns, host_first_byte_ns=end_ns,
+        host_receive_ns=end_ns, host_start_ns=start_ns, clock_sigma_ns=math.nan,
+        exposure_offset_ns=timing.exposure_offset_ns,
+    )  # fmt: skip
