@@ -89,7 +89,9 @@ def fit_spots(
     """
     means = np.array([mean[good] for _, _, mean in signals])
     dark_variance = noise[0] / dark_frames
-    start = [_first_guess(sensor, *each, good, noise[0] / each[1] + dark_variance) for each in signals]
+    start = [
+        _first_guess(sensor, source, mean, good, noise[0] / frames + dark_variance) for source, frames, mean in signals
+    ]
     scale, sigma = float(np.mean([s[0] for s in start])), float(np.median([s[2] for s in start]))
     p = np.array([scale, math.log(sigma), *[s[1] for s in start]])
     unit = np.array([scale, 1.0, *[sigma] * len(signals)])
@@ -164,7 +166,7 @@ def _weighted_fit(
 
 
 def _first_guess(
-    sensor: Sensor, source: str, frames: int, mean: FloatArray, good: BoolArray, variance: float
+    sensor: Sensor, source: str, mean: FloatArray, good: BoolArray, variance: float
 ) -> tuple[float, float, float]:
     """Scale, position and width of the Gaussian on a grid that fits best. Raises CalibrationError without a spot."""
     best = (0.0, 0.0, 0.0, 0.0)

@@ -3,7 +3,8 @@
 An entry is an array with a value for each axis, or one number for all axes; with a single axis all are numbers, since
 NumPy would take ten times as long. Every operation is then one pass over arrays that lie in the processor's cache, and
 only half of a symmetric matrix is computed; for larger matrices the calls would cost more than the arithmetic
-(`aolink.numerics.batched`). The result for one axis does not depend on how many there are, bit for bit.
+(`aolink.numerics.batched`). The row `o3_step` of tools/bench needs it. The result for one axis does not depend on how
+many there are, bit for bit.
 """
 
 from __future__ import annotations

@@ -183,7 +183,7 @@ def read_timing(table: Table) -> Timing:
     )  # fmt: skip
 
 
-def read_mirror(table: Table, n_inputs: int, timing: Timing) -> MirrorDriver:
+def read_mirror(table: Table, n_inputs: int) -> MirrorDriver:
     """The table ``[mirror]``. Raises `RigError`."""
     law = table.read_any("voltage", read_voltage)
     if law and (table.has("input_min") or table.has("input_max")):

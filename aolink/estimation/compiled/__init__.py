@@ -1,12 +1,13 @@
 """Loops over axes, components and pixels, compiled by Numba: of line sensors, of spots, and of many spots of one plant.
 
-Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the processor's
-cache. Each loop for line sensors and for spots has a twin in NumPy that tests compare it with: in `pixels.modes`, where
-spots on a plane use it, or in `tests/estimation/pixels/plain.py`. The loops for many spots of one plant are tested
-against the dense view of the same pixels. They hold no lock, so axes are shared among threads; the result for one axis
-does not depend on how many others there are, bit for bit. Machine code is kept beside the source or in the user's
-cache. ``python -m aolink.estimation.compiled`` makes it, as a part of the installation; otherwise it is made when the
-first estimator that needs it is made, not during a session.
+Whole-array calls for thousands of axes run through memory again and again; these loops keep one axis in the
+processor's cache (rows `profile_of_many_axes`, `mixture_of_many_axes` and `membrane_in_real_time` of tools/bench).
+Each loop for line sensors and for spots has a twin in NumPy that tests compare it with: in `pixels.modes`, where spots
+on a plane use it, or in `tests/estimation/pixels/plain.py`. The loops for many spots of one plant are tested against
+the dense view of the same pixels. They hold no lock, so axes are shared among threads; the result for one axis does
+not depend on how many others there are, bit for bit. Machine code is kept beside the source or in the user's cache.
+``python -m aolink.estimation.compiled`` makes it, as a part of the installation; otherwise it is made when the first
+estimator that needs it is made, not during a session.
 """
 
 from __future__ import annotations

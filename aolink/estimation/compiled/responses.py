@@ -1,7 +1,7 @@
 """Responses of plants of few states to their inputs: the plant stepped through the exposure, several axes abreast.
 
 NumPy would run through memory for each of the means; here some axes at a time stay in the processor's cache until their
-exposure ends. The twin is `aolink.plant.lifting.input_response`.
+exposure ends (row `frame_moments_and_o3` of tools/bench). The twin is `aolink.plant.lifting.input_response`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """o3 for one axis with two states, the extended Kalman filter with y_1 and y_2, written out number by number.
 
 The same lines take arrays with a value for each axis, or plain numbers of a single one, to the same bits. For a single
-axis a series of exposures is one loop over numbers (`run`): as arrays they would take thirty times as long.
+axis a series of exposures is one loop over numbers (`run`): as arrays they would take thirty times as long. The rows
+`o3_step` and `reestimation_rate` of tools/bench are theirs.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """The update of a Kalman filter, in the forms that it is computed in. They are one update, to rounding.
 
-`aolink.estimation.kalman.path_moments` chooses between them when an observation is made.
+`aolink.estimation.kalman.path_moments` chooses between them when an observation is made. Rows of tools/bench that need
+each: entry by entry `o3_step`, in blocks `spots_under_turbulence`, in information form `membrane_in_real_time`.
 """
 
 from __future__ import annotations

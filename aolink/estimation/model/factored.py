@@ -9,7 +9,7 @@ At most `NOISE_LEFT_OUT` of the noise path is left out, rms over outputs and ste
 the cosines leave out is included. It is added back: to the end covariance in full, to the variance of each output's
 path as a mean over the steps. With 2 % instead of 5 % left out and half as many coefficients again, `profile` on the
 rig membrane-12x12 gets no better. The dense basis of 144 actuators, 200 outputs and 200 steps would take 0.6 GB, this
-takes 2 MB.
+takes 2 MB (row `membrane_in_real_time` of tools/bench).
 """
 
 from __future__ import annotations
