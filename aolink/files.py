@@ -107,8 +107,8 @@ def writing(
     Raises
     ------
     AolinkError
-        Of the class ``error``: the target is refused (`check_target`), another command is writing it, or the file
-        cannot be written (any OSError in the block).
+        An error of the class ``error``: the target is refused (`check_target`), another command is writing it, or the
+        file cannot be written (any OSError in the block).
     """
     check_target(target, overwrite=overwrite, sources=sources, suffix=suffix, error=error)
     try:
@@ -136,8 +136,8 @@ def create(target: Path, *, overwrite: bool = False, error: type[AolinkError] = 
     Raises
     ------
     AolinkError
-        Of the class ``error``: the target is refused (`check_target`), another command is writing it, or it cannot
-        be created.
+        An error of the class ``error``: the target is refused (`check_target`), another command is writing it, or it
+        cannot be created.
     """
     check_target(target, overwrite=overwrite, error=error)
     flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC

@@ -54,7 +54,7 @@ SHORTER = {
 }
 """What is changed about a command before it is run: times, and what needs a screen."""
 EXIT_CODES = {"aolink recover broken.mcap": 1}
-"""Of commands that do not end with 0, as the page says beside them."""
+"""Exit codes of commands that do not end with 0, as the page says beside them."""
 BY_CI = ("sh tools/demo", "sh tools/test")
 """They set everything up, so that CI runs them and no test can."""
 LIGHTS: tuple[str, ...] = ("--light", "dark,flat:4,flat:8,still")

@@ -70,13 +70,13 @@ class Calibration:
     black_level: Measured
     """Counts."""
     read_noise: Measured
-    """Of a pixel, counts, rounding to whole counts included."""
+    """Standard deviation of a pixel, counts, rounding to whole counts included."""
     noise_density: Measured
     """V, without the rounding to whole counts."""
     gain: Measured | None
     """Counts that one photo-electron makes."""
     photoelectrons: Measured | None
-    """Of the whole spot in one exposure; zero where there are too many to be counted."""
+    """Photo-electrons of the whole spot in one exposure; zero where there are too many to be counted."""
     counts_per_density: Measured | None
     kernel_sigma: Measured | None
     """Slope units, in the rig file's convention: variance sigma^2/2."""

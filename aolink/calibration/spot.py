@@ -211,7 +211,7 @@ def check_at_rest(
     Parameters
     ----------
     counts:
-        Of the good pixels, (frames, good pixels).
+        Counts of the good pixels, (frames, good pixels).
     alone:
         Variance of each good pixel by itself, (good pixels,), and the variance of that over its square.
     number:

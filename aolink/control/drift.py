@@ -68,7 +68,7 @@ class FitMonitor:
         return self.fit()
 
     def fit(self) -> Fit | None:
-        """That of the newest exposures; None while they are too few."""
+        """How the innovations of the newest exposures look; None while they are too few."""
         if len(self._window) < WINDOW:
             return None
         nis, count, product, square = (sum(each) for each in zip(*self._window, strict=True))

@@ -109,7 +109,7 @@ class Rival:
         self._A, self._B = plant.A[np.ix_(self._moved, self._moved)].T.copy(), plant.B[self._moved].T.copy()
         self._C = plant.C[:, self._moved].T.copy()
         self._offset = np.zeros((plant.axes, len(self._moved)))
-        """Of the mirror's states from those that it really has."""
+        """Offset of the mirror's states from those that it really has."""
         self._low, self._high = mirror.input_min, mirror.input_max
         self._most_change = mirror.slew_max_per_s * rig.timing.fast_step_s or math.inf
         self._u, self._sent, self._sees = held, held, False

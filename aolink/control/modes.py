@@ -25,7 +25,7 @@ def reached(plant: Plant) -> tuple[Indices, Indices]:
 def response_at_rest(plant: Plant, n_steps: int) -> FloatArray:
     """Outputs of one copy when each of its inputs is held at one, (n_outputs, n_inputs).
 
-    Of a plant that does not come to rest, the mean of its outputs over the first ``n_steps`` fast steps.
+    For a plant that does not come to rest, it is the mean of its outputs over the first ``n_steps`` fast steps.
     """
     moved, _ = reached(plant)
     A, B, C = plant.A[np.ix_(moved, moved)], plant.B[moved], plant.C[:, moved]
@@ -52,7 +52,7 @@ class Modes:
 
     @classmethod
     def of(cls, response: FloatArray) -> Modes:
-        """Those of a response (n_outputs, n_inputs): of a plant, or measured by `aolink calibrate --interaction`."""
+        """Modes of a response (n_outputs, n_inputs): of a plant, or measured by `aolink calibrate --interaction`."""
         U, gains, V = np.linalg.svd(response, full_matrices=False)
         return cls(slopes=U, gains=gains, inputs=V.T)
 

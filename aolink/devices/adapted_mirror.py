@@ -96,7 +96,7 @@ class AdaptedMirror(Adapted):
     def _driver_sigma_ns(self) -> float:
         """What the driver knows of its own inexactness.
 
-        Of a mirror without a queue that is how late its inputs are, which the rig file may say instead.
+        For a mirror without a queue, that is how late its inputs are, which the rig file may say instead.
         """
         if self._delay_ns and Lacks.QUEUE in self.lacks:
             return 0.0

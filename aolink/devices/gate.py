@@ -90,7 +90,7 @@ class Gate:
         self._sent_end = self._first_step
         mirror = rig.mirror
         self.limits = CommandLimits(rig)
-        """Of what is sent to the mirror."""
+        """Limits of what is sent to the mirror."""
         margin = converter_margin(mirror)
         self._input_min, self._input_max = mirror.input_min - margin, mirror.input_max + margin
         planes = [(rig.sensor.shape, rig.sensor.bit_depth)]

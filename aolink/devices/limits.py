@@ -62,7 +62,8 @@ class CommandLimits:
     def take(self, first_step: int, u: NDArray[np.float64]) -> NDArray[np.float64]:
         """Check inputs and take them as sent, as `check` does; gives what to send.
 
-        That is ``u``; or, after `parked` and `go_on_from`, what comes as near to it as the limit of the change allows.
+        What to send is ``u``; or, after `parked` and `go_on_from`, what comes as near to it as the limit of the change
+        allows.
         """
         wanted = u
         if self._slew and first_step <= self._joined:

@@ -19,7 +19,7 @@ _REMEMBERED = 1000
 _LATE = 0.5
 """A step whose input was taken only after this part of it held the one before for longer: it was late."""
 _LEAST_PERIOD_NS = 1_000_000
-"""Of looking whether the host is held up: more often would cost more than it tells."""
+"""Least period of looking whether the host is held up: to look more often would cost more than it tells."""
 
 
 class PacedMirror:

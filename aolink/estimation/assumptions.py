@@ -16,7 +16,7 @@ from aolink.rig import Rig
 
 MOST_MODES = 3
 MOST_SWINGS = 8.0
-"""Of a mode in one exposure."""
+"""Swings of a mode in one exposure, at most."""
 STEPS_IN_SWING = 8
 """Fast steps in one swing of a mode, at least."""
 MOST_PATH_WIDTHS = 8.0

@@ -19,7 +19,7 @@ from aolink.exporting.telemetry import write_fits
 from aolink.files import check_target, writing
 
 _ROWS_AT_ONCE = 4096
-"""Of a Parquet file, which are in memory together."""
+"""Rows of a Parquet file that are in memory together."""
 
 
 def export(

@@ -40,7 +40,7 @@ class Tried:
 
     @property
     def score(self) -> float:
-        """Of all stretches."""
+        """Log-likelihood of all stretches."""
         return float(self.scores.sum())
 
 

@@ -41,7 +41,7 @@ _SPAN = 5.0
 """Standard deviations that the cells of a gamma distribution reach to on the lower side; 1.6 times as far above."""
 _LEAST_SKEWNESS, _MOST_SKEWNESS = 0.05, 2.8
 _SMOOTH = 0.05
-"""Of a gamma distribution, in standard deviations: where it begins it is not so right as it is steep."""
+"""Smoothing of a gamma distribution, in standard deviations: where it begins it is not so right as it is steep."""
 _RARE, _WIDE = 1e-3, 3.0
 """Share of a Gaussian so many times as wide that is in every distribution."""
 _AT_ONCE = 128

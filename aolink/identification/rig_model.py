@@ -21,7 +21,7 @@ _WALK = 1e-9
 _LEAST = 1e-12
 """Modulus that an eigenvalue is taken to have at least: one of zero is forgotten within a step."""
 _MOST_CONDITION = 1e10
-"""Of the eigenvectors: beyond, two poles are the same, and rounding is all that tells them apart."""
+"""Condition number of the eigenvectors: beyond, two poles are the same, and rounding is all that tells them apart."""
 _NUDGE = 1e-5
 """By how much such poles are moved apart, as a share."""
 _NOTHING = 1e-6

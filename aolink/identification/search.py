@@ -21,7 +21,7 @@ BLOCK = 16
 CYCLES = 4.0
 """Highest frequency that is searched, in cycles per exposure."""
 _SPACING = 0.06
-"""Of the grid of frequencies, in cycles per frame period: below the width of a maximum with the grid's damping."""
+"""Spacing of the grid of frequencies, cycles per frame period: below the width of a maximum with the grid's damping."""
 _DECAY = 0.4
 """By how much a resonance of the grid decays in a frame period, in nats."""
 _STARTS = 8
@@ -53,7 +53,7 @@ class Space:
     plant: str | None = None
     """The kind of plant that is fitted as well; its parameters come first. None: the plant is known."""
     sign: float = 1.0
-    """Of the plant's gain."""
+    """Sign of the plant's gain."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -173,7 +173,7 @@ def space_of(
 
 
 def _sign(seen: Sequence[Readings]) -> float:
-    """Of the gain of a plant that hardly delays: that of the covariance of the means with the inputs'."""
+    """Sign of the gain of a plant that hardly delays: that of the covariance of the means with the inputs'."""
     total = 0.0
     for each in seen:
         u = np.cumsum(each.inputs[:, 0], axis=1)
@@ -350,7 +350,7 @@ def _grid(space: Space, seen: Sequence[Readings]) -> list[tuple[float, ...]]:
         each[longest] = each[longest][::2]
     grid = []
     for product in itertools.product(*each):
-        # Of equal processes, the order of the frequencies does not matter.
+        # The order of the frequencies of equal processes does not matter.
         own = product[1:] if space.plant is not None else product
         if all(
             a[0] < b[0] or kind != other

@@ -23,7 +23,7 @@ from aolink.identification.simulate import simulated
 from aolink.numerics.arrays import FloatArray
 
 QUANTILE = 3.841
-"""Of chi-square with one degree of freedom, at 95 %."""
+"""Quantile of chi-square with one degree of freedom, at 95 %."""
 _DRAWS = 96
 _MOST = 8
 """Local maxima that are looked at."""

@@ -53,7 +53,7 @@ class Job:
         return self.output.with_suffix(".json")
 
     def digest(self) -> str:
-        """Of everything that the result depends on: a job with the same digest need not be done again."""
+        """Digest of everything that the result depends on: a job with the same digest need not be done again."""
         status = self.source.stat()
         facts = [
             str(self.source.resolve()),

@@ -55,7 +55,7 @@ def closed_loop(
     estimator:
         The estimator that serves it; empty for none.
     seed:
-        Of the rig; the rig file's own where None.
+        Seed of the rig; the rig file's own where None.
 
     Raises
     ------
@@ -89,17 +89,17 @@ class Replayed:
 
     controller: str
     estimator: str
-    """That served it; empty for none."""
+    """The estimator that served the controller; empty for none."""
     exposures: int
     open_exposures: int
-    """Of them, those with which the loop would have been open."""
+    """Exposures with which the loop would have been open."""
     input_rms: float
     """Root mean square of the inputs that it would have commanded, less the safe input."""
     difference_rms: float
     """The same of their difference to what the mirror held; NaN where the recording does not say."""
     stability: str
     seed: int | None
-    """Of the simulated rig; None where the recording is of none, and the rest is NaN."""
+    """Seed of the simulated rig; None where the recording is of none, and the rest is NaN."""
     recorded_rms: float
     """Residual slopes at the fast rate, root mean square, slope units: in the recording, ..."""
     open_rms: float = math.nan

@@ -57,7 +57,7 @@ class DemoResult:
 
 
 def possible_estimators(rig: Rig) -> tuple[str, ...]:
-    """Those that can work on a rig and would not make its demo long, by rank."""
+    """The estimators that can work on a rig and would not make its demo long, by rank."""
     return tuple(row.name for row in estimator_rows() if row.in_demo(rig) and row.refusal(rig) is None)
 
 

@@ -56,9 +56,9 @@ class Offer:
     """First and last frame that it was fitted to."""
     held_out: tuple[int, int]
     log_likelihood: float
-    """Of the exposures that were held out, nats."""
+    """Log-likelihood of the exposures that were held out, nats."""
     before: float
-    """That by the best of the models before."""
+    """Their log-likelihood by the best of the models before."""
     before_name: str
     before_model: str
     """Its poles in words."""
@@ -220,7 +220,7 @@ class Following:
 
 
 def _log_likelihood(rig: Rig, seen: Readings) -> float:
-    """Of readings by a rig file's model, nats; -inf where nothing disturbs by it."""
+    """Log-likelihood of readings by a rig file's model, nats; -inf where nothing disturbs by it."""
     per_copy = rig.plant.n_outputs
     try:
         return sum(

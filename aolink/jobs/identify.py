@@ -135,7 +135,7 @@ def _some(seen: Readings, which: Sequence[int]) -> Readings:
 
 
 def outputs_of(seen: Readings, which: Sequence[int]) -> list[int]:
-    """Those of some outputs that a model is fitted to. Raises IdentificationError where none shows a spot."""
+    """Which of some outputs a model is fitted to. Raises IdentificationError where none shows a spot."""
     seeing = [o for o in which if seen.usable[o].any()]
     if not seeing:
         raise IdentificationError("no exposure shows a spot of this output")

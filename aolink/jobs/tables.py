@@ -16,12 +16,12 @@ COLUMNS = (
     "nis", "nis_low", "nis_high", "start_nees", "end_nees", "nees_low", "nees_high", "not_ok", "nothing_measured",
     "seconds", "output", "damage", "error",
 )  # fmt: skip
-"""Of the table of recordings: one row for each recording, model and estimator; what is not known is empty."""
+"""Columns of the table of recordings: one row for each recording, model and estimator; what is not known is empty."""
 EXPOSURE_COLUMNS = (
     "recording", "model", "estimator", "frame_id", "time_ns", "first_step", "status", "reason", "nis", "nis_degrees",
     "path_rms", "path_sd", "path_rmse", "start_rmse", "end_rmse",
 )  # fmt: skip
-"""Of the table of exposures."""
+"""Columns of the table of exposures."""
 _TEXTS = {
     "recording", "model", "estimator", "status", "reason", "nothing_measured", "output", "damage", "error"
 }  # fmt: skip

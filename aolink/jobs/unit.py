@@ -193,7 +193,7 @@ def aolink_version() -> str:
 
 
 def _digest(recording: Recording, settings: Settings) -> str:
-    """Of all that the result depends on."""
+    """Digest of all that the result depends on."""
     facts = [
         recording.digest, aolink_version(), settings.estimator, settings.engine, settings.model.rig_text,
         [[key, str(value)] for key, value in settings.model.changes],

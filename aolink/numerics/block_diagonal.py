@@ -72,7 +72,7 @@ def alike(A: FloatArray, *columns: FloatArray) -> Indices | None:
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
     """P with P = A P A' + Q (discrete Lyapunov equation) for a stable A, (n, n).
 
-    Of a few states as n^2 linear equations, (I - A (x) A) vec P = vec Q, as SciPy does it for them.
+    For a few states it is solved as n^2 linear equations, (I - A (x) A) vec P = vec Q, as SciPy does it for them.
     """
 
     def solved(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, ...]:

@@ -69,12 +69,12 @@ class FrameSlopes:
 
     @property
     def rms(self) -> float:
-        """Of the wavefront."""
+        """Root mean square of the wavefront."""
         return residual_rms(self.wavefront)
 
     @property
     def peak_to_valley(self) -> float:
-        """Of the wavefront."""
+        """Highest less lowest value of the wavefront."""
         return float(np.nanmax(self.wavefront) - np.nanmin(self.wavefront))
 
 

@@ -136,7 +136,7 @@ def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     part = place - low
     # Beyond, no light reaches the window.
     near = ((low >= -reach - 1) & (low <= side * fine + reach)).all(axis=1)
-    # Of the square, in pixels: its corner and its side.
+    # Corners and side of the spots' squares, in pixels.
     some = near.any(axis=1)[:, None, None]
     least = np.where(some, np.where(near[:, None], low, np.inf).min(axis=2, keepdims=True), 0.0)
     most = np.where(some, np.where(near[:, None], low, -np.inf).max(axis=2, keepdims=True), 0.0)
@@ -152,14 +152,14 @@ def _image_of_some(psi: Psi, side: int, path_px: FloatArray) -> FloatArray:
     trace = np.bincount(places.ravel(), weights.ravel(), spots * size**2).reshape(spots, size, size)
     spectrum = fft.rfft2(trace)
     spectrum *= _image_spectrum(psi.image, fine, size)
-    # Of every fine-th row the spectrum is that of all of them, those so far apart that they look alike added up.
+    # Every fine-th row has the spectrum of all rows, with frequencies so far apart that they look alike added up.
     folded = spectrum.reshape(spots, fine, pixels, -1).sum(axis=1) / fine
     light = fft.irfft2(folded, (pixels, size)).reshape(spots, pixels, pixels, fine).sum(axis=3)
     return _cut(light, corner[..., 0].astype(np.int64), side)
 
 
 def _image_spectrum(image: FloatArray, fine: int, size: int) -> NDArray[np.complex128]:
-    """Of the image, with each row the sum over a pixel's rows from it on."""
+    """Spectrum of the image, with each row the sum over a pixel's rows from it on."""
     rows, columns = image.shape
     kernel = np.zeros((size, size))
     kernel[:rows, :columns] = image / image.sum()

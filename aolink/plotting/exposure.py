@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 _SIZE_IN = (9.0, 3.4)
 _BINS = 48
-"""Of a path's histogram, over the drawn part of the field."""
+"""Bins of a path's histogram, over the drawn part of the field."""
 _SEGMENTS = 120
-"""Of a path that is drawn as an envelope."""
+"""Segments of a path that is drawn as an envelope."""
 
 
 def exposure_with_estimates(

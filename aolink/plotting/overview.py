@@ -25,9 +25,9 @@ from aolink.plotting.style import TimeUnit, extremes, hides_swings
 NIS_COVERAGE = 0.95
 """Probability that a consistent estimator's NIS lies inside the bounds drawn."""
 _COLUMNS = 1500
-"""Of the blur over a session: a longer one has several exposures in a column."""
+"""Columns of the blur over a session: a longer session has several exposures in a column."""
 _POINTS = 17
-"""Of a path within its exposure."""
+"""Points of a path within its exposure."""
 _KERNELS = 4.0
 """What is drawn reaches this many of the kernel's standard deviations beyond the paths."""
 _NONE = -1
@@ -137,7 +137,7 @@ def overview(
     Parameters
     ----------
     estimators:
-        Those to draw; all by default.
+        The estimators to draw; all by default.
     output:
         Number of the output (a row of a path) whose blur and paths are drawn.
     progress:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _SIDE_BY_SIDE = 3
 """So many recordings have all their figures, beside each other; of more there is a table, and one figure of each."""
 _DPI = 150
-"""Of what is no line in a figure."""
+"""Resolution of what is no line in a figure, dots per inch."""
 _WIDE, _NARROW = (160.0, 66.0), (110.0, 66.0)
 """Width and height of figures, mm."""
 _STYLE = """

@@ -22,7 +22,7 @@ _BRIGHTEST = 98.0
 _RUNNING = 20
 """The errors are averaged over this share of the session."""
 _MOST_POINTS = 3000
-"""Of a line: a longer one is drawn as the range of its values."""
+"""Points of a line: a longer one is drawn as the range of its values."""
 
 
 def plot_blur(
@@ -92,7 +92,7 @@ def plot_nis(
 ) -> Axes:  # fmt: skip
     """The NIS of each estimator with the interval that holds 95 % of its values if the filter is consistent.
 
-    Of many axes it is their mean, whose interval is narrower; with ``one_axis`` that of the overview's output.
+    With many axes it is their mean, whose interval is narrower; with ``one_axis`` it is that of the overview's output.
     What was gated is a cross.
 
     Raises

@@ -54,7 +54,7 @@ class RecordingCopy:
     notes:
         Facts about the session in the place of those that the source has.
     attachments:
-        Those of the source by default.
+        What is attached, by name; what the source has by default.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class RecordingCopy:
         self._file.add(message.topic, schema, message.data, message.log_time_ns, self.messages, encoding)
 
     def _schema(self, name: str) -> Schema:
-        """That of this aolink, or of a kind that it does not know the source's."""
+        """The schema of a message as this aolink has it, or the source's where this aolink does not know the kind."""
         known = topics.SCHEMAS.get(name)
         schema = schema_of(known) if known is not None else self._foreign.get(name)
         self._schemas[name] = schema = schema or Schema(id=0, name=name, encoding="", data=b"")

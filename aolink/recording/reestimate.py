@@ -192,7 +192,7 @@ def kept_estimators(recording: Recording, names: Sequence[str], *, only: bool) -
 def _without_old_estimates(recording: Recording, kept: Sequence[str], told: Sequence[str]) -> Iterator[RawMessage]:
     """The messages of a recording; of its estimates and of the pictures restored with them, those of ``kept``.
 
-    Of the accounts of what an estimator had time for, those of the estimators ``told``.
+    Only the estimators ``told`` keep their accounts of what they had time for.
     """
     restored_with = ""
     for raw in recording.raw_messages():

@@ -34,7 +34,7 @@ def location(path: str | Path | Url) -> Path | Url:
 
 
 def only_paths(places: Iterable[Path | Url]) -> list[Path]:
-    """Those that are files of this machine."""
+    """The places that are files of this machine."""
     return [each for each in places if isinstance(each, Path)]
 
 

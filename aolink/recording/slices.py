@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 class RecordingSlice(Series):
     """What ``recording[10:20]`` is: these exposures and their estimates, as in the whole recording, bit for bit.
 
-    Of a file with an index little more is read than they are in. Estimators that are run on a slice begin anew there.
+    Little more of a file with an index is read than they are in. Estimators that are run on a slice begin anew there.
     """
 
     def __init__(self, recording: Recording, numbers: range) -> None:

@@ -56,7 +56,7 @@ def begin_recording(
     file.start()
     model = exposure_model(rig.plant, rig.timing.exposure_steps)
     outputs, basis = model.factors
-    # Of a large one only the columns of the start state, which are all that o1 to o3 have.
+    # A large basis is kept only in the columns of the start state, which are all that o1 to o3 have.
     basis = basis if basis.nbytes <= _LARGEST_BASIS else basis[..., : rig.plant.n_states]
     file.add_attachment(topics.RIG_ATTACHMENT, "application/toml", rig.toml.encode(), start_ns)
     arrays = {topics.BASIS_ATTACHMENT: basis} | ({} if outputs is None else {topics.OUTPUTS_ATTACHMENT: outputs})

@@ -36,7 +36,7 @@ def smooth_lines(
     values:
         The PSF, (taps,), or that of each pixel, (columns, taps).
     correlation, variance:
-        Those of the scene, see `aolink.restoration.scanner.first_order`.
+        Correlation and variance of the scene, see `aolink.restoration.scanner.first_order`.
     noise_variance:
         s^2, variance of the lines' white noise.
     seen:

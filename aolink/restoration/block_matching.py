@@ -27,7 +27,7 @@ _REACH = 8
 _GROUP = 16
 """Patches in a group, at most."""
 _THRESHOLD = 2.7
-"""Of the first pass, in standard deviations of the noise."""
+"""Threshold of the first pass, in standard deviations of the noise."""
 _KAISER = 2.0
 _BAND = 32
 """Rows of groups that are made at once: it bounds the memory."""
@@ -132,7 +132,7 @@ class _Patches:
             weight[here] += self.window[y, x] * weights
 
     def _spectra(self, image: Singles) -> Singles:
-        """Of the patches at all places, (places, pixels of a patch)."""
+        """Spectra of the patches at all places, (places, pixels of a patch)."""
         windows = np.lib.stride_tricks.sliding_window_view(image, self.sides)
         return np.asarray(windows.reshape(-1, math.prod(self.sides)) @ self.transform.T)
 

@@ -247,7 +247,7 @@ class Plane:
     shape: tuple[int, int]
     """Rows and columns of the plane."""
     transfer: NDArray[np.complexfloating[Any]]
-    """Of the blur, by `forward`."""
+    """Transfer function of the blur, by `forward`."""
     rough: FloatingArray
     """Spectrum of L."""
 

@@ -174,7 +174,7 @@ def plane_total_variation(
     part = 1 / (weight + _PLANE_PENALTY)
     rows, columns = plane.scene
     spectrum = plane.forward(plane.guess(images, difference_weight * noise_variance).astype(real))
-    # Of the blurred plane and of the differences: the splits plus scaled dual variables, as above.
+    # The splits of the blurred plane and of the differences, plus their scaled dual variables, as above.
     u, x = plane.backward(spectrum * transfer), plane.backward(spectrum)
     along, down = _next(x, -1), _next(x, -2)
     shrunk_along, shrunk_down = along[..., :rows, : columns - 1], down[..., : rows - 1, :columns]

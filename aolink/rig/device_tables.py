@@ -12,7 +12,7 @@ from aolink.rig.toml_table import Table
 class Delay:
     """A delay that no clock shows.
 
-    Of a mirror it is the time from an input's fast step to the mirror's following it; of a camera that tells no time,
+    For a mirror it is the time from an input's fast step to the mirror's following it; for a camera that tells no time,
     the time from the end of an exposure to its frame's arrival.
     """
 

@@ -187,7 +187,7 @@ class Control:
     when_lost: Literal["hold", "park"] = "hold"
     """What the mirror does while nothing reliable is known of the spot: it holds its input, or goes to the safe one."""
     gain: float = 0.5
-    """Of the integrator."""
+    """Gain of the integrator."""
     leak: float = 0.01
     """Share of itself that the integrator loses with each exposure."""
     least_singular_value: float = 0.03

@@ -29,8 +29,8 @@ from aolink.rig import Rig
 LENGTH = struct.Struct("<Q")
 """Each message on the socket is a pickle behind its length."""
 NICENESS = 5
-"""Of an estimator that nothing waits for: where all cores are busy, the loop, the devices' drivers, the disk and the
-estimator that closes the loop come first."""
+"""Niceness of an estimator that nothing waits for: where all cores are busy, the loop, the devices' drivers, the disk
+and the estimator that closes the loop come first."""
 _PARENT_DEATH_SIGNAL = 1
 """PR_SET_PDEATHSIG of Linux."""
 

@@ -19,7 +19,7 @@ from aolink.rig import Rig
 from aolink.session.replay import RecordedCommands
 
 _BITS = 16
-"""Of the shift register whose sequence ``prbs`` plays: it repeats after 65,535 values."""
+"""Bits of the shift register whose sequence ``prbs`` plays: it repeats after 65,535 values."""
 _MOST_CHECKED = 1 << 20
 """Fast steps that are compared with the limits before the session; each is again when it is sent."""
 _CHECKED = 4096

@@ -134,7 +134,7 @@ class SessionLoop:
         self._absent: list[Device] = []
         """Devices whose port has vanished, until the session goes on with them."""
         self._returned: list[Device] = []
-        """Those of them that have been identified again; their clocks are being asked."""
+        """Vanished devices that have been identified again; their clocks are being asked."""
         self._newest_steps: dict[int, int] = {}
         """First fast step of the newest frame, by its plane."""
         self._restarted: set[int] = set()

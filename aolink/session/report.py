@@ -44,17 +44,17 @@ class ControlReport:
 
     controller: str
     estimator: str
-    """That serves it; empty for none."""
+    """The estimator that serves the controller; empty for none."""
     exposures: int = 0
     """Exposures that it has taken."""
     open_exposures: int = 0
-    """Of them, those with which the loop was open: the mirror held its input, or went to the safe one."""
+    """Exposures with which the loop was open: the mirror held its input, or went to the safe one."""
     late_exposures: int = 0
-    """Of them, those that changed the inputs later than the rig file's ``control.delay_s``."""
+    """Exposures that changed the inputs later than the rig file's ``control.delay_s``."""
     misfit_exposures: int = 0
-    """Of them, those at which the model no longer fitted."""
+    """Exposures at which the model no longer fitted."""
     fall_back_exposures: int = 0
-    """Of them, those after which another controller acted, because this one did not pay."""
+    """Exposures after which another controller acted, because this one did not pay."""
     clipped_steps: int = 0
     """Fast steps whose wanted input the limits have changed."""
     slope_rms: float = float("nan")
@@ -151,7 +151,7 @@ class Report:
     estimation: dict[str, EstimatorReport] = field(default_factory=dict)
     """By the estimator's name. Empty on virtual time, which waits for every estimate."""
     control: ControlReport | None = None
-    """Of the closed loop; None where the session played its inputs."""
+    """Counts of the closed loop; None where the session played its inputs."""
     unwatched: int = 0
     """Exposures for which the watcher had no time."""
     warnings: list[str] = field(default_factory=list)

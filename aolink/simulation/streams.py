@@ -42,7 +42,7 @@ IDLE_S = 10.0
 _MOST_GUESTS = 16
 """Connections that may be waiting to identify themselves; beyond that, the oldest is dropped."""
 VERSIONS = (PROTOCOL_VERSION, SIGNED_VERSION)
-"""Of packets whose sender is told why they are refused."""
+"""Protocol versions of packets whose sender is told why they are refused."""
 _MOST_INTRODUCTION = 64
 """Bytes of an encoded Identify packet, and more than it can have."""
 

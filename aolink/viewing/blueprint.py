@@ -35,7 +35,7 @@ class Contents:
     estimators: list[str]
     """In rank order; the last is the one whose band is shown first."""
     measuring: list[str]
-    """Those of them that have an innovation."""
+    """Estimators that have an innovation."""
     density_top: float
     """Top of the intensity profile's plot, one over slope units."""
     truth: bool
@@ -43,7 +43,7 @@ class Contents:
     """Entities of the scene: as it came, restored, at rest; those that there are."""
     restored_spots: bool = False
     topics: frozenset[str] = frozenset()
-    """Those of the devices that have messages."""
+    """Topics of the devices that have messages."""
     drawn: Drawing
     """What its lines were drawn on."""
     maps: Mapping[str, float] = field(default_factory=dict)
@@ -64,7 +64,7 @@ class Contents:
 def blueprint(contents: Contents) -> rrb.Blueprint:
     """The layout: the exposure on top, the session's estimates below it, the devices at the bottom.
 
-    Of one exposure alone: why its blur looks as it does, beside its paths and its frame.
+    For one exposure alone it shows why its blur looks as it does, beside its paths and its frame.
     """
     layout: rrb.Container
     if contents.alone:

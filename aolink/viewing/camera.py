@@ -39,17 +39,17 @@ _GAP = 0.03
 _KEY_ROW, _KEY_COLUMNS = 0.095, 5
 """Height of a row of the key over the width, and names in it."""
 _MOST = 1.0 + _GAP / _PANELS[2]
-"""Of a predicted intensity over the panel's top: what is higher would be in the panel above."""
+"""Highest predicted intensity drawn, relative to the panel's top: what is higher would be in the panel above."""
 _LIGHT = 2.5
 """Top of the histogram over that of the intensity, which is the histogram blurred."""
 _POINTS_IN_ROW = 21
-"""Of a path inside one row of a page: more than can be told apart."""
+"""Points of a path inside one row of a page: more than can be told apart."""
 _SWINGS_IN_ROW = 5
 """A path over some pixels that a line through so many points would miss is drawn as its range: a row is not high."""
 _PIXELS = 6.0
-"""That it has to move by."""
+"""Pixels that a path has to move by to be drawn as its range."""
 _POINTS_OF_SPOT = 51
-"""Of a spot's path on the frame."""
+"""Points of a spot's path on the frame."""
 _ERF_AT = np.linspace(-5.0, 5.0, 1001)
 _ERF = np.array([math.erf(u) for u in _ERF_AT.tolist()])
 """The error function; between these points lines are wrong by 1e-5. To load SciPy's takes a third of a second."""
@@ -142,7 +142,7 @@ def log_page(
     Parameters
     ----------
     exposures:
-        Those of one page, in order.
+        The exposures of one page, in order.
     top:
         Density that is drawn brightest.
     until:

@@ -20,7 +20,7 @@ LINK_COUNTS = ("bad_crc", "bad_framing", "bad_payload", "sequence_gaps", "duplic
 """Fields of LinkStatistics that count faults."""
 
 _MOST_INPUTS = 2
-"""That are lines of their own; of more it is the first ones, and percentiles of all."""
+"""Most inputs that are lines of their own; where there are more, the first ones are, and percentiles of all."""
 _LEVELS = dict(enumerate(("TRACE", "DEBUG", "INFO", "WARN", "ERROR", "CRITICAL")))
 """Rerun's levels by the number of foxglove's."""
 

@@ -21,7 +21,7 @@ from aolink.viewing.series import Drawing, Style, send_axes, send_line
 from aolink.viewing.timebase import Timebase
 
 MOST_STATES = 8
-"""Of a plant with more the first ones are drawn: all of them are in the recording."""
+"""Most states that are drawn: of a plant with more it is the first ones, and all of them are in the recording."""
 
 
 def log_truth(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposure]) -> None:

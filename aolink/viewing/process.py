@@ -74,7 +74,7 @@ def serve_web(
     Parameters
     ----------
     port:
-        Of the page; by default `WEB_PORT`, or a free one where that is in use. The data goes over a second, free one.
+        Port of the page; by default `WEB_PORT`, or a free one if that is in use. The data goes over a second, free one.
     on_ready:
         Called once with the address to open.
     """
@@ -102,7 +102,7 @@ class Server:
 
     @property
     def address(self) -> str:
-        """Of the web page."""
+        """Address of the web page."""
         return f"http://{HOST}:{self.page_port}/?url={quote(self.data_address, safe='')}"
 
     def listen(self) -> None:

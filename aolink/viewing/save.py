@@ -37,9 +37,9 @@ COMPARED = "compared/"
 """Begins the names of what is beside the recording."""
 
 _PAGES = 16
-"""Of exposures in a part of a recording, which is in memory as a whole; the first part has one, to be there soon."""
+"""Pages of exposures in a part of a recording, which is in memory as a whole; the first has one, to be there soon."""
 _BYTES_IN_PART = 100e6
-"""That its frames, and as many numbers of each estimator's paths, may take."""
+"""Bytes that a part's frames, and as many numbers of each estimator's paths, may take."""
 _BESIDE_NS = 1_000_000_000
 """How long before and after its exposures a part's messages may have come."""
 

@@ -20,7 +20,7 @@ from aolink.viewing.timebase import Timebase
 PERCENTILES = (5, 50, 95)
 """What stands for many axes."""
 POINTS = 32
-"""That a path is drawn with in a long session: more than its exposure has columns on a screen."""
+"""Points that a path is drawn with in a long session: more than its exposure has columns on a screen."""
 _SECOND = 0.55
 """Opacity of the second of two lines that belong together, and of those that something is compared with."""
 
@@ -54,7 +54,7 @@ class Drawing:
     root: str = ""
     """Begins the name of every entity, with its slash, where a recording is shown beside another."""
     points: int | None = POINTS
-    """That a path of one exposure is drawn with; None: every fast step."""
+    """Points that a path of one exposure is drawn with; None: every fast step."""
     extents: dict[str, tuple[float, float]] = field(default_factory=dict)
     """The least and the largest value of each entity's lines."""
     swinging: dict[str, bool] = field(default_factory=dict)
@@ -128,7 +128,7 @@ def send_axes(
     values:
         (rows, axes); where all of them are shown there are no percentiles.
     shown:
-        Those that are lines of their own.
+        The axes that are lines of their own.
     labels:
         What the legend adds to the name of each of those.
     """

@@ -25,9 +25,9 @@ from aolink.wire import messages_pb2 as pb
 
 PROTOCOL_VERSION = 1
 SIGNED_VERSION = 2
-"""Of a packet whose payload ends with link, time stamp and signature."""
+"""Protocol version of a packet whose payload ends with link, time stamp and signature."""
 TRAILER_BYTES = 13
-"""Of these three."""
+"""Bytes of link, time stamp and signature."""
 MAX_PAYLOAD = 4608
 """Bytes; 4 KiB of data and the fields around it."""
 MAX_CHUNK = 4096

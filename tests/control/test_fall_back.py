@@ -19,7 +19,7 @@ from aolink.rig import Rig, load_rig
 from tests.control.rigs import DRIFT, LINE, small_rig
 
 STEPS = 40
-"""Of an exposure."""
+"""Fast steps of an exposure."""
 
 
 def played(folder: Path, slopes: FloatArray, *parts: str) -> Rig:

@@ -25,7 +25,7 @@ def plant_with(model: str) -> Plant:
 
 
 def test_the_gain_is_that_of_the_whole_riccati_equation() -> None:
-    """Of a disturbance that dies out, the Riccati equation of the whole state has a solution: SciPy's."""
+    """For a disturbance that dies out, the Riccati equation of the whole state has a solution: SciPy's."""
     plant = plant_with(LINE)
     rho = 1e-3 * float(response_at_rest(plant, 1)[0, 0] ** 2)
     P = linalg.solve_discrete_are(plant.A, plant.B, plant.C.T @ plant.C, rho * np.eye(1))

@@ -282,7 +282,7 @@ def test_a_camera_without_a_pause_loses_no_step_to_the_mirrors_clock(faster: flo
 
 
 def test_arrivals_before_a_session_are_apart_from_its_own() -> None:
-    """Of a camera that counts its frames and tells no time, which runs before the session does."""
+    """The camera counts its frames and tells no time, and it runs before the session does."""
     camera = started(bench := CameraWithoutTime())
     ends_ns = [100 * STEP_NS + (k + 1) * PERIOD_NS for k in range(-6, 2)]
     bench.taken = [

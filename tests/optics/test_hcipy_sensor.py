@@ -54,7 +54,7 @@ def measured(frames: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def expected_slopes() -> np.ndarray:
-    """Of the known wavefront, radians, (spots, 2)."""
+    """Slopes of the known wavefront, radians, (spots, 2)."""
     r = DIAMETER / 2
     return LENSLETS.mean_slopes(
         lambda p: np.sum([c * zernike_gradient(i, p / r) / r for i, c in COEFFICIENTS.items()], axis=0)

@@ -76,7 +76,7 @@ def test_dark_windows_have_no_spots_and_others_their_share_of_the_light():
 
 
 def test_the_plant_has_the_rows_of_the_lit_lenslets():
-    """Of those that are wholly lit, what it has without a pupil; a half lit one sees another part of the mirror."""
+    """The rows of wholly lit lenslets are those without a pupil; a half lit one sees another part of the mirror."""
     text = SH.toml
     a, b = text.index("pupil_m = 2.4e-3      # diameter"), text.index("slope_unit_rad")
     whole = parse_rig(text[:a] + text[b:])

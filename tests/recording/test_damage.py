@@ -230,7 +230,7 @@ def test_only_the_chunks_of_the_asked_time_and_topics_are_read(
 
 
 def test_a_channel_whose_chunk_is_lost_is_known_from_elsewhere(recorded: Session, tmp_path: Path) -> None:
-    """Of a killed session, without the index at the end: the first chunk names all the channels."""
+    """The recording is of a killed session, without the index at the end: the first chunk names all the channels."""
     data = bytearray(recorded.path.read_bytes())
     with recorded.path.open("rb") as file:
         from mcap.reader import make_reader

@@ -239,7 +239,7 @@ def test_a_picture_of_one_row(method: str) -> None:
 @pytest.mark.parametrize("method", QUICK)
 @pytest.mark.parametrize("shape", [(1, 1), (5, 1), (1, 5), (2, 2), (8, 1), (1, 6), (6, 5)])
 def test_small_pictures_are_restored_or_refused(method: str, shape: tuple[int, int]) -> None:
-    """Of less than six pixels nothing tells the noise from the scene, nor how rough it is."""
+    """In less than six pixels nothing tells the noise from the scene, nor how rough it is."""
     image = np.random.default_rng(1).random(shape)
     on_line = method in ("predictor", "filter", "lag", "smoother")
     if (shape[1] if on_line else max(shape)) < 6:

@@ -101,7 +101,7 @@ class End:
         return self.read()
 
     def write(self, data: bytes) -> Any:
-        """Of a device it is how much was taken, of a host nothing is asked."""
+        """Gives how much was taken, for a device; for a host nobody asks."""
         return self._outgoing.write(data)
 
     def fileno(self) -> int:
@@ -218,7 +218,7 @@ class Run:
 
     @property
     def first_step(self) -> int:
-        """Of the session."""
+        """First fast step of the session."""
         command = next(Recording(self.path).messages(topics.COMMAND)).message
         return must_be(pb.CommandBlock, command).first_step
 

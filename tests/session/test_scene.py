@@ -272,7 +272,7 @@ def test_recorded_estimates_are_used_and_old_results_replaced(session: Path, sha
 
 
 def test_motion_and_its_covariance_are_those_of_the_path(session: Path) -> None:
-    """Of one output the estimate's own; of a mean of spots what all of its coefficients say together."""
+    """For one output they are the estimate's own; for a mean of spots, what all of its coefficients say together."""
     estimate = reestimate(Recording(session), ["moments"])["moments"][-1]
     path, root = motion(estimate, np.eye(1), coefficient_roots(estimate))
     np.testing.assert_array_equal(path, estimate.path)

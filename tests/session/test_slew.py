@@ -38,7 +38,7 @@ def session(
     rig: Rig = RIG,
     inputs: Inputs | None = None,
 ) -> Run:
-    """Of 30 exposures, after some of which something happens; the integrator's where no inputs are given."""
+    """A session of 30 exposures, after some of which something happens; the integrator's where no inputs are given."""
     hub, left = SimulatedTimeHub(rig), dict(happens)
 
     def progress(exposures: int) -> None:

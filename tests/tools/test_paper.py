@@ -340,6 +340,6 @@ def test_the_limit_is_below_o1_and_the_estimators_of_pixels_are_near_it(page: st
     head, first = rows[0], next(row for row in rows if row[0] == "12 Hz shake, V = 0.01")
     path = dict(zip(head[1:], map(float, first[1:]), strict=True))
     assert path["sampled"] < path["o1"] < 2 * path["open-loop"]
-    # Of so few exposures a ratio has an error of some tenths; the section on o1 has the runs to tell.
+    # With so few exposures a ratio has an error of some tenths; the section on o1 has the runs to tell.
     assert path["mixture"] < path["o1"]
     assert path["profile"] < 1.3 * path["o1"]

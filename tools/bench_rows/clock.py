@@ -11,7 +11,7 @@ _SEEDS = 100
 _SESSION_S = 60.0
 _DRIFT = 200e-6
 _WALK = 1e-6 / 60**0.5
-"""Of the frequency, 1/sqrt(s)."""
+"""Random walk of the frequency, 1/sqrt(s)."""
 _JITTER_NS = 2e6
 """Mean of the exponential time that a packet takes beyond the shortest, each way."""
 _ROUND_TRIP_NS = 4e6

@@ -20,7 +20,7 @@ from bench_rows.row import Effort, Row
 _STEP_S = 0.002
 _STEPS = 10_000
 _FEW = 10
-"""Of so many steps."""
+"""Limit of the late steps in `_STEPS` steps."""
 
 
 class _AtOnce:

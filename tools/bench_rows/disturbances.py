@@ -18,11 +18,11 @@ from aolink.optics.turbulence import FrozenFlow, Layer
 STEP_S = 1e-3
 PUPIL_M = 0.5
 WINDS_M_S = (5.0, 11.0)
-"""Of the two layers, which blow in directions drawn by the seed."""
+"""Winds of the two layers, which blow in directions drawn by the seed."""
 DAMPING = 0.002
 _SHORTEST_M = PUPIL_M / 8
 _PIXELS = 16
-"""Of HCIPy's screens across the pupil."""
+"""Pixels of HCIPy's screens across the pupil."""
 _ORDER = 64
 _RIDGE = 1e-9
 _HIGHEST_HZ = 100.0
@@ -82,7 +82,7 @@ def turbulence(kind: str, sd: float, steps: int, past: int, seed: int) -> Distur
 
 @lru_cache(maxsize=16)
 def _tilt(kind: str, steps: int, seed: int) -> FloatArray:
-    """Of mean zero and sd 1, (steps,)."""
+    """Tilt of mean zero and sd 1, (steps,)."""
     random = np.random.default_rng([seed, 2])
     made = np.sum([(_waves if kind == "own" else _screen)(wind, steps, random) for wind in WINDS_M_S], axis=0)
     return np.asarray((made - made.mean()) / made.std())

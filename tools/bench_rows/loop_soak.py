@@ -65,6 +65,6 @@ def closed_loop_soak(effort: Effort) -> Row:
 
 
 def _resident_mb() -> float:
-    """Of this process, which holds the session and the writer."""
+    """Resident memory, MB, of this process, which holds the session and the writer."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

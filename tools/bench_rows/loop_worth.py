@@ -27,7 +27,7 @@ from bench_rows.row import Effort, Row
 
 GAINS = (0.1, 0.3, 0.5, 0.7, 0.9, 1.1, 1.3)
 _KERNEL_SD = 0.1 / math.sqrt(2)
-"""Of the rig `loop`, slope units."""
+"""Standard deviation of the kernel of the rig `loop`, slope units."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,12 @@ class Cell:
 
     @property
     def kinds(self) -> list[str]:
-        """Of the processes that are identified, as `aolink identify --model` names them."""
+        """Kinds of the processes that are identified, as `aolink identify --model` names them."""
         return [kind for kind, there in (("ornstein-uhlenbeck", self.turbulence), ("resonance", self.line)) if there]
 
     @property
     def sd(self) -> float:
-        """Of the path, slope units."""
+        """Standard deviation of the path, slope units."""
         return self.widths * _KERNEL_SD
 
     def disturbance(self, steps: int, past: int, seed: int) -> Disturbance:
@@ -160,7 +160,7 @@ class Measured:
 
     @property
     def goals(self) -> list[Goal]:
-        """Those of the cell, named before anything was measured."""
+        """The goals of the cell, named before anything was measured."""
         at, found = self.cell.line, []
         if not at:
             found += [Goal(name, "", 1.02) for name in self.ours]
@@ -209,7 +209,7 @@ def measured(cell: Cell, size: Size) -> Measured:
 
 
 def all_measured(cells: Sequence[Cell], short: bool) -> Iterator[Measured]:
-    """Of each cell; for a short form of the first one, with short exposures. Standard error says how long each took."""
+    """Each cell measured; for a short form the first, with short exposures. Standard error says how long each took."""
     for cell in [replace(cells[0], steps=20)] if short else cells:
         start = time.monotonic()
         yield measured(cell, SHORT if short else FULL)

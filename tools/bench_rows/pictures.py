@@ -113,7 +113,7 @@ class Quality:
 
 
 def quality(pairs: list[tuple[FloatArray, FloatArray]]) -> Quality:
-    """Of restored pictures and their scenes."""
+    """Quality of restored pictures and their scenes."""
 
     def border(image: FloatArray) -> FloatArray:
         return np.concatenate([image[:, :32], image[:, -32:]], axis=1)

@@ -27,7 +27,7 @@ class Curve:
 
     @property
     def slope(self) -> float:
-        """Of the logarithms, over the larger half of the sizes: what a power of the size the cost goes with there."""
+        """Power of the size that the cost goes with in the larger half of the sizes: the slope of the logarithms."""
         half = len(self.sizes) // 2
         x, y = np.log(self.sizes[half:]), np.log(self.costs[half:])
         return float(np.polyfit(x, y, 1)[0])

@@ -34,7 +34,7 @@ _MOST_LATE = 1e-3
 _LATE = {1e-5: 0.0, 1e-4: _MOST_LATE}
 """Share of steps that may be late in real time, by bit error rate."""
 _QUEUE = "queue_steps = 4000\nwatchdog_s = 8"
-"""Of the simulated rig in real time: four seconds, for which a busy machine may hold a program up."""
+"""Queue of the simulated rig in real time: four seconds, for which a busy machine may hold a program up."""
 _TURN_S = 0.05
 _DEVICE = Path(__file__).parents[1] / "device"
 

@@ -18,7 +18,7 @@ from bench_rows.row import Row
 
 _PACKAGES = ("aolink", "numpy", "scipy", "numba", "mcap", "protobuf", "rerun-sdk", "pyarrow", "typer", "rich")
 _LEAST_NOISE = 0.02
-"""Of a ratio, where a few runs happen to agree better than that."""
+"""Least noise of a ratio, where a few runs happen to agree better than that."""
 _SIGMAS = 2.0
 """Times the noise that a change has to be to count as one."""
 

@@ -39,7 +39,7 @@ LONG = frozenset(
         "worth_air", "worth_factors", "coverage", "following",
     }
 )  # fmt: skip
-"""Those that take two minutes or more each, `soak` forty, `closed_loop_soak` sixty.
+"""Functions that take two minutes or more each, `soak` forty, `closed_loop_soak` sixty.
 
 They are measured where they are named, or with `--long`.
 """

@@ -23,9 +23,9 @@ PICTURES = ("camera", "chelsea", "coins")
 BORDERS = ("circular", "true")
 KERNELS = Path(__file__).parents[2] / "tests" / "data" / "levin09_kernels.npz"
 _WEIGHTS = (5e-4, 1e-3, 2e-3)
-"""Of SCICO's total variation, for a data term of half the squared residual."""
+"""Weights of SCICO's total variation, for a data term of half the squared residual."""
 _PENALTIES = (0.01, 0.02, 0.05)
-"""Of its plug and play."""
+"""Penalties of SCICO's plug and play."""
 _SIZE = 256
 
 

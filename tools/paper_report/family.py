@@ -37,14 +37,14 @@ SEEDS = {"tuning": range(100_000), "reporting": range(100_000, 200_000)}
 
 MODES = (1, MOST_MODES)
 SWINGS = (0.05, MOST_SWINGS)
-"""Of a resonance, in an exposure."""
+"""Swings of a resonance in an exposure."""
 DAMPING = (0.002, 1.0)
 MEMORY = (0.1, 20.0)
 """Exposures in which an Ornstein-Uhlenbeck process forgets all but 1/e."""
 PATH_WIDTHS = (0.3, MOST_PATH_WIDTHS)
 """Sd of the path, in sds of the kernel."""
 PEAK_SNR = (LEAST_PEAK_SNR, 300.0)
-"""Of the brightest pixel of a resting spot."""
+"""Signal to noise in the brightest pixel of a resting spot."""
 STEPS = (20, 400)
 KERNEL_PIXELS = (LEAST_KERNEL_PIXELS, 4.0)
 """The kernel's sigma in the paper's convention, sqrt(2) times its sd."""
@@ -64,10 +64,10 @@ class Mode:
 
     kind: Literal["resonance", "Ornstein-Uhlenbeck", "random walk"]
     swings: float
-    """Of a resonance, in an exposure; of another, 1/(2 pi memory in exposures); of a random walk 0."""
+    """Swings of a resonance in an exposure; of another, 1/(2 pi memory in exposures); of a random walk 0."""
     damping: float
     sd: float
-    """Of what it adds to the path, slope units; of a random walk, what it gains in the whole run."""
+    """Standard deviation of what it adds to the path, slope units; of a random walk, what it gains in the whole run."""
     direction: float
     """In which it moves a spot on a plane, if one plant moves it along both axes, rad."""
 

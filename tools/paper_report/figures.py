@@ -350,5 +350,5 @@ def figure_family(path: Path, given: Sequence[Row], dpi: int) -> None:
 
 
 def _swings(seed: int) -> float:
-    """Of a random walk, which has none, the least of the family."""
+    """Swings of the fastest mode in an exposure; for a random walk, which has none, the least of the family."""
     return max(draw(seed).swings, SWINGS[0] / 5)

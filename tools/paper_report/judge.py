@@ -34,7 +34,7 @@ class Size:
 
     runs: int = 24
     exposures: int = 24
-    """Of each run; a random walk gains its sd over these."""
+    """Exposures of each run; a random walk gains its sd over these."""
     skip: int = 4
     """Exposures at the start that are not scored."""
     pixel_runs: int = 24
@@ -58,7 +58,7 @@ class Row:
     seed: int
     estimator: str
     states: int
-    """Of the plant, the degrees of freedom of ``nees``."""
+    """States of the plant, the degrees of freedom of ``nees``."""
     scored: int
     """Exposures, of all runs."""
     path: list[float]
@@ -72,7 +72,7 @@ class Row:
     statuses: dict[str, int]
     """Exposures by their status."""
     seconds: float
-    """Of the processor, for an exposure of one run."""
+    """Time of the processor, s, for an exposure of one run."""
 
 
 def stratified(seeds: Sequence[int], count: int) -> list[int]:
@@ -177,9 +177,9 @@ class Plan:
     scenes: int = 200
     """By all but the slow ones; the first of the reporting seeds."""
     pixel_scenes: int = 40
-    """Of these, by `profile` and `mixture`, stratified."""
+    """How many of these scenes are judged by `profile` and `mixture`, stratified."""
     limit_scenes: int = 18
-    """Of those, by `sampled`."""
+    """How many of those scenes are judged by `sampled`."""
     size: Size = field(default_factory=lambda: Size(pixel_runs=6))
 
 

@@ -37,7 +37,7 @@ class Found:
     end: float
     """RMS of the end state's norm."""
     nees: float
-    """Of the end state, over its number of states."""
+    """NEES of the end state, over its number of states."""
     nees_low: float
     nees_high: float
     """95 % bounds of that for errors that are independent from exposure to exposure."""
@@ -48,7 +48,7 @@ class Found:
     time_ms: float
     """For an axis and exposure."""
     single: tuple[float, float, float]
-    """Of exposures in which `profile` saw one reading of the blur: their share, the distance and the NEES there."""
+    """Exposures in which `profile` saw one reading of the blur: their share, the distance and the NEES there."""
 
 
 @dataclass(frozen=True)

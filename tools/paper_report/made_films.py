@@ -47,7 +47,7 @@ class Kind:
     frames: int
     """In an exposure."""
     periods: float = 0.0
-    """Of the vibration in an exposure; 0: a random walk."""
+    """Periods of the vibration in an exposure; 0: a random walk."""
     lasts: float = 0.0
     """Periods until the vibration's amplitude is forgotten."""
 

@@ -30,11 +30,11 @@ class Effort:
 
     noise_frames: int = 200_000
     runs: int = 120
-    """Of each table."""
+    """Runs of each table."""
     exposures: int = 40
-    """Of each run, the first ``skip`` of which are not scored."""
+    """Exposures of each run, the first ``skip`` of which are not scored."""
     cycle_exposures: int = 65
-    """Of runs with the slow input: ``skip`` and half a period, to one side and back."""
+    """Exposures of runs with the slow input: ``skip`` and half a period, to one side and back."""
     skip: int = 15
     map_runs: int = 200
     shake_runs: int = 200
@@ -42,18 +42,18 @@ class Effort:
     limit_exposures: int = 14
     limit_skip: int = 4
     o1_runs: int = 60
-    """Of each scene without the sampler."""
+    """Runs of each scene without the sampler."""
     o1_exposures: int = 24
     film_frames: tuple[int, ...] = (8, 12, 24)
     film_exposures: int | None = None
-    """Of each length, so many; all that the film has if None."""
+    """So many exposures of each length; all that the film has if None."""
     made_kinds: tuple[int, int] = (0, 11)
     """Which kinds of made films, from the first to before the second."""
     made_seeds: int = 5
     made_exposures: int = 14
     family: Plan = field(default_factory=Plan)
     particles: int = 1500
-    """Of the sampler."""
+    """Particles of the sampler."""
     offsets: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     densities: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003, 0.001)
     process_noises: tuple[float, ...] = (0.1, 1.0, 10.0)
@@ -197,7 +197,7 @@ class Norms:
 
     reading: str
     state_rms: float
-    """Of the state itself about its mean, in closed form."""
+    """Root mean square of the state itself about its mean, in closed form."""
     state_mean: float
     rms: dict[str, Measured]
     """By estimator."""
@@ -264,7 +264,7 @@ class ErrorRow:
     noise_density: float
     offset: float
     expected: float
-    """Of open loop, by the stationary covariance."""
+    """RMSE of open loop, by the stationary covariance."""
     rmse: dict[str, Measured]
     gain: Measured
     """o3/o1."""

@@ -60,7 +60,7 @@ def passive_output(model: ExposureModel, inputs: FloatArray, state: FloatArray, 
     Parameters
     ----------
     model:
-        Of a plant with one axis and one output.
+        Model of a plant with one axis and one output.
     inputs:
         At the operating point, (n_steps, n_inputs).
     state:

@@ -58,7 +58,7 @@ def degraded(noise_variance: float, seed: int) -> FloatArray:
 
 
 def first_order_correlation() -> float:
-    """Of neighbours along a line: z in R(z, i) is a share of the line's 32 pixels."""
+    """Correlation of neighbours along a line: z in R(z, i) is a share of the line's 32 pixels."""
     return math.exp(-4.35 / 32)
 
 

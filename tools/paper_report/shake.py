@@ -36,7 +36,7 @@ class ShakeRow:
     ratio: Measured
     """moments/o1, paired."""
     nees: Measured
-    """Of the end state by `moments`; 2 where its covariance is right."""
+    """NEES of the end state by `moments`; 2 where its covariance is right."""
     nees_open_loop: Measured
     """The same by prediction alone, whose covariance is right: how far 2 is to be trusted in so many runs."""
 

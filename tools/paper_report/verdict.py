@@ -77,7 +77,7 @@ class Bound:
 
 
 def family_ratio(rows: Rows, name: str, reference: str) -> Bound | None:
-    """That ratio, by bootstrap over scenes and over the runs of each; None without scenes."""
+    """The ratio over the family, by bootstrap over scenes and over the runs of each; None without scenes."""
     pairs = list(squares(rows, name, reference).values())
     if not pairs:
         return None

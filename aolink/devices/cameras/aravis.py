@@ -114,7 +114,7 @@ class AravisCamera:
         self._running = False
         self._start_ns = 0
         self._before: tuple[int, int, int] | None = None
-        """Of the frame before: its id as the camera has it, its number without wrapping, and its time, ns."""
+        """The frame before: its id as the camera has it, its number without wrapping, and its time, ns."""
         try:
             self._camera = self._do("arv_camera_new", self._address.encode(), to="be opened")
             self._device = self._aravis("arv_camera_get_device", self._camera)

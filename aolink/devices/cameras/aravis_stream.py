@@ -90,7 +90,7 @@ class PictureStream:
         )
 
     def pictures(self) -> Iterator[Picture]:
-        """Those that have arrived since the last call. Raises DeviceError for one of another size or format."""
+        """The pictures that have arrived since the last call. Raises DeviceError for one of another size or format."""
         while buffer := self._aravis("arv_stream_try_pop_buffer", self._stream):
             memory = self._memory.pop(buffer)
             self._offer()

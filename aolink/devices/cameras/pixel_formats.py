@@ -81,4 +81,4 @@ PIXEL_FORMATS = {
         PixelFormat("Mono16", 0x01100007, 16, 16),
     )
 }
-"""Those that a driver may ask a camera for, by name, packed ones before others of as many bits."""
+"""Pixel formats that a driver may ask a camera for, by name, packed ones before others of as many bits."""

@@ -30,7 +30,7 @@ _LIMIT_DEG = 50.0
 _LIMIT = math.tan(math.radians(_LIMIT_DEG))
 """Tangent of the optical angle at the edge of the unit circle."""
 _DECIMALS = 6
-"""Of a coordinate: a step of a millionth of the range, below what the mirror repeats."""
+"""Decimals of a coordinate: a step of a millionth of the range, below what the mirror repeats."""
 _LEAVE_PRO_MODE = bytes.fromhex("7e 00 06 02 0000 0000 7e") + b"\r\n"
 """A frame of the Pro mode, where the maker's programs leave the driver: go to the Simple mode. A driver that is there
 already takes it for a command that it does not know."""

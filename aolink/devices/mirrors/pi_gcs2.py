@@ -46,7 +46,7 @@ _MOST_LINES = 100
 _QUIET_S = 0.05
 """A line on which nothing has come for so long has no late answers on it."""
 _DECIMALS = 6
-"""Of a position: below what the stages resolve, in micrometres, microradians and milliradians."""
+"""Decimals of a position: below what the stages resolve, in micrometres, microradians and milliradians."""
 
 
 class PiMirror:
@@ -63,7 +63,7 @@ class PiMirror:
         Position for an input of one, less the position for zero, and the latter; in the controller's units. One number,
         or a list of one for each input.
     baud_rate:
-        Of a serial port.
+        Baud rate of a serial port.
     """
 
     lacks: ClassVar[tuple[Lacks, ...]] = (Lacks.READ_BACK, Lacks.WATCHDOG)

@@ -46,7 +46,7 @@ class AptUnit:
     Parameters
     ----------
     address:
-        Of the cube, or of the bay.
+        Address of the cube, or of the bay.
 
     Raises
     ------

@@ -22,7 +22,7 @@ class Gaussian:
     """(axes, n, n)"""
 
     def part(self, axes: slice | Indices) -> Gaussian:
-        """Those of some axes."""
+        """The Gaussians of some axes."""
         return Gaussian(self.mean[axes], self.covariance[axes])
 
     def with_noise(self, size: int) -> Gaussian:

@@ -37,7 +37,7 @@ def path_from_coefficients(
     Parameters
     ----------
     coefficients:
-        Of ``model.basis``, (axes, n_states) or more of its columns.
+        Coefficients of ``model.basis``, (axes, n_states) or more of its columns.
     covariance:
         Covariance of the coefficients, (axes, n, n).
     inputs:

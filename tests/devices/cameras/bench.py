@@ -18,7 +18,7 @@ from aolink.rig import Rig, load_rig, parse_rig
 from aolink.session import Report, record
 
 EXPOSURE_STEPS = 40
-"""Of a millisecond; frame after frame, so that a session is short."""
+"""Fast steps of an exposure, of a millisecond each; frame after frame, so that a session is short."""
 BITS_8 = {"bit_depth": (16, 8), "black_level": (20000, 60), "counts_per_density": (2000, 5)}
 """The rig's sensor with 8 bits."""
 

@@ -39,7 +39,7 @@ class SerialMirror:
     make: Callable[..., SerialDevice]
     """Makes its simulator, with ``faults``."""
     keys: str
-    """Of ``[devices.mirror]``, without the port."""
+    """Keys of ``[devices.mirror]``, without the port."""
     inputs: Callable[[NDArray[np.float64]], NDArray[np.float64]]
     """The rig's inputs, (2,), from what its simulator holds."""
 

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 FAKE, RELAY = "127.0.0.1", "127.0.0.2"
 CONTROL_PORT = 3956
 FIRST_ID = 65401
-"""Of the fake camera's first frame: it crosses the end of 16 bits soon, on purpose."""
+"""Id of the fake camera's first frame: it crosses the end of 16 bits soon, on purpose."""
 RESTART_ID = 30_000
 LIBRARY = "libaravis-0.8.so.0"
 WRITE_REGISTER, RESEND = 0x0082, 0x0040

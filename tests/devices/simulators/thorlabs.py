@@ -20,7 +20,7 @@ class AptDevice(SerialDevice):
     Parameters
     ----------
     addresses:
-        Of a cube, or of the bays.
+        Addresses of a cube, or of the bays.
     reports:
         Sent before each answer: a status update that another program has asked for, and that nobody stopped.
     complains_at:

@@ -50,7 +50,7 @@ def values(sensor: Sensor, counts: np.ndarray, orders: Sequence[int] = (1, 2), f
 
 @given(centre=st.floats(-0.4, 0.4), swing=st.floats(0, 0.3), turns=st.floats(0.1, 3))
 def test_moments_are_those_of_the_path(centre, swing, turns):
-    """Of a finely sampled path, by a kernel that pixels resolve, with the kernel taken out."""
+    """The moments of a finely sampled path, by a kernel that pixels resolve, with the kernel taken out."""
     path = centre + swing * np.sin(2 * np.pi * turns * np.linspace(0, 1, 200))
     sensor = dataclasses.replace(FINE, kernel=dataclasses.replace(FINE.kernel, sigma=0.09))
     expected = [np.mean(path**p) for p in (1, 2, 3, 4)]

@@ -68,7 +68,7 @@ def test_a_path_that_nothing_is_known_of_has_their_whole_variance(rig: Rig) -> N
         covariance[:, : plant.n_states, : plant.n_states] = plant.initial_covariance
         variances.append(model.path_sd(covariance)[0] ** 2)
     added = variances[0] - variances[1]
-    # Of the process noise the dense basis leaves 2 % (rms) out, the factored one nothing.
+    # The dense basis leaves 2 % (rms) of the process noise out, the factored one nothing.
     np.testing.assert_allclose(added.mean(axis=1), 0.04**2, rtol=0.02)
 
 

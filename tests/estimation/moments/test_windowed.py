@@ -269,7 +269,7 @@ def test_a_frame_without_a_spot_is_refused():
 
 
 def test_shot_noise_by_the_rig_file_is_allowed_for():
-    """Of 300 photo-electrons there is more noise than the camera's own; without allowing for it, NEES shows it."""
+    """With 300 photo-electrons there is more noise than the camera's own; without allowing for it, NEES shows it."""
     sensor = dataclasses.replace(SENSOR, noise_density=1e-4, photoelectrons=300.0)
     plant = dataclasses.replace(
         RIG.plant, process_noise=np.array([[0.5]]), initial_covariance=RIG.plant.initial_covariance / 20

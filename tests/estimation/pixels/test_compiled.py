@@ -248,7 +248,7 @@ def test_the_innovation_is_that_of_the_twin(pair):
     prior = view.reduced.prior(state)
     found = find_modes(view, prior, whitened(prior, broad(view, prior).mean[:, None]))
     ours, theirs = (innovation(each, prior, found) for each in (view, in_numpy))
-    # Of a direction of next to no information it is the noise along any direction of the pixels.
+    # In a direction of next to no information, the innovation is the noise along any direction of the pixels.
     information = np.einsum("aii->ai", theirs.covariance) - 1
     tells = information > 1e-5 * information[:, :1]
     np.testing.assert_allclose(ours.value[tells] ** 2, theirs.value[tells] ** 2, rtol=0.02, atol=0.02)

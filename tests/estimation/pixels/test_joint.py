@@ -59,7 +59,7 @@ class Frame:
     exposure: Exposure
     windows: SpotWindows
     prior: Gaussian
-    """Of the state, (1, n_states)."""
+    """Prior of the state, (1, n_states)."""
 
     @property
     def response(self):

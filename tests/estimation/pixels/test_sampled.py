@@ -85,7 +85,7 @@ def functions(view, t):
 
 
 def ranks(count, particles, seed=5):
-    """Of the truth among thinned particles, for paths drawn from the prior itself: uniform if the sampler is right."""
+    """Ranks of the truth among thinned particles, for paths drawn from the prior: uniform if the sampler is right."""
     rng = np.random.default_rng(seed)
     rig = dataclasses.replace(RIG, sensor=dataclasses.replace(RIG.sensor, noise_density=0.003))
     reduced = likelihood.reduction(MODEL, rig.sensor, left_out=0.1)

@@ -406,7 +406,7 @@ def test_where_few_points_count_others_are_tempered(updates, monkeypatch):
 @pytest.mark.parametrize("updates", [PROFILE, MIXTURE])
 @pytest.mark.parametrize("temper", [False, True])
 def test_the_posterior_of_a_single_coefficient_is_an_integral_over_a_line(updates, temper, monkeypatch):
-    """Of one state without process noise the posterior is an integral over a line."""
+    """For one state without process noise, the posterior is an integral over a line."""
     noise = 0.0 * RIG.plant.process_noise
     one = np.ones((1, 1))
     plant = dataclasses.replace(
