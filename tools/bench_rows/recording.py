@@ -191,19 +191,19 @@ def recording_rate(effort: Effort) -> Row:
     return Row("recording small messages", f"{mine:.0f} k/s", f"mcap's writer {theirs:.0f} k/s", mine / theirs, 0.8)
 
 
-def record_long(path: Path, exposures: int) -> None:
-    """A recording of many exposures, made from a short one played again and again."""
+def record_long(path: Path, exposures: int, name: str = "section-vi-lively") -> None:
+    """A recording of many exposures of 200 steps, made from a short one played again and again."""
     import aolink
     from aolink.assembly import Frame
     from aolink.recording import convert, topics
     from aolink.recording.writer import RecordingWriter
     from aolink.wire import messages_pb2 as pb
 
-    rig = load_rig("section-vi-lively")
-    some = aolink.simulate(rig, 100)
+    rig = load_rig(name)
+    some = aolink.simulate(rig, min(100, exposures))
     with RecordingWriter(path, rig, {}, 0, deterministic=True) as writer:
         for k in range(exposures):
-            each, first, now = some[k % 100], 200 * k, 200_000_000 * k
+            each, first, now = some[k % len(some)], 200 * k, 200_000_000 * k
             applied = pb.Applied(first_step=first, n_steps=200, u=each.inputs.ravel())
             frame = Frame(
                 frame_id=k + 1, first_step=first, last_step=first + 199, pixels=each.pixels, mask=each.mask,
@@ -215,14 +215,18 @@ def record_long(path: Path, exposures: int) -> None:
                 writer.write(topic, message, now)
 
 
-def reestimation_rate(effort: Effort) -> Row:
-    """o3 over a recording, against reading the same file and decoding its frames, no more."""
+def reestimation_rate(effort: Effort) -> list[Row]:
+    """o3 over a recording of one axis and of 32, against reading the same file and decoding its frames, no more."""
+    one = _reestimated("re-estimation with o3", "section-vi-lively", effort.of(1500), effort)
+    return [one, _reestimated("re-estimation with o3 of 32 axes", "sh-4x4", effort.of(500), effort)]
+
+
+def _reestimated(figure: str, name: str, count: int, effort: Effort) -> Row:
     from aolink.recording import convert
     from aolink.recording.reestimate import reestimate
 
     with tempfile.TemporaryDirectory() as folder:
-        count = effort.of(1500)
-        record_long(Path(folder) / "a.mcap", count)
+        record_long(Path(folder) / "a.mcap", count, name)
         recording = Recording(Path(folder) / "a.mcap")
 
         def read() -> None:
@@ -236,7 +240,7 @@ def reestimation_rate(effort: Effort) -> Row:
         estimating, reading = median_s(lambda: reestimate(recording, ["o3"]), effort.of(15), read)
         skipping = median_s(lambda: sum(1 for _ in recording.messages(topics.IMAGE, topics.EXPOSURE)), effort.of(5))[0]
     return Row(
-        "re-estimation with o3",
+        figure,
         f"{count / estimating:.0f} frames/s",
         f"reading {count / reading:.0f}; past the mirror's reports {count / skipping:.0f}",
         reading / estimating,
