@@ -12,8 +12,7 @@ from aolink.estimation.alignment import Shifted, considered, matters, share_of_s
 from aolink.estimation.batch import Batch
 from aolink.estimation.estimate import Estimate, Status, in_single_precision
 from aolink.estimation.frames.measure import Measured, Measurements
-from aolink.estimation.kalman.filter import Filter, Posterior
-from aolink.estimation.kalman.two_states import Run
+from aolink.estimation.kalman.filter import Filter, Posterior, Run
 from aolink.exposure import Exposure
 from aolink.rig import Rig
 

@@ -153,7 +153,9 @@ def _paper(*orders: int) -> Callable[[Rig, Options], Filter]:
             return _blur_filter(rig, options, SecondOrderMoments(rig.plant, orders, flux=options.flux))
         moments = PathMoments(rig.plant, orders, gain, flux=options.flux)
         if orders == (1, 2) and TwoStateFilter.suits(rig.plant):
-            return TwoStateFilter(rig.plant, moments, process_noise=options.process_noise, gate=options.gate)
+            two = TwoStateFilter(rig.plant, moments, process_noise=options.process_noise, gate=options.gate)
+            two.warm_up(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset))
+            return two
         return _blur_filter(rig, options, moments)
 
     return build

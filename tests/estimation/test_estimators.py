@@ -367,9 +367,10 @@ def test_it_does_not_matter_how_many_exposures_are_handed_over_at_once(name, flu
         assert first_difference(expected, theirs[1]) is None
 
 
-def test_the_loop_over_numbers_is_the_filter_in_arrays():
+@pytest.mark.parametrize("name", ["section-vi-lively", "sh-4x4"])
+def test_the_compiled_loop_is_the_filter_in_arrays(name):
     """Bit for bit, with exposures that are refused, one that is not a number, and a gap."""
-    rig = load_rig("section-vi-lively")
+    rig = load_rig(name)
     some = list(simulate(rig, 60, seed=5))
     for k in (20, 40, 41, 42, 43):
         some[k] = dataclasses.replace(some[k], pixels=some[k - 7].pixels[:, ::-1].copy())

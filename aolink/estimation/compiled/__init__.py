@@ -29,6 +29,7 @@ from aolink.estimation import compiled, make_estimator
 from aolink.rig import load_rig
 
 compiled.compiles_itself = True
+make_estimator(load_rig("section-vi-lively"), "o3")
 make_estimator(load_rig("section-vi-lively"), "mixture")
 make_estimator(load_rig("tip-tilt"), "mixture")
 make_estimator(load_rig("membrane-12x12"), "profile")

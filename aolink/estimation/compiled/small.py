@@ -25,6 +25,11 @@ def compiled_sums(function: Callable[..., Any]) -> Any:
     return _compiled(function, {"contract", "arcp", "reassoc", "nsz"})
 
 
+def compiled_exactly(function: Callable[..., Any]) -> Any:
+    """The same for a function that gives the bits that the interpreter gives: no product is fused with a sum."""
+    return _compiled(function, set())
+
+
 def _compiled(function: Callable[..., Any], freedom: set[str]) -> Any:
     options: Any = {"nogil": True, "error_model": "numpy", "fastmath": freedom}
     try:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from aolink.errors import EstimatorError
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile
 from aolink.estimation.frames.moments import least_significance, measure_moments, spot_significance
-from aolink.estimation.frames.spots import measure_spots
+from aolink.estimation.frames.spots import measure_spots, moments_of_frames
 from aolink.exposure import Exposure
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.rig import Rig
@@ -24,7 +25,8 @@ Measured = tuple[FrameData | None, str]
 class Measurements:
     """What an estimator needs of each of some exposures, the same bits as for each alone.
 
-    Frames of a line sensor without a flaw are measured all at once, the others one by one on demand.
+    Frames without a flaw of a line sensor, or of spots with a copy of the plant for each slope, are measured all at
+    once, the others one by one on demand.
     """
 
     def __init__(self, rig: Rig, exposures: Sequence[Exposure], needs: Needs | None) -> None:
@@ -33,21 +35,30 @@ class Measurements:
         """Row of each exposure in ``moments``, -1 where it has none."""
         self.moments: Measurement | None = None
         sensor = rig.sensor
-        if needs is None or needs.what != "moments" or not (isinstance(sensor, Sensor) and sensor.shape[0] == 1):
+        self._axes = rig.plant.axes if isinstance(sensor, SpotSensor) else 1
+        if needs is None or needs.what != "moments" or rig.plant.n_outputs > 1:
             return
         shape = sensor.shape
-        sized = [k for k, each in enumerate(exposures) if each.pixels.shape == shape == each.mask.shape]
-        if not sized:
+        whole = [
+            k
+            for k, each in enumerate(exposures)
+            if each.slopes is None and each.pixels.shape == shape == each.mask.shape and each.mask.all()
+        ]
+        if not whole:
             return
-        pixels = np.concatenate([exposures[k].pixels for k in sized])
-        whole = np.concatenate([exposures[k].mask for k in sized]).all(axis=1)
-        lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
-        good = np.flatnonzero(whole & lit & ~is_saturated(sensor, pixels).any(axis=1))
-        moments = measure_moments(sensor, pixels[good], needs.orders, needs.flux) if len(good) else ""
-        if isinstance(moments, Measurement):
+        if isinstance(sensor, SpotSensor):
+            frames = np.stack([exposures[k].pixels for k in whole])
+            good, moments = moments_of_frames(sensor, frames, needs, _least_significance(sensor))
+        elif shape[0] == 1:
+            good, moments = _moments_of_lines(
+                sensor.profile, np.concatenate([exposures[k].pixels for k in whole]), needs
+            )
+        else:
+            return
+        if moments is not None:
             self.moments = moments
             for row, k in enumerate(good.tolist()):
-                self.rows[sized[k]] = row
+                self.rows[whole[k]] = row
 
     def __getitem__(self, k: int) -> Measured:
         """What was measured of exposure k, or None; and a remark."""
@@ -57,9 +68,18 @@ class Measurements:
         return self.some(row, row + 1), ""
 
     def some(self, row: int, end: int) -> Measurement:
-        """Moments in some rows."""
+        """Moments in some rows, each of all axes."""
         assert self.moments is not None
-        return Measurement(value=self.moments.value[row:end], covariance=self.moments.covariance[row:end])
+        some = slice(row * self._axes, end * self._axes)
+        return Measurement(value=self.moments.value[some], covariance=self.moments.covariance[some])
+
+
+def _moments_of_lines(sensor: Sensor, pixels: NDArray[np.uint16], needs: Needs) -> tuple[Indices, Measurement | None]:
+    """Which frames of a line sensor, (frames, pixels), show a spot without a flaw, and the moments of these."""
+    lit = spot_significance(sensor, to_density(sensor, pixels)) >= least_significance(sensor)
+    good = np.flatnonzero(lit & ~is_saturated(sensor, pixels).any(axis=1))
+    moments = measure_moments(sensor, pixels[good], needs.orders, needs.flux) if len(good) else ""
+    return good, moments if isinstance(moments, Measurement) else None
 
 
 def measure(rig: Rig, exposure: Exposure, needs: Needs | None) -> Measured:

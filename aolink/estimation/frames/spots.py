@@ -22,7 +22,7 @@ from aolink.estimation.frames.moments import (
     spot_significance,
 )
 from aolink.estimation.frames.plane_moments import measure_moments_2d
-from aolink.numerics.arrays import BoolArray, FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import effective_noise_density, is_saturated, to_density
 from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import Sensor, SpotSensor
@@ -42,24 +42,49 @@ class Profiles:
 def profiles(sensor: SpotSensor, pixels: NDArray[np.uint16], usable: BoolArray) -> Profiles:
     """Sums of each window over its rows (x) and over its columns (y); both arguments are (rows, columns)."""
     # 256 counts of 16 bits, which a window has at most along a side, make a sum that single precision holds exactly.
-    counts = _summed(sensor, pixels.astype(np.float32))
+    counts = _summed(sensor, pixels[None].astype(np.float32))
     if usable.all():
         return Profiles(counts=counts, mask=np.ones_like(counts, dtype=bool))
-    mask = _summed(sensor, (~usable).astype(np.float32)) == 0
+    mask = _summed(sensor, (~usable)[None].astype(np.float32)) == 0
     return Profiles(counts=np.where(mask, counts, 0.0), mask=mask)
 
 
 def _summed(sensor: SpotSensor, light: NDArray[np.float32]) -> FloatArray:
-    """Sums of each window over its rows and over its columns, (n_outputs, pixels)."""
-    (rows, columns), (height, width) = sensor.grid, sensor.window
-    sums = np.empty((width, rows, columns, 2))
-    sums[..., 0] = np.add.reduce(light.reshape(rows, height, columns, width), axis=1).transpose(2, 0, 1)
+    """Sums of each window of frames over its rows and over its columns, (frames * n_outputs, pixels)."""
+    (rows, columns), (height, width), frames = sensor.grid, sensor.window, len(light)
+    sums = np.empty((width, frames, rows, columns, 2))
+    sums[..., 0] = np.add.reduce(light.reshape(frames, rows, height, columns, width), axis=2).transpose(3, 0, 1, 2)
     # As a product: NumPy takes several times as long to sum over a short last axis.
-    along_rows = light.reshape(-1, width) @ np.ones(width, np.float32)
-    sums[..., 1] = along_rows.reshape(rows, height, columns).transpose(1, 0, 2)
+    along_rows = light.reshape(frames, -1, width) @ np.ones(width, np.float32)  # frame by frame: on one thread
+    sums[..., 1] = along_rows.reshape(frames, rows, height, columns).transpose(2, 0, 1, 3)
     if sensor.light is not None:
-        sums = sums.reshape(width, -1, 2)[:, sensor.lit]
+        sums = sums.reshape(width, frames, -1, 2)[:, :, sensor.lit]
     return sums.reshape(width, -1).T
+
+
+def moments_of_frames(
+    sensor: SpotSensor, frames: NDArray[np.uint16], needs: Needs, least_significance: FloatArray | float
+) -> tuple[Indices, Measurement | None]:
+    """Which of some frames show all spots without a flaw, and the moments of these, a row for each output of each.
+
+    Parameters
+    ----------
+    frames:
+        (frames, rows, columns), of which all pixels arrived.
+    """
+    line, count = sensor.profile, len(frames)
+    counts = _summed(sensor, frames.astype(np.float32))
+    lit = spot_significance(line, to_density(line, counts)).reshape(count, -1) >= least_significance
+    if needs.flux == "measured":
+        lit &= _enough_light(line, counts).reshape(count, -1)
+    good = np.flatnonzero(lit.all(axis=1) & ~is_saturated(sensor, frames).any(axis=(1, 2)))
+    if len(good) < count:
+        counts = counts.reshape(count, -1, line.pixels)[good].reshape(-1, line.pixels)
+    if not len(good):
+        return good, None
+    light = None if sensor.spot_light is None else np.tile(np.repeat(sensor.spot_light, 2), len(good))
+    moments = measure_moments(line, counts, needs.orders, needs.flux, light)
+    return good, moments if isinstance(moments, Measurement) else None
 
 
 def measure_spots(

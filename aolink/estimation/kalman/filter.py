@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from aolink.estimation.compiled import two_states
 from aolink.estimation.estimate import Components, Status
 from aolink.estimation.frames.frame_data import Measurement, Needs
-from aolink.estimation.kalman import two_states
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.estimation.kalman.path_moments import Observation
 from aolink.estimation.kalman.predict import Noise, Predict, added_noise, predict, predicted_mean
@@ -63,6 +63,19 @@ class Posterior:
         return Gaussian(self.coefficients.mean[:, :n], self.coefficients.covariance[:, :n, :n])
 
 
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Posteriors of consecutive exposures, as in `Posterior`; arrays are (exposures, axes, ...)."""
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    end: FloatArray
+    end_covariance: FloatArray
+    innovation: FloatArray
+    innovation_covariance: FloatArray
+    nis: FloatArray
+
+
 class Filter(ABC):
     """A recursive filter for one rig: it is given what it needs of each exposure and gives that one's posterior."""
 
@@ -79,7 +92,7 @@ class Filter(ABC):
     def step(self, model: ExposureModel, response: InputResponse, measured: Any | None) -> Posterior:
         """Predict over one exposure and update with what was measured of it; only predict where that is None."""
 
-    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> Run | None:
         """`step` for several exposures at once where the filter can, otherwise None."""
         return None
 
@@ -211,41 +224,75 @@ def gate_status(used: BoolArray, lost: BoolArray, missed: IntArray) -> tuple[Int
 
 
 class TwoStateFilter(BlurFilter):
-    """o3 of one axis with two states: a series of exposures is one loop over numbers, to the same bits."""
+    """o3 of plants with two states and one output: a series of exposures is one compiled loop, to the same bits."""
 
     @staticmethod
     def suits(plant: Plant) -> bool:
         """Whether a plant is of this size."""
-        return (plant.axes, plant.n_states, plant.n_outputs) == (1, 2, 1)
+        return (plant.n_states, plant.n_outputs) == (2, 1)
 
-    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> two_states.Run | None:
-        """`step` for exposures without a gap between them, all at once and to the same bits, up to the first that is
-        gated or not finite; None if that is the first of all.
+    def warm_up(self, model: ExposureModel) -> None:
+        """Load what `run` needs, or compile it, before the session."""
+        nothing = Measurement(value=np.zeros((0, 2)), covariance=np.zeros((0, 2, 2)))
+        self.run(
+            model,
+            model.response(np.zeros((model.n_steps, self.plant.axes * self.plant.n_inputs))).of(slice(0)),
+            nothing,
+        )
+
+    def run(self, model: ExposureModel, responses: InputResponse, measured: Measurement) -> Run | None:
+        """`step` for exposures without a gap between them, all at once and to the same bits, up to the first of which
+        an axis is gated or not finite; None if that is the first of all.
 
         Parameters
         ----------
         responses, measured:
-            One row for each exposure.
+            A row for each axis of the first exposure, then of the second.
         """
-        if self._missed[0]:
+        if self._missed.any():
             return None
-        noise, prior = added_noise(model, self._process_noise), self.prior
-        state, covariance = prior.mean[0], prior.covariance[0]
-        done = two_states.run(
-            model, noise, state, covariance, responses, measured.value, measured.covariance, self._gate
-        )
-        count = len(done.nis)
+        from aolink.estimation.compiled import two_state_runs  # not before an estimator needs it
+
+        shape = (len(measured.value) // self.plant.axes, self.plant.axes)
+
+        def series(values: FloatArray) -> FloatArray:
+            """(exposures * axes, ...) as (exposures, axes, ...)."""
+            return np.ascontiguousarray(values.reshape(*shape, *values.shape[1:]))
+
+        R = measured.covariance[:, 0] if measured.covariance.ndim == 4 else measured.covariance
+        P = np.broadcast_to(self.prior.covariance, (self.plant.axes, 2, 2))
+        state, unseen = (np.array(each, order="C") for each in (self.prior.mean, self._unseen.mean))
+        covariance, table = np.ascontiguousarray(_upper(P)), np.empty((*shape, two_state_runs.NUMBERS))
+        count = two_state_runs.run(
+            np.array(model.transition), np.array(two_states.weights_of(model.transition)), np.array(model.mean_row[0]),
+            np.array(model.quadratic[0]), _upper(added_noise(model, self._process_noise)),
+            series(responses.mean[:, 0]), series(responses.slope[:, 0]), series(responses.square[:, 0]),
+            series(responses.end), series(measured.value), series(_upper(R)), self._gate, state, covariance, unseen,
+            table,
+        )  # fmt: skip
         if not count:
             return None
-        self.prior = Gaussian(done.end[-1], done.end_covariance[-1])
-        settled = None if self._settled_under is model.transition else _SETTLED
-        before = self._unseen
-        mean, covariance, is_settled = two_states.unseen(
-            model, before.mean[0], before.covariance[0], responses.end[:count], settled
-        )
-        self._unseen = Gaussian(mean[None], covariance[None])
-        self._settled_under = model.transition if is_settled else None
-        return done
+        table = table[:count]
+        self.prior = Gaussian(state, covariance[:, _SQUARE])
+        for _ in range(count):  # its covariance is one for all axes, and soon no longer changes
+            if model.transition is self._settled_under:
+                break
+            self._predict_unseen(model.transition, model.process_noise, np.zeros_like(unseen))
+        self._unseen = Gaussian(unseen, self._unseen.covariance)
+        return Run(
+            coefficients=table[..., :2], covariance=table[..., _SQUARE + 2], end=table[..., 9:11],
+            end_covariance=table[..., _SQUARE + 11], innovation=table[..., 14:],
+            innovation_covariance=table[..., _SQUARE + 5], nis=table[..., 8],
+        )  # fmt: skip
+
+
+_SQUARE = np.array([[0, 1], [1, 2]])
+"""Where the entries of a symmetric matrix are in its upper half."""
+
+
+def _upper(matrices: FloatArray) -> FloatArray:
+    """Upper halves of symmetric matrices, (..., 2, 2) -> (..., 3)."""
+    return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
 
 
 def _without(done: Update, usable: BoolArray | None) -> Update:

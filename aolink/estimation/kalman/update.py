@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from aolink.estimation.kalman import information_form, two_states
+from aolink.estimation.compiled import two_states
+from aolink.estimation.kalman import information_form
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.numerics import batched, entrywise
 from aolink.numerics.arrays import FloatArray
@@ -126,7 +127,7 @@ def two_state_update(prior: Gaussian, innovation: list[Entry], H: entrywise.Matr
     (p, q), (_, r) = entrywise.unpack(prior.covariance)
     (first, shared), (_, rest) = entrywise.unpack(R)
     x, v, p, q, r, s, both, t, nis = two_states.update(
-        entrywise.columns(prior.mean), (p, q, r), innovation, H, (first, shared, rest), together=bool(np.any(shared))
+        entrywise.columns(prior.mean), (p, q, r), innovation, H, (first, shared, rest), bool(np.any(shared))
     )
     after = Gaussian(entrywise.pack_vector([x, v], axes), entrywise.pack([[p, q], [q, r]], axes))
     S = entrywise.pack([[s, both], [both, t]], axes)
