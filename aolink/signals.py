@@ -18,6 +18,8 @@ from types import FrameType
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ECHO_S = 0.5
 """A terminal that closes sends a signal several times; what comes within this time is the same request."""
+_AGAIN_S = 0.02
+"""How long after an interruption was lost it is raised again."""
 
 
 class Interrupted(BaseException):
@@ -58,13 +60,37 @@ class StopRequest:
         if self._at_once if first else now - self._first_s > _ECHO_S:
             raise Interrupted(number)
 
+    def _raise_again(self, number: int, frame: FrameType | None) -> None:
+        raise Interrupted(self.signal)
+
+    @contextmanager
+    def _never_lost(self) -> Iterator[None]:
+        """Where nobody can catch it (a finaliser, a callback of the interpreter's own), an interruption would only be
+        reported as ignored: it is raised again a moment later, out of there."""
+        report, alarm = sys.unraisablehook, signal.signal(signal.SIGALRM, self._raise_again)
+
+        def hook(ignored: sys.UnraisableHookArgs) -> None:
+            if ignored.exc_type is Interrupted:
+                signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+            else:
+                report(ignored)
+
+        sys.unraisablehook = hook
+        try:
+            yield
+        finally:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, alarm)
+            sys.unraisablehook = report
+
     @contextmanager
     def installed(self) -> Iterator[StopRequest]:
         # SIGHUP that is ignored already stays so: that is what `nohup` does, and a background job may rely on it.
         heard = [n for n in _SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
         before = {number: signal.signal(number, self._handle) for number in heard}
         try:
-            yield self
+            with self._never_lost():
+                yield self
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)

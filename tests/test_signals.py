@@ -148,6 +148,24 @@ def test_a_signal_ends_a_command_that_has_just_begun(
         started.assert_nothing_half_is_left()
 
 
+def test_a_signal_that_comes_where_nothing_can_be_caught_is_not_lost(tmp_path: Path) -> None:
+    program = (
+        "import os, signal, time\n"
+        "from aolink.signals import ending_the_command\n"
+        "class Finalised:\n"
+        "    def __del__(self):\n"
+        "        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "        time.sleep(0.1)\n"
+        "with ending_the_command():\n"
+        "    it = Finalised()\n"
+        "    del it\n"
+        "    for _ in range(600):\n"
+        "        time.sleep(0.1)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=50)
+    assert (done.returncode, done.stderr) == (143, "aolink: interrupted by SIGTERM\n")
+
+
 MIDST: dict[str, Callable[[Started], bool]] = {
     "rig": lambda it: "camera" in must_be(TextIOBase, it.process.stdout).readline(),
     "record": lambda it: (it.folder / "a.mcap").exists() and (it.folder / "a.mcap").stat().st_size > 30_000,
