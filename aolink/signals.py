@@ -11,9 +11,11 @@ import signal
 import sys
 import termios
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
+from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ECHO_S = 0.5
@@ -60,36 +62,13 @@ class StopRequest:
         if self._at_once if first else now - self._first_s > _ECHO_S:
             raise Interrupted(number)
 
-    def _raise_again(self, number: int, frame: FrameType | None) -> None:
-        raise Interrupted(self.signal)
-
-    @contextmanager
-    def _never_lost(self) -> Iterator[None]:
-        """Where nobody can catch it (a finaliser, a callback of the interpreter's own), an interruption would only be
-        reported as ignored: it is raised again a moment later, out of there."""
-        report, alarm = sys.unraisablehook, signal.signal(signal.SIGALRM, self._raise_again)
-
-        def hook(ignored: sys.UnraisableHookArgs) -> None:
-            if ignored.exc_type is Interrupted:
-                signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
-            else:
-                report(ignored)
-
-        sys.unraisablehook = hook
-        try:
-            yield
-        finally:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, alarm)
-            sys.unraisablehook = report
-
     @contextmanager
     def installed(self) -> Iterator[StopRequest]:
         # SIGHUP that is ignored already stays so: that is what `nohup` does, and a background job may rely on it.
         heard = [n for n in _SIGNALS if n != signal.SIGHUP or signal.getsignal(n) != signal.SIG_IGN]
         before = {number: signal.signal(number, self._handle) for number in heard}
         try:
-            with self._never_lost():
+            with _never_lost():
                 yield self
         finally:
             for number, handler in before.items():
@@ -99,6 +78,42 @@ class StopRequest:
         """End the command as one that a signal ended, once it has ended in good order what it was doing."""
         if self.signal:
             raise Interrupted(self.signal)
+
+
+_lost = 0
+"""The signal whose interruption was lost, until it is raised again."""
+
+
+def _raise_again(number: int = 0, frame: FrameType | None = None) -> None:
+    global _lost
+    lost, _lost = _lost, 0
+    if lost:
+        raise Interrupted(lost)
+
+
+def _not_lost(ignored: sys.UnraisableHookArgs, report: Callable[[sys.UnraisableHookArgs], Any]) -> None:
+    global _lost
+    if isinstance(ignored.exc_value, Interrupted):
+        _lost = ignored.exc_value.number
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+    else:
+        report(ignored)
+
+
+@contextmanager
+def _never_lost() -> Iterator[None]:
+    """Where nobody can catch it (a finaliser, a callback of the interpreter's own), an interruption would only be
+    reported as ignored: it is raised again a moment later, out of there, or at the end of the outermost block."""
+    report, alarm = sys.unraisablehook, signal.signal(signal.SIGALRM, _raise_again)
+    sys.unraisablehook = partial(_not_lost, report=report)
+    try:
+        yield
+    finally:
+        sys.unraisablehook = report
+        if alarm is not _raise_again:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, alarm)
+            _raise_again()
 
 
 @contextmanager

@@ -148,17 +148,26 @@ def test_a_signal_ends_a_command_that_has_just_begun(
         started.assert_nothing_half_is_left()
 
 
-def test_a_signal_that_comes_where_nothing_can_be_caught_is_not_lost(tmp_path: Path) -> None:
+# What the program does when the interruption has just been lost: nothing else; a session begins; one has just ended.
+AFTERWARDS = {
+    "waits": "    del it\n",
+    "begins a session": "    del it\n    StopRequest().installed().__enter__()\n",
+    "ends a session": "    with StopRequest(at_once=True).installed():\n        del it\n",
+}
+
+
+@pytest.mark.parametrize("afterwards", AFTERWARDS.values(), ids=AFTERWARDS)
+def test_a_signal_that_comes_where_nothing_can_be_caught_is_not_lost(tmp_path: Path, afterwards: str) -> None:
     program = (
         "import os, signal, time\n"
-        "from aolink.signals import ending_the_command\n"
+        "from aolink.signals import StopRequest, ending_the_command\n"
         "class Finalised:\n"
         "    def __del__(self):\n"
         "        os.kill(os.getpid(), signal.SIGTERM)\n"
         "        time.sleep(0.1)\n"
         "with ending_the_command():\n"
         "    it = Finalised()\n"
-        "    del it\n"
+        f"{afterwards}"
         "    for _ in range(600):\n"
         "        time.sleep(0.1)\n"
     )

@@ -28,6 +28,7 @@ from aolink.estimation.estimate import Estimate, WanderingValue
 from aolink.estimation.estimator import Estimator
 from aolink.estimation.kalman.filter import Posterior
 from aolink.estimation.model.base import ExposureModel
+from aolink.estimation.moments.windowed import NOT_BELIEVED
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.block_diagonal import stationary_covariance
@@ -87,7 +88,7 @@ class WanderingEstimator(Estimator):
                 assert copy.posterior is not None
                 evidence.append(_evidence(copy.posterior))
             self.several = self._each[len(series) // 2].several
-            self._weigh(exposure.first_step, np.stack(evidence, axis=1))
+            self._weigh(exposure.first_step, _nearest_known(np.stack(evidence, axis=1)))
             yield self._combined(estimates)
 
     def _weigh(self, first_step: int, evidence: FloatArray) -> None:
@@ -203,7 +204,19 @@ def _evidence(posterior: Posterior) -> FloatArray:
         return posterior.log_evidence
     S = posterior.innovation_covariance
     sizes = np.linalg.slogdet(S)[1] if S.ndim == 3 else np.log(np.maximum(S, 1e-300)).sum(axis=1)
-    return np.where(posterior.nis > 0, -0.5 * (posterior.nis + sizes), np.nan)
+    seen = (posterior.nis > 0) & (posterior.nis < NOT_BELIEVED)
+    return np.where(seen, -0.5 * (posterior.nis + sizes), np.nan)
+
+
+def _nearest_known(evidence: FloatArray) -> FloatArray:
+    """Evidence (axes, copies), where it is not finite that of the nearest copy whose is.
+
+    A copy with much noise, or a wide kernel, may see no spot where the others do; that says nothing of its value.
+    """
+    known = np.isfinite(evidence)
+    places = np.arange(evidence.shape[1])
+    away = np.where(known[:, None, :], np.abs(places[:, None] - places), evidence.shape[1])
+    return np.take_along_axis(evidence, away.argmin(axis=2), axis=1)
 
 
 def _in_basis(nominal: Estimate, other: Estimate, tolerance: float) -> tuple[FloatArray, FloatArray]:

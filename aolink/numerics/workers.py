@@ -26,7 +26,7 @@ THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"
 """The environment variables that set the number of threads of linear algebra libraries."""
 _PATIENCE_S = 3.0
 """How long a process may take to end in good order when it has been asked to."""
-_CALLS_S = 0.05
+_CALLS_MS = 50
 """How long to wait at a time for calls that no process will take any more."""
 _PIECE = 1 << 20
 _FOR_THE_PARENT = {signal.SIGINT, signal.SIGHUP}
@@ -149,7 +149,8 @@ def _end(pool: ProcessPoolExecutor, calls: int) -> None:
         process.join(_PATIENCE_S)
     # The pool's own threads end when all calls are in the pipe. One that is larger than the pipe would keep them from
     # that for ever, for nobody reads (Python before 3.11.5): so it is read here, by a descriptor that only we close.
-    deadline = time.monotonic() + _PATIENCE_S
+    deadline, poll = time.monotonic() + _PATIENCE_S, select.poll()
+    poll.register(calls, select.POLLIN)
     while manager is not None and manager.is_alive() and time.monotonic() < deadline:
-        if select.select([calls], [], [], _CALLS_S)[0] and os.read(calls, _PIECE):
+        if poll.poll(_CALLS_MS) and os.read(calls, _PIECE):
             deadline = time.monotonic() + _PATIENCE_S

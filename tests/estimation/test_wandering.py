@@ -166,6 +166,20 @@ def test_other_quantities_are_found_too_and_intervals_hold(parameter, truth, nam
     assert held > 0.88
 
 
+@pytest.mark.parametrize(("noisier", "flux"), [(30.0, "known"), (9.0, "measured")])
+def test_copies_with_so_much_noise_that_they_see_no_spot_say_nothing(noisier, flux):
+    rig = load_rig("section-vi-lively")
+    weak = dataclasses.replace(
+        rig, sensor=dataclasses.replace(rig.sensor, noise_density=noisier * rig.sensor.noise_density)
+    )
+    following = wandering(weak, Wandering(parameter="sensor_noise", largest=3.0, rate_per_minute=0.02))
+    estimator = make_estimator(following, "moments", flux=flux)
+    for exposure in simulate(weak, 40, seed=4):
+        found = found_in(estimator.step(exposure))
+    assert abs(found.mean[0] - 1) < max(0.3, 3 * found.sd[0])
+    assert found.sd[0] < 0.4
+
+
 def test_the_papers_estimators_take_the_plant_as_it_is():
     exposures = simulate(JITTER, 3, seed=1)
     for name in ("open-loop", "o1", "o3"):

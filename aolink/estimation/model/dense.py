@@ -33,7 +33,6 @@ class DenseModel(ExposureModel):
         # paths of the states are computed then.
         few = plant.n_outputs > plant.n_states and not self.n_unmodelled
         self._few = replace(plant, C=np.eye(plant.n_states)) if few else plant
-        self._constants = [_constant(each) for each in (plant.A, plant.B, plant.C, self._state_rows)]
 
     @property
     def state_rows(self) -> FloatArray:
@@ -127,18 +126,18 @@ class DenseModel(ExposureModel):
         """`responses` by compiled steps; c is only written where it is asked for."""
         from aolink.estimation.compiled.responses import responses  # not before an estimator needs it
 
-        axes, n, outputs = len(inputs) * self.plant.axes, self.plant.n_states, self.plant.n_outputs
-        given = [*self._constants, _constant(inputs)]
-        end, mean, slope, square = (np.empty((*rows, axes)) for rows in ((n,), (outputs,), (outputs, n), (outputs,)))
+        plant, axes, n, outputs = self.plant, len(inputs) * self.plant.axes, self.plant.n_states, self.plant.n_outputs
+        given = [_constant(each) for each in (plant.A, plant.B, plant.C, self._state_rows, inputs)]
 
-        def stepped(path: FloatArray) -> FloatArray:
-            responses(*given, end, mean, slope, square, path)
-            return path
+        def stepped(path: FloatArray) -> list[FloatArray]:
+            found = [np.empty((*rows, axes)) for rows in ((n,), (outputs,), (outputs, n), (outputs,))]
+            responses(*given, *found, path)
+            return [*found, path]
 
-        stepped(np.empty((0, outputs, self.n_steps)))
+        end, mean, slope, square, _ = stepped(np.empty((0, outputs, self.n_steps)))
         return InputResponse(
             end=end.T, mean=mean.T, slope=np.moveaxis(slope, -1, 0), square=square.T,
-            whole=lambda: stepped(np.empty((axes, outputs, self.n_steps))),
+            whole=lambda: stepped(np.empty((axes, outputs, self.n_steps)))[-1],
         )  # fmt: skip
 
     def _by_blocks(self, inputs: FloatArray) -> InputResponse:
@@ -188,6 +187,6 @@ class DenseModel(ExposureModel):
 
 def _constant(values: FloatArray) -> FloatArray:
     """The same values as all callers of compiled code give them, so that it is compiled once."""
-    view = np.ascontiguousarray(values).view()
+    view = np.ascontiguousarray(values, dtype=np.float64).view()
     view.flags.writeable = False
     return view

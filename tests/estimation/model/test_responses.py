@@ -76,6 +76,17 @@ def test_inputs_as_they_lie_in_a_recording() -> None:
         np.testing.assert_array_equal(model.response(same).square, expected.square)
 
 
+def test_inputs_that_are_written_over_later_change_no_mean() -> None:
+    """The path is made when it is asked for."""
+    u = np.random.default_rng(5).standard_normal((N, 3))
+    found = exposure_model(any_plant(2, 1, 1, 3), N).response(u)
+    mean, end = found.mean.copy(), found.end.copy()
+    u[:] = 5.0
+    assert found.path.shape == (3, 1, N)
+    np.testing.assert_array_equal(found.mean, mean)
+    np.testing.assert_array_equal(found.end, end)
+
+
 def test_the_path_of_some_axes_is_that_of_all() -> None:
     found = exposure_model(any_plant(2, 1, 1, 20), N).response(np.random.default_rng(4).standard_normal((N, 20)))
     np.testing.assert_array_equal(found.of(slice(5, 9)).path, found.path[5:9])
