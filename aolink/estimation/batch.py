@@ -13,7 +13,7 @@ from aolink.rig import Rig
 
 # Most exposures in a batch, and most numbers (a few megabytes): enough that the fixed cost of a batch does not matter.
 _AT_ONCE = 512
-_NUMBERS_AT_ONCE = 1_000_000
+_NUMBERS_AT_ONCE = 500_000
 
 
 class Batch:
@@ -33,7 +33,8 @@ class Batch:
         ((n_steps, offset, _),) = kinds
         # One exposure of many axes is megabytes, and not copied.
         inputs = exposures[0].inputs[None] if len(exposures) == 1 else np.array([each.inputs for each in exposures])
-        self.finite = np.isfinite(inputs).all(axis=(1, 2)).tolist()
+        known = np.isfinite(inputs)
+        self.finite = [True] * len(exposures) if known.all() else known.all(axis=(1, 2)).tolist()
         self.model = exposure_model(rig.plant, n_steps, offset)
         self.responses = self.model.responses(inputs)
         """Responses of all axes of the first exposure, then of the second, (exposures * axes, ...)."""

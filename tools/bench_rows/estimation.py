@@ -103,7 +103,9 @@ def frame_moments_and_o3(effort: Effort) -> Row:
         windows = exposure.pixels.reshape(30, 16, 30, 16).swapaxes(1, 2).reshape(900, 256)
         windows.astype(np.float64) @ weights
 
-    times = [timed(lambda: o3.step(exposure)) for _ in range(effort.of(300))]
+    turns = effort.of(300)
+    following = iter([replace(exposure, first_step=200 * (k + 1)) for k in range(turns)])
+    times = [timed(lambda: o3.step(next(following))) for _ in range(turns)]
     ours, p99 = np.percentile(times, [50, 99])
     moments, filtering = median_s(product, effort.of(15), loop)
     theirs = moments + filtering * 1800 / sample

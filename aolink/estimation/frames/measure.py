@@ -47,7 +47,9 @@ class Measurements:
         if not whole:
             return
         if isinstance(sensor, SpotSensor):
-            frames = np.stack([exposures[k].pixels for k in whole])
+            # One frame of many spots is not copied.
+            pixels = [exposures[k].pixels for k in whole]
+            frames = pixels[0][None] if len(pixels) == 1 else np.stack(pixels)
             good, moments = moments_of_frames(sensor, frames, needs, _least_significance(sensor))
         elif shape[0] == 1:
             good, moments = _moments_of_lines(

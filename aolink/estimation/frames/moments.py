@@ -213,7 +213,12 @@ def spot_significance(sensor: Sensor, density: FloatArray) -> FloatArray:
             np.add(light[k], density[:, k], out=light[k + 1])
     lengths = [2**k for k in range(sensor.pixels.bit_length()) if 2**k <= sensor.pixels]
     gained = [(light[n:] - light[:-n]).max(axis=0) / math.sqrt(n) for n in lengths]
-    return np.asarray(np.max(gained, axis=0) * math.sqrt(sensor.pixel_width / effective_noise_density(sensor)))
+    return np.asarray(np.max(gained, axis=0) * significance_scale(sensor))
+
+
+def significance_scale(sensor: Sensor) -> float:
+    """One over the standard deviation of a pixel's density."""
+    return math.sqrt(sensor.pixel_width / effective_noise_density(sensor))
 
 
 def least_significance(sensor: Sensor, light: FloatArray | float = 1.0) -> FloatArray:

@@ -19,6 +19,7 @@ from aolink.estimation.frames.moments import (
     measure_moments,
     noise_integrals,
     raw_moments,
+    significance_scale,
     spot_significance,
 )
 from aolink.estimation.frames.plane_moments import measure_moments_2d
@@ -72,12 +73,19 @@ def moments_of_frames(
     frames:
         (frames, rows, columns), of which all pixels arrived.
     """
-    line, count = sensor.profile, len(frames)
-    counts = _summed(sensor, frames.astype(np.float32))
-    lit = spot_significance(line, to_density(line, counts)).reshape(count, -1) >= least_significance
+    from aolink.estimation.compiled.frames import brightest_stretches, window_sums  # not before it is needed
+
+    line, count, (rows, columns), side = sensor.profile, len(frames), sensor.grid, sensor.window[0]
+    sums, ends = np.empty((side, count, rows, columns, 2)), np.empty((count, 2), dtype=np.int64)
+    window_sums(np.ascontiguousarray(frames), side, sums, ends)
+    each = sums.reshape(side, count, -1, 2)
+    seen = (each if sensor.light is None else each[:, :, sensor.lit]).reshape(side, -1)
+    counts, stretches = seen.T, np.empty(seen.shape[1])
+    brightest_stretches(to_density(line, seen), stretches)
+    lit = (stretches * significance_scale(line)).reshape(count, -1) >= least_significance
     if needs.flux == "measured":
         lit &= _enough_light(line, counts).reshape(count, -1)
-    good = np.flatnonzero(lit.all(axis=1) & ~is_saturated(sensor, frames).any(axis=(1, 2)))
+    good = np.flatnonzero(lit.all(axis=1) & (ends[:, 0] > 0) & (ends[:, 1] < sensor.full_scale))
     if len(good) < count:
         counts = counts.reshape(count, -1, line.pixels)[good].reshape(-1, line.pixels)
     if not len(good):

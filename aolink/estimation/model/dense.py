@@ -101,7 +101,7 @@ class DenseModel(ExposureModel):
         return np.tensordot(mixed, paths[:, :, :count], axes=1)
 
     def responses(self, inputs: FloatArray) -> InputResponse:
-        if not inputs.any():
+        if not (inputs[:, -1].any() or inputs.any()):
             return self._at_rest(len(inputs) * self.plant.axes)
         found = (self._stepped if self.plant.n_states <= _FEW_STATES else self._by_blocks)(inputs)
         if not self.moved:
@@ -124,20 +124,24 @@ class DenseModel(ExposureModel):
 
     def _stepped(self, inputs: FloatArray) -> InputResponse:
         """`responses` by compiled steps; c is only written where it is asked for."""
-        from aolink.estimation.compiled.responses import responses  # not before an estimator needs it
+        from aolink.estimation.compiled.responses import responses, responses_of_two_states  # not before it is needed
 
         plant, axes, n, outputs = self.plant, len(inputs) * self.plant.axes, self.plant.n_states, self.plant.n_outputs
         given = [_constant(each) for each in (plant.A, plant.B, plant.C, self._state_rows, inputs)]
+        found = [np.empty((*rows, axes)) for rows in ((n,), (outputs,), (outputs, n), (outputs,))]
+        if (n, plant.n_inputs, outputs) == (2, 1, 1):
+            responses_of_two_states(*given, *found)
+        else:
+            responses(*given, *found, np.empty((0, outputs, self.n_steps)))
 
-        def stepped(path: FloatArray) -> list[FloatArray]:
-            found = [np.empty((*rows, axes)) for rows in ((n,), (outputs,), (outputs, n), (outputs,))]
-            responses(*given, *found, path)
-            return [*found, path]
+        def path() -> FloatArray:
+            path = np.empty((axes, outputs, self.n_steps))
+            responses(*given, *(np.empty_like(each) for each in found), path)
+            return path
 
-        end, mean, slope, square, _ = stepped(np.empty((0, outputs, self.n_steps)))
+        end, mean, slope, square = found
         return InputResponse(
-            end=end.T, mean=mean.T, slope=np.moveaxis(slope, -1, 0), square=square.T,
-            whole=lambda: stepped(np.empty((axes, outputs, self.n_steps)))[-1],
+            end=end.T, mean=mean.T, slope=np.moveaxis(slope, -1, 0), square=square.T, whole=path
         )  # fmt: skip
 
     def _by_blocks(self, inputs: FloatArray) -> InputResponse:

@@ -91,3 +91,14 @@ def test_the_path_of_some_axes_is_that_of_all() -> None:
     found = exposure_model(any_plant(2, 1, 1, 20), N).response(np.random.default_rng(4).standard_normal((N, 20)))
     np.testing.assert_array_equal(found.of(slice(5, 9)).path, found.path[5:9])
     np.testing.assert_array_equal(found.of(slice(5, 9)).mean, found.mean[5:9])
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 3, 5, 43])
+def test_any_number_of_steps(n_steps: int) -> None:
+    """The state of a plant of two states is kept over some steps, and these may not come out even."""
+    plant = any_plant(2, 1, 1, 70)
+    model, u = exposure_model(plant, n_steps), np.random.default_rng(6).standard_normal((n_steps, 70))
+    found = model.response(u)
+    for axis in (0, 69):
+        for name, expected in stepped(plant, model, u[:, axis : axis + 1]).items():
+            np.testing.assert_allclose(getattr(found, name)[axis], expected, rtol=1e-10, atol=1e-12)
