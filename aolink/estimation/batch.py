@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from aolink.estimation.model.base import ExposureModel, InputResponse
+from aolink.estimation.model.base import ExposureModel, InputResponse, numbers
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.exposure import Exposure
 from aolink.rig import Rig
@@ -36,7 +36,7 @@ class Batch:
         known = np.isfinite(inputs)
         self.finite = [True] * len(exposures) if known.all() else known.all(axis=(1, 2)).tolist()
         self.model = exposure_model(rig.plant, n_steps, offset)
-        self.responses = self.model.responses(inputs)
+        self.responses = self.model.responses(numbers(inputs, known))
         """Responses of all axes of the first exposure, then of the second, (exposures * axes, ...)."""
 
     def model_of(self, k: int) -> ExposureModel:

@@ -28,7 +28,7 @@ from typing import Self
 import numpy as np
 
 from aolink.numerics import batched
-from aolink.numerics.arrays import FloatArray
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.plant.lifting import input_response, lift
 from aolink.rig import Plant
 
@@ -119,6 +119,7 @@ class ExposureModel(ABC):
     def responses(self, inputs: FloatArray) -> InputResponse:
         """`response` for many exposures, inputs (exposures, n_steps, axes * n_inputs), in a fraction of the calls.
 
+        Inputs are numbers, as `numbers` gives them.
         The first axis has all axes of the first exposure, then of the second, with the same bits as for each alone.
         """
 
@@ -176,7 +177,7 @@ class ExposureModel(ABC):
 
     def response(self, inputs: FloatArray) -> InputResponse:
         """Response to the inputs of an exposure, (n_steps, axes * n_inputs)."""
-        return self.responses(inputs[None])
+        return self.responses(numbers(inputs[None]))
 
     def last_response(self, end: FloatArray) -> FloatArray:
         """c_N, response of the outputs in the step after the last to that of the end state, (axes, n_outputs)."""
@@ -185,17 +186,23 @@ class ExposureModel(ABC):
 
 def over_steps(plant: Plant, inputs: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Transition, noise and response of the states over one or more steps with these inputs, (k, axes * n_inputs)."""
-    _, kick = input_response(plant, by_axis(plant, inputs))
+    _, kick = input_response(plant, by_axis(plant, numbers(inputs)))
     return *lift(plant, len(inputs)), kick
+
+
+def numbers(inputs: FloatArray, known: BoolArray | None = None) -> FloatArray:
+    """Inputs with zero for what is not a number: it must not poison every estimate that follows.
+
+    ``known`` says which are numbers, where that is found already.
+    """
+    known = np.isfinite(inputs) if known is None else known
+    return inputs if known.all() else np.where(known, inputs, 0.0)
 
 
 def by_axis(plant: Plant, inputs: FloatArray) -> FloatArray:
     """Inputs of the rig as each copy of the plant has them, (k, axes * n_inputs) -> (axes, k, n_inputs).
 
     Inputs of several exposures are split alike, (exposures, k, axes * n_inputs) -> (exposures * axes, k, n_inputs).
-    What is not a number is taken as zero: it must not poison every estimate that follows.
     """
-    known = np.isfinite(inputs)
-    finite = inputs if known.all() else np.where(known, inputs, 0.0)
-    split = finite.reshape(-1, inputs.shape[-2], plant.axes, plant.n_inputs).transpose(0, 2, 1, 3)
+    split = inputs.reshape(-1, inputs.shape[-2], plant.axes, plant.n_inputs).transpose(0, 2, 1, 3)
     return split.reshape(-1, inputs.shape[-2], plant.n_inputs)

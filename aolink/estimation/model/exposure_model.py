@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from aolink.estimation.model.base import ExposureModel, by_axis
+from aolink.estimation.model.base import ExposureModel, by_axis, numbers
 from aolink.estimation.model.dense import DenseModel
 from aolink.estimation.model.factored import FactoredModel
 from aolink.numerics.arrays import FloatArray
@@ -46,6 +46,6 @@ def path_from_coefficients(
     plant = model.plant
     if len(inputs) != model.n_steps:
         model = exposure_model(plant, len(inputs))
-    input_path, _ = input_response(plant, by_axis(plant, inputs))
+    input_path, _ = input_response(plant, by_axis(plant, numbers(inputs)))
     shape = (plant.axes * plant.n_outputs, model.n_steps)
     return model.path(coefficients, input_path).reshape(shape), model.path_sd(covariance).reshape(shape)
