@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
+from scipy import ndimage, optimize
 
 from aolink.errors import FrameError, ImportingError
 from aolink.exposure import Truth
@@ -42,6 +42,10 @@ _SAMPLES = 100
 """Frames in which the objects' light is fitted."""
 STRAY = 1 / 8
 """Share of a window by which an object may be off its middle before the window moves."""
+_STRETCH = 10
+"""Of these frames, so many in a row are averaged to see what shines beside an object."""
+_ALONE = 1 / 3
+"""Light beside an object that is less bright than this share of it does not matter."""
 _REST = 2.5
 """Standard deviations of where an object's light may be, its walk in an exposure included: beyond is that of others."""
 
@@ -207,6 +211,16 @@ class Survey:
     """Standard deviation of the error of a place in one frame, pixels."""
     walk: float
     """Variance of the step from frame to frame along one direction, pixels squared."""
+    beside: FloatArray
+    """The brightest light beside each object as a share of its own, both through a Gaussian of the object's size, in
+    each stretch of the film, (stretches, n); NaN where the object is not seen."""
+    stretch: int
+    """Frames of a stretch."""
+
+    def alone(self, first: int, end: int) -> BoolArray:
+        """Which objects have no other light beside them in the frames from ``first`` to before ``end``, (n,)."""
+        some = self.beside[first // self.stretch : -(-end // self.stretch)]
+        return np.asarray(~(some >= _ALONE).any(axis=0))
 
 
 def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[[int], None] | None = None) -> Survey:
@@ -234,15 +248,18 @@ def survey(film: Film, settings: Settings, objects: Objects, progress: Callable[
     path = np.array(places)
     if np.isfinite(path).all(axis=2).sum() < 2 * _FIRST_FRAMES:
         raise ImportingError(f"{film.name}: no object can be followed from frame to frame: do they move too far?")
-    sd, sd_sd, amounts, ground, residual, model = _fitted(np.array(windows), np.array(centres), objects.sd)
+    sd, sd_sd, amounts, ground, residual, model, beside = _fitted(np.array(windows), np.array(centres), objects.sd)
     walk, place_sd = _steps(path)
-    return Survey(path, sd, sd_sd, amounts, ground, residual, model, place_sd, walk)
+    return Survey(path, sd, sd_sd, amounts, ground, residual, model, place_sd, walk, beside, every * _STRETCH)
 
 
 def _fitted(
     windows: FloatArray, centres: FloatArray, start_sd: float
-) -> tuple[float, float, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """The Gaussian, integrated over pixels, and the ground that best fit windows (samples, n, side, side)."""
+) -> tuple[float, float, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The Gaussian, integrated over pixels, and the ground that best fit windows (samples, n, side, side).
+
+    What they leave of the windows, averaged over some of these, tells the light beside an object (`Survey.beside`).
+    """
     _, n, side, _ = windows.shape
     edges = np.arange(side + 1) - 0.5
 
@@ -266,12 +283,24 @@ def _fitted(
     sd = float(np.median(each))
     sd_sd = float(each.std(ddof=1) / math.sqrt(len(each))) if len(each) > 1 else math.nan
     light, ground, residuals, models = np.full(n, np.nan), np.zeros(n), [], []
+    beside = np.full((-(-len(windows) // _STRETCH), n), np.nan)
     for k in usable:
         (light[k], ground[k]), shape, rest = amounts(sd, k)
+        stretches = np.flatnonzero(np.isfinite(centres[:, k]).all(axis=1)) // _STRETCH
+        for stretch in np.unique(stretches):
+            left_over = rest.reshape(-1, side, side)[stretches == stretch].mean(axis=0)
+            beside[stretch, k] = _brightest_beside(left_over, sd) / (light[k] / (4 * math.pi * sd**2))
         for axis in (1, 2):
             residuals.append(rest.reshape(-1, side, side).sum(axis=axis).ravel() / light[k])
             models.append(shape.reshape(-1, side, side).sum(axis=axis).ravel())
-    return sd, sd_sd, light, ground, np.concatenate(residuals), np.concatenate(models)
+    return sd, sd_sd, light, ground, np.concatenate(residuals), np.concatenate(models), beside
+
+
+def _brightest_beside(window: FloatArray, sd: float) -> float:
+    """The largest value beside the middle of a window (side, side), smoothed by a Gaussian."""
+    y, x = np.indices(window.shape) - len(window) // 2
+    smooth = ndimage.gaussian_filter(window, sd, mode="constant")
+    return float(smooth[np.hypot(x, y) >= _WEIGHT * sd].max())
 
 
 def _steps(places: FloatArray) -> tuple[float, float]:
@@ -310,8 +339,8 @@ def tracked(
             f" (aolink rig --from writes one), {rig.name} has {rig.n_outputs} slopes of a {sensor.shape[0]} x"
             f" {sensor.shape[1]} sensor"
         )
-    objects = find_objects(film, settings)
-    known = survey(film, settings, objects)
+    known = survey(film, settings, find_objects(film, settings))
+    account.notes += tuple(_crowded(film, known))
     windows = _Windows(rig, sensor, known)
     light, step, area = Light(film, settings), 0, sensor.pixel_size
     for group in grouped(film, settings.frames_per_exposure, periods):
@@ -341,6 +370,25 @@ def tracked(
                 path=path, path_sd=known.place_sd * sensor.pixel_width,
             )  # fmt: skip
         yield ImportedExposure(frame=frame, inputs=inputs, truth=truth)
+
+
+def _crowded(film: Film, known: Survey) -> Iterator[str]:
+    """A note on each object that has other light beside it, with the frames and how bright it is."""
+    for k, beside in enumerate(known.beside.T):
+        stretches = np.flatnonzero(beside >= _ALONE)
+        if not len(stretches):
+            continue
+        ends = np.flatnonzero(np.diff(stretches, append=-1) != 1)
+        starts = np.concatenate([[0], ends[:-1] + 1])
+        frames = ", ".join(
+            f"{stretches[a] * known.stretch} to {min((stretches[b] + 1) * known.stretch, film.count) - 1}"
+            for a, b in zip(starts, ends, strict=True)
+        )
+        x, y = known.places[stretches[0] * known.stretch, k]
+        yield (
+            f"object {k + 1} (at {x:.0f},{y:.0f}) has other light beside it in frames {frames}, up to"
+            f" {beside[stretches].max():.0%} as bright: its estimates are wrong there by more than they say"
+        )
 
 
 def _blurs(picture: FloatArray, last: FloatArray, known: Survey, frames: int) -> FloatArray:

@@ -49,6 +49,27 @@ def test_objects_are_found_and_followed_to_a_tenth_of_a_pixel(walkers: SpotFilm)
     assert np.sqrt(np.mean(error**2)) / 3 < known.place_sd < 0.3
 
 
+def test_light_beside_an_object_is_said_with_its_frames(tmp_path: Path) -> None:
+    """A second object sticks to the first one in the second half of the film; a fainter one is no matter."""
+    rng = np.random.default_rng(6)
+    motion = random_walk(rng, 160, 2, 0.5)
+    film = spot_film(rng, motion, MIDDLES)
+    for k, brightness in enumerate((0.6, 0.15)):
+        other = spot_film(
+            rng, motion[80:, :, k : k + 1], MIDDLES[k : k + 1] + np.array([4.0, 3.0]), noise=0.0, ground=0.0,
+            light=brightness * 20_000.0,
+        )  # fmt: skip
+        film.frames[80:] += other.frames
+    source = array_film(film.frames, "film")
+    known = survey(source, SETTINGS, find_objects(source, SETTINGS))
+    assert known.alone(0, 80).tolist() == [True, True]
+    assert known.alone(72, 88).tolist() == known.alone(80, 160).tolist() == [False, True]
+    rig = parse_rig(first_rig(source, SETTINGS, "film"))
+    (note,) = import_film(source, rig, SETTINGS, tmp_path / "a.mcap").notes
+    assert "object 1" in note
+    assert "in frames 80 to 159" in note
+
+
 @pytest.mark.parametrize(("asked", "what"), [(9, "shows . objects, 9 are asked for"), (1, None)])
 def test_as_many_objects_as_asked_for(walkers: SpotFilm, asked: int, what: str | None) -> None:
     film = array_film(walkers.frames[:10], "walkers")

@@ -177,8 +177,8 @@ def _measured(value: float, samples: FloatArray) -> Measured:
 
 
 def rms(squares: FloatArray) -> Measured:
-    """Root of the mean of squared errors, (runs, exposures)."""
-    each = squares.mean(axis=1)
+    """Root of the mean of squared errors, (runs, exposures); NaN where one does not count."""
+    each = np.nanmean(squares, axis=1)
     return _measured(np.sqrt(each.mean()), np.sqrt(each[_resampled(len(each))].mean(axis=1)))
 
 
@@ -189,8 +189,8 @@ def mean(values: FloatArray) -> Measured:
 
 
 def ratio(squares: FloatArray, reference: FloatArray) -> Measured:
-    """Ratio of root mean squares, the runs resampled in pairs; both (runs, exposures)."""
-    above, below = squares.mean(axis=1), reference.mean(axis=1)
+    """Ratio of root mean squares, the runs resampled in pairs; both (runs, exposures), NaN where one does not count."""
+    above, below = np.nanmean(squares, axis=1), np.nanmean(reference, axis=1)
     chosen = _resampled(len(above))
     samples = np.sqrt(above[chosen].mean(axis=1) / below[chosen].mean(axis=1))
     return _measured(np.sqrt(above.mean() / below.mean()), samples)

@@ -3,6 +3,7 @@
 The mean of K frames is an exposure of K fast steps whose path the single frames tell. The rig file is the one that
 `aolink rig --from` writes: kernel, noise and random walk of the single frames. Beside the estimators stands what a user
 would do instead: the centroid of each blurred picture, held for the exposure, or interpolated from one to the next.
+Exposures of a sphere that `aolink import` says to have other light beside it do not count, but in one table.
 """
 
 import tempfile
@@ -18,7 +19,8 @@ from aolink.importing.first_rig import first_rig
 from aolink.importing.frames import Settings
 from aolink.importing.readers import open_film
 from aolink.importing.recording import import_film
-from aolink.numerics.arrays import FloatArray
+from aolink.importing.tracking import find_objects, survey
+from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.frame import spot_windows
@@ -27,6 +29,7 @@ from aolink.recording.reader import Recording
 from aolink.rig import Rig, parse_rig
 from paper_report.blocks import Block, Heading, Table, Text
 from paper_report.ensemble import Measured, ratio, rms
+from paper_report.judge import BEYOND_95
 from paper_report.numbers import Effort
 
 FILE = Path(__file__).parents[2] / "tests" / "data" / "diffusing_spheres.npz"
@@ -42,15 +45,21 @@ def places() -> tuple[tuple[float, float], ...]:
     return tuple((float(x) + k * width, float(y)) for k, (x, y) in enumerate(data["tracked_xy"][:, 0]))
 
 
-def spheres(K: int) -> tuple[Rig, list[Exposure]]:
-    """A rig of 12 axes and its exposures of K frames, read back from a recording."""
+def spheres(K: int) -> tuple[Rig, list[Exposure], BoolArray]:
+    """A rig of 12 axes, its exposures of K frames, read back from a recording, and where a sphere is alone.
+
+    The last is (exposures, 12).
+    """
     settings = Settings(rate_hz=_RATE_HZ, invert=True, track=6, places=places(), frames_per_exposure=K)
     film = open_film(FILE)
     rig = parse_rig(first_rig(film, settings, "spheres"))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "spheres.mcap"
         import_film(film, rig, settings, path)
-        return rig, list(Recording(path).exposures())
+        exposures = list(Recording(path).exposures())
+    known = survey(film, settings, find_objects(film, settings))
+    alone = [known.alone(each.first_step, each.first_step + K) for each in exposures]
+    return rig, exposures, np.repeat(alone, 2, axis=1)
 
 
 def centroids(rig: Rig, exposures: Sequence[Exposure]) -> tuple[FloatArray, FloatArray]:
@@ -93,47 +102,62 @@ class Film:
     """RMSE of the smoothed path over that of the interpolated centroid, which uses the future as well."""
     coverage: dict[str, float]
     """Share of the path inside the estimate's 95 % intervals, with the error of the truth in the account."""
+    crowded: int
+    """Exposures of one sphere that do not count, of ``scored``: other light is beside it."""
+    scored: int
+    all_over_held: dict[str, Measured]
+    """As ``over_held``, with these exposures."""
+    all_over_interpolated: dict[str, Measured]
 
 
 def film(effort: Effort) -> list[Film]:
     """The estimators on the film, in exposures of each length."""
-    found = []
-    for frames in effort.film_frames:
-        rig, exposures = spheres(frames)
-        exposures = exposures[: effort.film_exposures]
-        scored = [k for k, each in enumerate(exposures) if k >= _SKIP and each.truth is not None]
-        true = np.array([each.truth.path for each in exposures if each.truth is not None and each is not exposures[0]])
-        unit = 1 / rig.sensor.pixel_width
+    return [_film_of(frames, effort) for frames in effort.film_frames]
 
-        def squares(paths: FloatArray, true: FloatArray = true, unit: float = unit) -> FloatArray:
-            """Mean squared errors, pixels squared, (axes, exposures)."""
-            return np.asarray(((paths - true) ** 2).mean(axis=2).T * unit**2)
 
-        held, interpolated = (squares(each[scored]) for each in centroids(rig, exposures))
-        path, smoothed, coverage = {"centroid, held": held}, {"centroid, interpolated": interpolated}, {}
-        for name in ESTIMATOR_NAMES:
-            options = {"particles": effort.particles} if name == "sampled" else {}
-            estimator = make_estimator(rig, name, **options)
-            estimates = [estimator.step(exposure) for exposure in exposures]
-            some = [estimates[k] for k in scored]
-            after = smooth(rig.plant, exposures, estimates)
-            path[name] = squares(np.array([each.path for each in some]))
-            smoothed[name] = squares(np.array([after[k].path for k in scored]))
-            truth_sd = max(each.truth.path_sd for each in exposures if each.truth is not None)
-            error = np.abs(np.array([each.path for each in some]) - true)
-            spread = np.hypot(np.array([each.path_sd for each in some]), truth_sd)
-            coverage[name] = float((error <= 1.96 * spread).mean())
-        found.append(
-            Film(
-                frames,
-                {name: rms(each) for name, each in path.items()},
-                {name: ratio(each, held) for name, each in path.items()},
-                {name: rms(each) for name, each in smoothed.items()},
-                {name: ratio(each, interpolated) for name, each in smoothed.items()},
-                coverage,
-            )
-        )
-    return found
+def _film_of(frames: int, effort: Effort) -> Film:
+    rig, exposures, alone = spheres(frames)
+    exposures = exposures[: effort.film_exposures]
+    scored = [k for k, each in enumerate(exposures) if k >= _SKIP and each.truth is not None]
+    truths = [each.truth for k, each in enumerate(exposures) if k >= _SKIP and each.truth is not None]
+    true, truth_sd = np.array([each.path for each in truths]), max(each.path_sd for each in truths)
+    counts = alone[scored].T
+
+    def squares(paths: FloatArray) -> FloatArray:
+        """Mean squared errors, pixels squared, (axes, exposures)."""
+        return np.asarray(((paths - true) ** 2).mean(axis=2).T / rig.sensor.pixel_width**2)
+
+    held, interpolated = (squares(each[scored]) for each in centroids(rig, exposures))
+    path, smoothed, coverage = {"centroid, held": held}, {"centroid, interpolated": interpolated}, {}
+    for name in ESTIMATOR_NAMES:
+        options = {"particles": effort.particles} if name == "sampled" else {}
+        estimator = make_estimator(rig, name, **options)
+        estimates = [estimator.step(exposure) for exposure in exposures]
+        some = [estimates[k] for k in scored]
+        after = smooth(rig.plant, exposures, estimates)
+        path[name] = squares(np.array([each.path for each in some]))
+        smoothed[name] = squares(np.array([after[k].path for k in scored]))
+        error = np.abs(np.array([each.path for each in some]) - true)
+        spread = np.hypot(np.array([each.path_sd for each in some]), truth_sd)
+        coverage[name] = float((error <= BEYOND_95 * spread).mean(axis=2).T[counts].mean())
+
+    def over(errors: dict[str, FloatArray], reference: FloatArray, which: BoolArray) -> dict[str, Measured]:
+        own = np.where(which, reference, np.nan)
+        return {name: ratio(np.where(which, each, np.nan), own) for name, each in errors.items()}
+
+    everywhere = np.ones_like(counts)
+    return Film(
+        frames,
+        {name: rms(np.where(counts, each, np.nan)) for name, each in path.items()},
+        over(path, held, counts),
+        {name: rms(np.where(counts, each, np.nan)) for name, each in smoothed.items()},
+        over(smoothed, interpolated, counts),
+        coverage,
+        int((~counts).sum()) // 2,
+        counts.size // 2,
+        over(path, held, everywhere),
+        over(smoothed, interpolated, everywhere),
+    )
 
 
 def film_section(found: Sequence[Film]) -> list[Block]:
@@ -146,8 +170,10 @@ def film_section(found: Sequence[Film]) -> list[Block]:
             "Not the paper's: a film of six spheres that diffuse in water, along x and y"
             " (tests/data/diffusing_spheres.md), imported as `aolink rig --from` and `aolink import --track 6 --sum K`"
             " do it. The mean of K frames is an exposure, the places in the single frames its path; kernel, noise and"
-            " random walk are those of single frames. RMSE of the path, pixels, with the standard error over the twelve"
-            " axes:"
+            " random walk are those of single frames. Exposures of a sphere that has other light beside it, as"
+            " `aolink import` says of the single frames, do not count: "
+            + ", ".join(f"{each.crowded} of {each.scored} at {each.frames} frames" for each in found)
+            + ". RMSE of the path, pixels, with the standard error over the twelve axes:"
         ),
         Table(["estimator", *across], [[name, *(str(each.path[name]) for each in found)] for name in filtered]),
         Text("Over that of the held centroid, with the 95 % interval of a bootstrap over the axes:"),
@@ -160,6 +186,18 @@ def film_section(found: Sequence[Film]) -> list[Block]:
         Table(
             ["smoother", *across],
             [[name, *(each.over_interpolated[name].interval for each in found)] for name in smoothed],
+        ),
+        Text("With the exposures that do not count, filtered over held and smoothed over interpolated:"),
+        Table(
+            ["estimator", *across, *(f"{each}, smoothed" for each in across)],
+            [
+                [
+                    name,
+                    *(each.all_over_held[name].interval for each in found),
+                    *(each.all_over_interpolated[name].interval for each in found),
+                ]
+                for name in ESTIMATOR_NAMES
+            ],
         ),
         Text("Share of the path inside the estimate's 95 % intervals, with the tracker's own error added:"),
         Table(

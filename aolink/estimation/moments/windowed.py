@@ -292,8 +292,10 @@ def weighted_sums(
     if light is not None:
         variance /= light[..., None] ** 2
     noise = batched.matmul(W * variance[..., None, :], batched.transpose(W))
-    # Where a window has fewer pixels than functions, their sums are linearly dependent.
-    noise += 1e-12 * np.eye(W.shape[-2]) * noise.max(axis=(-2, -1), keepdims=True)
+    # Where a window has fewer pixels than functions, their sums are linearly dependent; where it has none, all are
+    # zero, and say nothing whatever their noise is.
+    largest = noise.max(axis=(-2, -1), keepdims=True)
+    noise += np.eye(W.shape[-2]) * np.where(largest > 0, 1e-12 * largest, 1.0)
     return y, noise
 
 

@@ -20,7 +20,7 @@ from aolink.optics.plane import exposure_density_2d, pixel_mass_2d
 from aolink.optics.sensor import Kernel, SpotSensor
 from aolink.rig import Plant, Rig, load_rig
 from aolink.simulation.model import simulate
-from tests.kinds import must_be, spots_of
+from tests.kinds import must_be, spots_of, truth_of
 
 ONE = load_rig("single-lenslet")
 TILTED = Kernel(shape="gaussian", sigma=0.13, matrix=((0.15, 0.05), (0.05, 0.09)))
@@ -312,6 +312,18 @@ def test_a_part_of_a_window_that_is_missing_is_left_out():
     gone = run(rig, [*exposures[:11], dataclasses.replace(exposures[11], mask=mask)], ["moments"])["moments"][11]
     assert gone.status == Status.INPUT_INVALID
     assert "pixels are missing" in gone.reason
+
+
+@pytest.mark.parametrize("flux", ["known", "measured"])
+def test_a_window_in_which_every_column_misses_a_pixel_tells_nothing(flux):
+    rig = membrane()
+    exposures = simulate(rig, 8)
+    height, width = spots_of(rig).window
+    mask = np.ones(rig.sensor.shape, dtype=bool)
+    mask[np.arange(width) % height, np.arange(width)] = False  # of the first spot
+    estimator, exposures[7] = make_estimator(rig, "moments", flux=flux), dataclasses.replace(exposures[7], mask=mask)
+    found = [estimator.step(exposure) for exposure in exposures][7]
+    assert (np.abs(found.path - truth_of(exposures[7]).path) < 5 * found.path_sd).all()
 
 
 def test_no_estimate_is_lopsided_or_not_a_number_whatever_the_frame():
