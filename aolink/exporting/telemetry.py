@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from aolink.estimation.frames.spots import profiles
 from aolink.exporting.arrays import ESTIMATE, EXPOSURE, TRUTH, Variable, arrays
 from aolink.exporting.common import Progress, check_frame, facts, needed
-from aolink.exporting.series import Series
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
 from aolink.optics.sensor import BaseSensor, SpotSensor
+from aolink.series import Series
 
 _IN_IMAGES = ("pixels", "inputs")
 """What of an exposure is not in the table, because an image holds it."""

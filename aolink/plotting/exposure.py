@@ -12,13 +12,13 @@ from aolink.errors import ExportError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.registry import BASELINE_ESTIMATOR
 from aolink.exporting.common import check_frame
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density
 from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.plotting.overview import limits_of, profile_density
 from aolink.plotting.style import BAND, TimeUnit, colour, extremes, figure_or_new, hides_swings
+from aolink.series import Series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

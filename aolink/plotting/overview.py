@@ -14,13 +14,13 @@ from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.frames.spots import profiles
 from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.numerics.chi_square import chi_square_quantile
 from aolink.optics.camera import to_density
 from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
 from aolink.plotting.style import TimeUnit, extremes, hides_swings
+from aolink.series import Series
 
 NIS_COVERAGE = 0.95
 """Probability that a consistent estimator's NIS lies inside the bounds drawn."""

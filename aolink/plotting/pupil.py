@@ -12,7 +12,6 @@ from aolink.errors import ExportError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.frames.spots import profiles
 from aolink.exporting.common import check_frame
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
@@ -20,6 +19,7 @@ from aolink.optics.frame import spot_windows
 from aolink.optics.sensor import SpotSensor
 from aolink.plotting.style import colour_bar, figure_or_new
 from aolink.rig import Rig
+from aolink.series import Series
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure

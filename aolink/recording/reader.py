@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel, exposure_model
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.limits import Budget, exceeded, limits, load_array
 from aolink.recording import convert, schemas_pb2, topics
@@ -34,6 +33,7 @@ from aolink.recording.scan import Loss, Summary, chunk_at, open_recording, read_
 from aolink.recording.slices import RecordingSlice
 from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
+from aolink.series import Series
 from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
 
