@@ -130,6 +130,7 @@ class Sender:
         self._skipped = {name: recording.skipped(name) for name in self._names}
         self._scorers = {name: Scorer() for name in self._names}
         self._measuring: set[str] = set()
+        self._shown = [topic for topic in recording.counts if topics.named(topic).shown_by]
         self._known: set[str] = set()
         """Entities and kinds of data that there are."""
         self._scales: dict[str, float] = {}
@@ -146,7 +147,7 @@ class Sender:
         recording = self._recording
         restored = iter(recording.restored())
         ahead = next(restored, None)
-        messages = self._messages(devices.EVERY_STEP)
+        messages = self._messages(tuple(topics.RUNS))
         waiting: Any = next(messages, None)
         for exposures, estimates, following in self._read():
             pictures: list[RestoredPictures] = []
@@ -165,9 +166,7 @@ class Sender:
             raise ViewerError(
                 f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
             )
-        rest = [topic for topic in recording.counts if topics.named(topic).name in devices.LOGS]
-        rest = [topic for topic in rest if topic not in devices.EVERY_STEP]
-        self._send_messages(list(self._messages(rest)))
+        self._send_messages(list(self._messages([topic for topic in self._shown if topic not in topics.RUNS])))
         true_scene = recording.true_scene
         if self._rig.scene is not None and true_scene is not None:
             scene.log_true_scene(self._drawing, self._rig.scene, true_scene)
@@ -265,7 +264,7 @@ class Sender:
         end, ended_ns = last.first_step + last.n_steps, last.host_start_ns + period
         for each in recording.messages(*there, start_ns=max(low, 0), end_ns=high):
             message: Any = each.message
-            if each.topic in devices.EVERY_STEP:
+            if each.topic in topics.RUNS:
                 inside = message.first_step < end and message.first_step + message.n_steps > first.first_step
             else:
                 frame = getattr(message, "frame_id", None)
@@ -282,10 +281,8 @@ class Sender:
         for record in messages:
             by_topic.setdefault(record.topic, []).append(record)
         assert self._timebase is not None
-        for name, log in devices.LOGS.items():
-            for topic, records in by_topic.items():
-                if topics.named(topic).name == name:
-                    log(self._drawing, self._timebase, records)
+        for topic, records in by_topic.items():
+            getattr(devices, topics.named(topic).shown_by)(self._drawing, self._timebase, records)
         self._known |= by_topic.keys()
 
     def contents(self, other: Sender | None = None) -> Contents:
@@ -298,7 +295,7 @@ class Sender:
             truth="truth" in self._known,
             scenes=list(compress(scene.SCENES, (each in self._known for each in scene.SCENES))),
             restored_spots=scene.RESTORED_SPOTS in self._known,
-            topics=frozenset(self._recording.counts.keys() & (self._known if self._finished else devices.LOGS.keys())),
+            topics=frozenset(self._known.intersection(self._shown) if self._finished else self._shown),
             drawn=self._drawing,
             maps=self._scales,
             warnings=self._warnings > 0,
