@@ -16,7 +16,6 @@ from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import Scorer
 from aolink.exposure import Exposure
-from aolink.optics.sensor import SpotSensor
 from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
 from aolink.recording.reader import check_stands_alone
@@ -231,9 +230,9 @@ class Sender:
         before = self._last.frame_id if self._last else exposures[0].frame_id - 1
         self._lost += exposures[-1].frame_id - before - len(exposures)
         self._last = exposures[-1]
-        if isinstance(rig.sensor, SpotSensor) and has_pupil(self._recording):
+        if has_pupil(self._recording):
             best = estimates[self._names[-1]] if self._names else {}
-            log_maps(drawing, timebase, rig, rig.sensor, exposures, best, self._scales)
+            log_maps(drawing, timebase, rig, exposures, best, self._scales)
         if rig.scene is not None and scene.log_scenes(drawing, rig.scene, timebase, exposures):
             self._known.add(scene.SCENE)
         if scene.log_restored(drawing, timebase, exposures, restored):
@@ -372,9 +371,7 @@ def send_camera(
     outputs = {"truth": {e.frame_id: e.truth.path for e in exposures if e.truth is not None}}
     outputs |= {name: {k: e.path for k, e in by_frame.items()} for name, by_frame in estimates.items()}
     camera.log_frames(drawing, timebase, new)
-    light = 1.0
-    if isinstance(sensor, SpotSensor):
-        light = 1.0 if sensor.spot_light is None else float(sensor.spot_light[output // 2])
+    if sensor.directions == 2:
         for name, by_frame in outputs.items():
             camera.log_spot_paths(drawing, sensor, timebase, new, name, by_frame)
     # What follows is one slope over time.
@@ -394,5 +391,5 @@ def send_camera(
     camera.log_now(drawing, line, timebase, shown)
     camera.log_measured_profile(drawing, line, timebase, shown, top)
     for name, by_frame in paths.items():
-        camera.log_path_profile(drawing, line, timebase, shown, name, by_frame, top, light)
+        camera.log_path_profile(drawing, line, timebase, shown, name, by_frame, top, sensor.light_of(output))
     return top
