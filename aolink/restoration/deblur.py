@@ -105,7 +105,7 @@ def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: st
     mixes = np.eye(rig.n_outputs).reshape(-1, sensor.directions, rig.n_outputs)
     psfs = estimated_psfs(exposure, estimate, mixes, sensor.kernel, sensor.pixel_width)
     out = np.zeros_like(share)
-    for spot, psf in enumerate(psfs):
+    for spot, psf in zip(range(sensor.spots), psfs, strict=False):
         window = sensor.window_of(spot)
         out[window] = restore(share[window], psf, method=method, mask=good[window]).image
     return out
