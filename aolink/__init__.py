@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from aolink.estimation import Estimate
-    from aolink.exporting.series import Series
     from aolink.exposure import Exposures
     from aolink.recording.reader import Recording
     from aolink.rig import Rig, load_rig
+    from aolink.series import Series
 
     __version__: str
 

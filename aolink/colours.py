@@ -8,7 +8,6 @@ from contextlib import suppress
 
 from aolink import estimation
 from aolink.errors import EstimatorError
-from aolink.estimation.looks import LOOKS, Look
 
 Colour = tuple[int, int, int]
 
@@ -19,7 +18,7 @@ def estimator_colour(name: str) -> Colour:
     """Colour of an estimator; one that has options, or is not installed here, gets one by its name, always the same."""
     if ":" not in name:
         with suppress(EstimatorError):
-            return _look(name).colour
+            return estimation.estimator_row(name).colour
     return _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)]
 
 
@@ -28,13 +27,8 @@ def by_rank(names: list[str]) -> list[str]:
 
     def rank(name: str) -> float:
         try:
-            return _look(name).rank
+            return estimation.estimator_row(name).rank
         except EstimatorError:
             return math.inf
 
     return sorted(names, key=lambda name: (rank(name), name))
-
-
-def _look(name: str) -> Look | estimation.EstimatorRow:
-    """Place and colour of an estimator, whose name may have its options; aolink's own need not be loaded for that."""
-    return LOOKS.get(name.partition(":")[0]) or estimation.estimator_row(name)

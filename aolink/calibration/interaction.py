@@ -15,7 +15,7 @@ from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
 from aolink.optics.frame import spot_windows
-from aolink.optics.sensor import SpotSensor
+from aolink.optics.sensor import BaseSensor
 from aolink.rig import Rig
 
 # A pixel counts if its density exceeds this many sd of noise: pixels far from the spot only add noise.
@@ -119,8 +119,7 @@ def measure_interaction(
     CalibrationError
         The sensor has no grid of spots, spots are missing, or inputs did not move apart from each other.
     """
-    if not isinstance(rig.sensor, SpotSensor):
-        raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
+    check_spots(rig)
     inputs, slopes, value, rested = [], [], np.full(rig.n_inputs, np.nan), 0
     for exposure in exposures:
         seen = slopes_of(exposure) if slopes_of else None
@@ -156,7 +155,13 @@ def measure_interaction(
     )
 
 
-def spot_slopes(sensor: SpotSensor, pixels: NDArray[np.uint16]) -> FloatArray:
+def check_spots(rig: Rig) -> None:
+    """Raise CalibrationError for a sensor that sees no slopes in two directions."""
+    if rig.sensor.directions == 1:
+        raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
+
+
+def spot_slopes(sensor: BaseSensor, pixels: NDArray[np.uint16]) -> FloatArray:
     """Thresholded centroid of each spot in the rig's order, slope units, (2 spots,); NaN where there is no spot."""
     density = spot_windows(sensor, to_density(sensor, pixels))
     noise = np.sqrt(sensor.noise_density / sensor.pixel_size)

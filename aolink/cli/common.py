@@ -16,6 +16,7 @@ from aolink.errors import EstimatorError, RigError
 
 if TYPE_CHECKING:
     from aolink.estimation import Score
+    from aolink.optics.sensor import BaseSensor
     from aolink.recording.reader import Recording
     from aolink.recording.remote import Url
     from aolink.rig import Rig
@@ -102,15 +103,13 @@ def open_recording(file: "str | Path | Url", *, check: bool = False, side: "Sequ
     return recording
 
 
-def spot_of(sensor: object, lenslet: str) -> int:
+def spot_of(sensor: "BaseSensor", lenslet: str) -> int:
     """Number of the spot of a lenslet that is named by its row and column."""
     import numpy as np
 
-    from aolink.optics.sensor import SpotSensor
-
     if not (match := re.fullmatch(r"(\d+),(\d+)", lenslet)):
         raise typer.BadParameter(f"--lenslet {lenslet}: give row and column, counted from 0, as 2,3")
-    if not isinstance(sensor, SpotSensor):
+    if sensor.directions == 1:
         raise typer.BadParameter("--lenslet is for a sensor with lenslets; this one is a line")
     row, column = map(int, match.groups())
     rows, columns = sensor.grid

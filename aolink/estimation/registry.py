@@ -13,33 +13,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from aolink.errors import EstimatorError
-from aolink.estimation.compiled import make_ready
-from aolink.estimation.estimator import Estimator
-from aolink.estimation.frames.centroid_noise import centroid_covariance
-from aolink.estimation.frames.frame_data import SpotWindows
-from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
-from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
-from aolink.estimation.kalman.path_moments import Observation, PathMoments, SecondOrderMoments
-from aolink.estimation.kalman.predict import added_noise
-from aolink.estimation.kalman.steady_gain import steady_gain
-from aolink.estimation.looks import LOOKS
-from aolink.estimation.model.exposure_model import exposure_model
-from aolink.estimation.moments.joint_moments import JointMoments
-from aolink.estimation.moments.spots import WindowedSpots
-from aolink.estimation.moments.windowed import WindowedMoments
-from aolink.estimation.options import Engine, Options, checked_options, with_options
-from aolink.estimation.pixels.joint_pixels import JointProfile
 from aolink.extensions import names_with, row_named
-from aolink.numerics.arrays import FloatArray
-from aolink.optics.sensor import Sensor, SpotSensor
 from aolink.plant.alike import MANY_STATES, alike_systems
 from aolink.rig import Rig
+
+if TYPE_CHECKING:
+    from aolink.estimation.estimator import Estimator
+    from aolink.estimation.kalman.filter import Filter
+    from aolink.estimation.options import Engine, Options
 
 GROUP = "aolink.estimators"
 """The entry points by which other packages add estimators."""
@@ -104,6 +90,11 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     EstimatorError
         There is no such estimator or option, or it cannot work on this rig.
     """
+    # Not before: whoever wants no more of a row than its colour and rank waits for none of these.
+    from aolink.estimation.estimator import Estimator
+    from aolink.estimation.model.exposure_model import exposure_model
+    from aolink.estimation.options import checked_options, with_options
+
     row, chosen = estimator_row(name), checked_options(**options | with_options(name)[1])
     if reason := row.refusal(rig):
         raise EstimatorError(reason)
@@ -127,71 +118,6 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
     return WanderingEstimator(rig, made)
 
 
-def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None) -> BlurFilter:
-    return BlurFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
-
-
-def _open_loop(rig: Rig, options: Options) -> Filter:
-    return _blur_filter(rig, options, None)
-
-
-def _paper(*orders: int) -> Callable[[Rig, Options], Filter]:
-    """The filters of Mishra & Wen with these moments."""
-
-    def build(rig: Rig, options: Options) -> Filter:
-        gain = _steady_gain(rig, options) if orders == (1,) and options.gain == "steady-state" else None
-        if options.engine == "filterpy":
-            theirs = FilterpyMoments(rig.plant, orders, gain, flux=options.flux)
-            return BlurFilter(
-                rig.plant, theirs, process_noise=options.process_noise, gate=options.gate, predictor=theirs.predict
-            )
-        if options.second_order and 2 in orders:
-            if rig.plant.n_outputs > 2:
-                raise EstimatorError(
-                    f"second_order is for plants of one spot, {rig.name} has {rig.plant.n_outputs // 2}: use moments"
-                )
-            return _blur_filter(rig, options, SecondOrderMoments(rig.plant, orders, flux=options.flux))
-        moments = PathMoments(rig.plant, orders, gain, flux=options.flux)
-        if orders == (1, 2) and TwoStateFilter.suits(rig.plant):
-            two = TwoStateFilter(rig.plant, moments, process_noise=options.process_noise, gate=options.gate)
-            two.warm_up(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset))
-            return two
-        return _blur_filter(rig, options, moments)
-
-    return build
-
-
-@lru_cache(maxsize=4)
-def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
-    """The steady-state gain of o1 by the noise in the rig file, one for all axes or one each; None if there is none."""
-    model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
-    Q = added_noise(model, options.process_noise)
-    # Axes whose spots have the same light share a gain.
-    noises, of_axis = np.unique(centroid_covariance(rig), axis=0, return_inverse=True)
-    gains = [steady_gain(model, Q, noise) for noise in noises]
-    if len(gains) == 1:
-        return gains[0]
-    known = [gain for gain in gains if gain is not None]
-    return np.array(known)[of_axis] if len(known) == len(gains) else None
-
-
-def _moments(rig: Rig, options: Options) -> Filter:
-    if alike_systems(rig.plant) is not None:
-        _warm_up(rig)
-    return _blur_filter(rig, options, _windowed(rig, options))
-
-
-def _windowed(rig: Rig, options: Options) -> Observation[Any]:
-    """Windowed moments of a line sensor, of spots, or of all spots of a plant with hundreds of states."""
-    orders, basis, flux, n_outputs = options.orders, options.basis, options.flux, rig.plant.n_outputs
-    if n_outputs == 1:
-        return WindowedMoments(rig.sensor.profile, orders, basis=basis, flux=flux)
-    assert isinstance(rig.sensor, SpotSensor)
-    if alike_systems(rig.plant) is not None:
-        return JointMoments(rig.sensor, n_outputs, orders, basis=basis, flux=flux)
-    return WindowedSpots(rig.sensor, n_outputs // 2, orders, basis=basis, flux=flux)
-
-
 def _moments_refusal(rig: Rig) -> str | None:
     if rig.plant.n_outputs > 2 * _MOST_SPOTS and alike_systems(rig.plant) is None:
         return (
@@ -199,54 +125,6 @@ def _moments_refusal(rig: Rig) -> str | None:
             f" {rig.name} has {rig.plant.n_outputs // 2}: use o3"
         )
     return None
-
-
-def _warm_up(rig: Rig) -> None:
-    """Estimate a dark exposure of many spots, so that what this loads is loaded before the session."""
-    assert isinstance(rig.sensor, SpotSensor)
-    steps = rig.timing.exposure_steps
-    model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
-    shape = (rig.plant.axes, rig.plant.n_outputs // 2, *rig.sensor.window)
-    dark = SpotWindows(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
-    make_ready()
-    for each in (JointMoments, JointProfile):
-        blur_filter = BlurFilter(rig.plant, each(rig.sensor, rig.plant.n_outputs))
-        blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
-
-
-def _profile(rig: Rig, options: Options) -> Filter:
-    if alike_systems(rig.plant) is None:
-        from aolink.estimation.pixels.updates import PROFILE
-
-        return _of_pixels(rig, options, PROFILE.within(options.tempered))
-    assert isinstance(rig.sensor, SpotSensor)
-    _warm_up(rig)
-    return _blur_filter(rig, options, JointProfile(rig.sensor, rig.plant.n_outputs))
-
-
-def _mixture(rig: Rig, options: Options) -> Filter:
-    from aolink.estimation.pixels.updates import MIXTURE
-
-    return _of_pixels(rig, options, MIXTURE.within(options.tempered))
-
-
-def _sampled(rig: Rig, options: Options) -> Filter:
-    from aolink.estimation.pixels.sampled import TemperedUpdater
-
-    return _of_pixels(rig, options, TemperedUpdater(options.particles, options.seed))
-
-
-def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
-    """The filters that use every pixel; their compiled code is loaded when the first one is made."""
-    from aolink.estimation.pixels.filter import MixtureFilter
-    from aolink.estimation.pixels.updates import MIXTURE
-
-    pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
-    # mixture compiles at once what profile would compile at the first posterior of several modes.
-    make_ready()
-    pixels.warm_up(MIXTURE)
-    updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
-    return pixels
 
 
 def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
@@ -261,7 +139,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
                 f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"
             )
-        if isinstance(rig.sensor, SpotSensor) and rig.sensor.spot_light is not None:
+        if rig.sensor.spot_light is not None:
             return (
                 f"{name} takes each spot to have the whole light, but {rig.name} has partly lit lenslets:"
                 " use moments or o3"
@@ -273,24 +151,44 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
 
 def _is_line(rig: Rig) -> bool:
     """Whether the sensor is a line: for spots on a plane the filters that use every pixel are too slow for a demo."""
-    return isinstance(rig.sensor, Sensor)
+    return rig.sensor.directions == 1
 
 
-def _row(name: str, **rest: Any) -> EstimatorRow:
-    return EstimatorRow(name=name, **LOOKS[name]._asdict(), **rest)
+def _built(maker: str, *orders: int) -> Callable[[Rig, Options], Filter]:
+    """The function of that name in `aolink.estimation.filters`, which is loaded when it is called."""
+
+    def build(rig: Rig, options: Options) -> Filter:
+        from aolink.estimation import filters
+
+        made: Filter = getattr(filters, maker)(rig, options, *orders)
+        return made
+
+    return build
 
 
 _PAPER_ENGINES: tuple[Engine, ...] = ("aolink", "filterpy")
 _OURS = {
     row.name: row
     for row in (
-        _row("open-loop", build=_open_loop),
-        _row("o1", build=_paper(1), engines=_PAPER_ENGINES),
-        _row("o2", build=_paper(2), engines=_PAPER_ENGINES),
-        _row("o3", build=_paper(1, 2), engines=_PAPER_ENGINES),
-        _row("moments", build=_moments, refusal=_moments_refusal, wanders=True),
-        _row("profile", build=_profile, refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_line),
-        _row("mixture", build=_mixture, refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_line),
-        _row("sampled", build=_sampled, refusal=_pixels_refusal("sampled"), wanders=True, in_demo=lambda rig: False),
+        EstimatorRow(name="open-loop", rank=0, colour=(204, 121, 167), build=_built("open_loop")),
+        EstimatorRow(name="o1", rank=10, colour=(86, 180, 233), build=_built("paper", 1), engines=_PAPER_ENGINES),
+        EstimatorRow(name="o2", rank=20, colour=(120, 130, 255), build=_built("paper", 2), engines=_PAPER_ENGINES),
+        EstimatorRow(name="o3", rank=30, colour=(240, 110, 50), build=_built("paper", 1, 2), engines=_PAPER_ENGINES),
+        EstimatorRow(
+            name="moments", rank=40, colour=(0, 175, 125), build=_built("moments"), refusal=_moments_refusal,
+            wanders=True,
+        ),
+        EstimatorRow(
+            name="profile", rank=50, colour=(140, 210, 80), build=_built("profile"),
+            refusal=_pixels_refusal("profile"), wanders=True, in_demo=_is_line,
+        ),
+        EstimatorRow(
+            name="mixture", rank=60, colour=(240, 80, 140), build=_built("mixture"),
+            refusal=_pixels_refusal("mixture"), wanders=True, in_demo=_is_line,
+        ),
+        EstimatorRow(
+            name="sampled", rank=70, colour=(190, 130, 80), build=_built("sampled"),
+            refusal=_pixels_refusal("sampled"), wanders=True, in_demo=lambda rig: False,
+        ),
     )
-}
+}  # fmt: skip

@@ -1,1 +1,1 @@
-"""Exposures and their estimates for other programs: arrays, tables, datasets, files, a plot."""
+"""Exposures and their estimates for other programs: arrays, tables, datasets, files."""

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from aolink.errors import ExportError
 from aolink.exporting.common import Progress, clock_of, facts, needed, no_progress, time_ns, together
-from aolink.exporting.series import Series
 from aolink.exporting.summary import estimate_scalars
 from aolink.exposure import Exposure
+from aolink.series import Series
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -10,8 +10,8 @@ from typing import Any
 
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Estimate
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
+from aolink.series import Series
 
 Progress = Callable[[int], None]
 """Is told how many exposures have been read."""

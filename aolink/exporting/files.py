@@ -13,10 +13,10 @@ import numpy as np
 from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays, to_xarray
 from aolink.exporting.common import Progress, facts, needed, no_progress
-from aolink.exporting.series import Series
 from aolink.exporting.table import columns, rows
 from aolink.exporting.telemetry import write_fits
 from aolink.files import check_target, writing
+from aolink.series import Series
 
 _ROWS_AT_ONCE = 4096
 """Rows of a Parquet file that are in memory together."""

@@ -10,10 +10,10 @@ import numpy as np
 
 from aolink.estimation.estimate import Estimate
 from aolink.exporting.common import Progress, clock_of, needed, no_progress, time_ns, together
-from aolink.exporting.series import Series
 from aolink.exporting.summary import estimate_scalars, path_rms, rms_by_axis
 from aolink.exposure import Exposure, Truth
 from aolink.numerics.arrays import FloatArray
+from aolink.series import Series
 
 if TYPE_CHECKING:
     import pandas as pd

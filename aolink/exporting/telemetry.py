@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from aolink.estimation.frames.spots import profiles
+from aolink.estimation.frames.measure import profiles_of
 from aolink.exporting.arrays import ESTIMATE, EXPOSURE, TRUTH, Variable, arrays
 from aolink.exporting.common import Progress, check_frame, facts, needed
-from aolink.exporting.series import Series
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.centroid import centre_of_gravity
-from aolink.optics.sensor import BaseSensor, SpotSensor
+from aolink.optics.sensor import BaseSensor
+from aolink.series import Series
 
 _IN_IMAGES = ("pixels", "inputs")
 """What of an exposure is not in the table, because an image holds it."""
@@ -61,12 +61,14 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
     source = aot.NaturalGuideStar(uid="SPOT")
     sensor, pixels = rig.sensor, found["pixels"].values
     if "slopes" in found:
-        spots, centres = _slopes(sensor, found["slopes"].values)
+        slopes = found["slopes"].values
     else:
-        spots, centres = _centres(series, pixels, found["mask"].values)
-    shape, lit = (sensor.grid, sensor.lit) if isinstance(sensor, SpotSensor) else ((1, 1), [0])
-    grid = np.full(shape, -1)
-    grid.flat[lit] = np.arange(spots)
+        slopes = _centres(sensor, pixels, found["mask"].values)
+    # As the format has them, (frames, 2, spots); NaN where there is no second direction.
+    centres = np.full((len(slopes), 2, sensor.spots), np.nan)
+    centres[:, : sensor.directions] = slopes.reshape(len(slopes), sensor.spots, -1).swapaxes(1, 2)
+    grid = np.full(sensor.grid, -1)
+    grid.flat[sensor.lit] = np.arange(sensor.spots)
     camera = aot.Detector(
         uid="CAMERA",
         pixel_intensities=None if "slopes" in found else aot.Image("PIXELS", pixels, unit="adu", time=frames),
@@ -76,11 +78,11 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
     wavefront_sensor = aot.ShackHartmann(
         uid="SENSOR",
         source=source,
-        n_valid_subapertures=spots,
+        n_valid_subapertures=sensor.spots,
         measurements=aot.Image("CENTRES_OF_GRAVITY", centres, unit="slope unit", time=frames),
         subaperture_mask=aot.Image("SUBAPERTURES", grid),
         mask_offsets=[aot.Coordinates(0, 0)],
-        subaperture_size=float(sensor.window[1]) if isinstance(sensor, SpotSensor) else None,
+        subaperture_size=float(sensor.profile.pixels) if sensor.directions == 2 else None,
         detector=camera,
         centroiding_algorithm=None if "slopes" in found else "centre of gravity of the window",
     )
@@ -113,31 +115,14 @@ def _system(aot: Any, series: Series, found: Mapping[str, Variable]) -> Any:
     )  # fmt: skip
 
 
-def _centres(series: Series, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]) -> tuple[int, FloatArray]:
-    """Number of spots, and centres of gravity of the frames, slope units, (frames, 2, spots).
-
-    NaN where a window holds no light or has lost a pixel.
-    """
-    sensor = series.rig.sensor
+def _centres(sensor: BaseSensor, pixels: NDArray[np.uint16], mask: NDArray[np.bool_]) -> FloatArray:
+    """Centres of gravity of frames, slope units, (frames, outputs); NaN where a window is dark or has lost a pixel."""
     line = sensor.profile
-    if isinstance(sensor, SpotSensor):
-        each = [profiles(sensor, frame, whole) for frame, whole in zip(pixels, mask, strict=True)]
-        counts, good = np.array([e.counts for e in each]), np.array([e.mask for e in each])
-    else:
-        counts, good = pixels.astype(np.float64), mask
+    each = [profiles_of(sensor, frame, whole) for frame, whole in zip(pixels, mask, strict=True)]
+    counts, good = np.array([e.counts for e in each]), np.array([e.mask for e in each])
     light = to_density(line, counts.reshape(-1, 1, line.pixels))
     found = line.field[0] + (centre_of_gravity(light)[:, 0] + 0.5) * line.pixel_width
-    found = np.where(good.reshape(-1, line.pixels).all(axis=1), found, np.nan).reshape(len(pixels), -1)
-    if not isinstance(sensor, SpotSensor):
-        return 1, np.stack([found, np.full_like(found, np.nan)], axis=1)
-    return sensor.spots, found.reshape(len(pixels), sensor.spots, 2).swapaxes(1, 2)
-
-
-def _slopes(sensor: BaseSensor, slopes: FloatArray) -> tuple[int, FloatArray]:
-    """Number of spots, and recorded slopes as the format has them, (frames, 2, spots); NaN where there is no second."""
-    if isinstance(sensor, SpotSensor):
-        return sensor.spots, slopes.reshape(len(slopes), sensor.spots, 2).swapaxes(1, 2)
-    return slopes.shape[1], np.stack([slopes, np.full_like(slopes, np.nan)], axis=1)
+    return np.where(good.reshape(-1, line.pixels).all(axis=1), found, np.nan).reshape(len(pixels), -1)
 
 
 def _commands(found: Mapping[str, Variable]) -> tuple[NDArray[np.int64], FloatArray]:

@@ -25,7 +25,7 @@ from aolink.numerics.arrays import BoolArray, FloatArray
 from aolink.optics.centroid import weighted_centroid
 from aolink.optics.kernel import pixel_masses
 from aolink.optics.maxima import cut_windows, find_maxima, flatten, spot_sd
-from aolink.optics.sensor import SpotSensor
+from aolink.optics.sensor import BaseSensor
 from aolink.rig import Rig
 
 _EDGE = 4.0
@@ -333,7 +333,7 @@ def tracked(
         The rig file does not describe so many spots, or the film shows fewer objects.
     """
     sensor = rig.sensor
-    if not isinstance(sensor, SpotSensor) or sensor.spots != settings.track or sensor.light is not None:
+    if sensor.directions == 1 or sensor.spots != settings.track or sensor.spot_light is not None:
         raise ImportingError(
             f"--track {settings.track} needs a rig file with {settings.track} spots, sensor.kind = 'spots'"
             f" (aolink rig --from writes one), {rig.name} has {rig.n_outputs} slopes of a {sensor.shape[0]} x"
@@ -416,8 +416,8 @@ def _state(rig: Rig, output: FloatArray | None) -> FloatArray:
 class _Windows:
     """A window for each object; it moves by whole pixels where the rig's inputs can tell the estimators so."""
 
-    def __init__(self, rig: Rig, sensor: SpotSensor, known: Survey) -> None:
-        self._sensor, self._side = sensor, sensor.window[0]
+    def __init__(self, rig: Rig, sensor: BaseSensor, known: Survey) -> None:
+        self._sensor, self._side = sensor, sensor.profile.pixels
         plant = rig.plant
         gain = plant.C @ plant.B
         # An input moves the outputs at once, and for good.

@@ -13,13 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from aolink.calibration import KINDS, Calibration, Frames, calibrate, calibrated_text
-from aolink.calibration.interaction import Interaction, measure_interaction, poke_inputs, rest_exposures
+from aolink.calibration.interaction import Interaction, check_spots, measure_interaction, poke_inputs, rest_exposures
 from aolink.calibration.measure import LEAST_FRAMES, line_sensor
 from aolink.devices.opening import open_devices
 from aolink.errors import AolinkError, CalibrationError, RigError
 from aolink.estimation import make_estimator
 from aolink.files import check_target
-from aolink.optics.sensor import SpotSensor
 from aolink.recording import topics
 from aolink.recording.reader import Recording
 from aolink.rig import Rig
@@ -194,8 +193,7 @@ def record_pokes(
     AolinkError
         As `aolink.session.record`.
     """
-    if not isinstance(rig.sensor, SpotSensor):
-        raise CalibrationError("an interaction matrix needs a sensor of kind 'spots'")
+    check_spots(rig)
     size = share * (rig.mirror.input_max - rig.mirror.input_min)
     pokes = np.tile(poke_inputs(rig, size, rest_exposures(rig, hold_s)), (repeats, 1))
 

@@ -17,7 +17,6 @@ from aolink.estimation.assumptions import broken_assumptions, peak_snr
 from aolink.estimation.frames.moments import least_significance, spot_significance
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density
-from aolink.optics.sensor import SpotSensor
 from aolink.plant.check import nominal_path
 from aolink.plant.lifting import lift
 from aolink.plant.observability import observability
@@ -150,7 +149,7 @@ def _check_sensor(rig: Rig) -> Iterator[Finding]:
     low, high = sensor.field
     pixel, width = sensor.pixel_width, high - low
     narrow, wide = np.sqrt(np.linalg.eigvalsh(sensor.kernel.covariance)).tolist()
-    spots = f" for each of {sensor.spots} spots" if isinstance(sensor, SpotSensor) else ""
+    spots = f" for each of {sensor.spots} spots" if sensor.directions == 2 else ""
     sds = f"{wide:.3g}" if narrow == wide else f"{narrow:.3g} to {wide:.3g}"
     in_pixels = f"{wide / pixel:.3g}" if narrow == wide else f"{narrow / pixel:.3g} to {wide / pixel:.3g}"
     yield _info(

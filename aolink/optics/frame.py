@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density, pixel_mass, pixel_masses
 from aolink.optics.plane import exposure_density_2d
-from aolink.optics.sensor import BaseSensor, Kernel, Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, Kernel
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -39,27 +39,28 @@ def frame_density(sensor: BaseSensor, path: FloatArray) -> FloatArray:
     -------
     (rows, columns); the spot of a lenslet that is lit in part has that share of the light.
     """
-    if isinstance(sensor, SpotSensor):
-        rows, columns = sensor.grid
-        edges, paths = sensor.profile.edges, path.reshape(sensor.spots, 2, -1)
-        if sensor.kernel.matrix is None:
-            windows = spots_density(sensor.kernel, edges, paths)
-        else:
-            windows = exposure_density_2d(sensor.kernel.covariance, edges, edges, paths.swapaxes(1, 2))
-        if sensor.spot_light is not None:
-            lit, windows = windows, np.zeros((rows * columns, *sensor.window))
-            windows[sensor.lit] = lit * sensor.spot_light[:, None, None]
-        tiled = windows.reshape(rows, columns, *sensor.window).swapaxes(1, 2)
-        return np.asarray(np.ascontiguousarray(tiled).reshape(sensor.shape))
-    assert isinstance(sensor, Sensor)
-    return exposure_density(sensor.kernel, sensor.edges, path)
+    edges = sensor.profile.edges
+    if sensor.directions == 1:
+        return exposure_density(sensor.kernel, edges, path)
+    (rows, columns), paths = sensor.grid, path.reshape(sensor.spots, 2, -1)
+    if sensor.kernel.matrix is None:
+        windows = spots_density(sensor.kernel, edges, paths)
+    else:
+        windows = exposure_density_2d(sensor.kernel.covariance, edges, edges, paths.swapaxes(1, 2))
+    window = windows.shape[1:]
+    if sensor.spot_light is not None:
+        lit, windows = windows, np.zeros((rows * columns, *window))
+        windows[sensor.lit] = lit * sensor.spot_light[:, None, None]
+    tiled = windows.reshape(rows, columns, *window).swapaxes(1, 2)
+    return np.asarray(np.ascontiguousarray(tiled).reshape(sensor.shape))
 
 
-def spot_windows(sensor: SpotSensor, frame: NDArray[Scalar]) -> NDArray[Scalar]:
+def spot_windows(sensor: BaseSensor, frame: NDArray[Scalar]) -> NDArray[Scalar]:
     """A frame cut into its spots' windows, (rows, columns) -> (spots, rows of a window, columns of a window)."""
-    (rows, columns), (height, width) = sensor.grid, sensor.window
-    cut = frame.reshape(rows, height, columns, width).swapaxes(1, 2).reshape(-1, height, width)
-    return cut if sensor.light is None else cut[sensor.lit]
+    rows, columns = sensor.grid
+    tiles = frame.reshape(rows, len(frame) // rows, columns, -1).swapaxes(1, 2)
+    cut = tiles.reshape(-1, *tiles.shape[2:])
+    return cut if sensor.spot_light is None else cut[sensor.lit]
 
 
 def spots_density(kernel: Kernel, edges: FloatArray, path: FloatArray) -> FloatArray:

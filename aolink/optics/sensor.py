@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -44,8 +44,16 @@ class Kernel:
 
 @dataclass(frozen=True, kw_only=True)
 class BaseSensor(ABC):
-    """The common part of all sensors: equal pixels, each spot seen on ``field``, an integer read-out."""
+    """The common part of all sensors: equal pixels, each spot seen on ``field``, an integer read-out.
 
+    Whoever uses a sensor asks it for what differs, not for its class: the rig's outputs are ``directions`` slopes of
+    each spot, spot after spot.
+    """
+
+    directions = 1
+    """Directions in which a spot is seen: along a line, or in x and y."""
+    grid = (1, 1)
+    """Rows and columns of windows."""
     field: tuple[float, float]
     """Outer edges of the first and the last pixel that see a spot, slope units; the same in both directions."""
     noise_density: float
@@ -83,6 +91,31 @@ class BaseSensor(ABC):
     @abstractmethod
     def peak_density(self) -> float:
         """Density of a pixel at whose middle a spot rests."""
+
+    @property
+    def lit(self) -> Indices:
+        """Windows that have a spot, counted along the rows of the grid, (spots,)."""
+        return np.arange(self.grid[0] * self.grid[1])
+
+    @property
+    def spots(self) -> int:
+        """Number of spots."""
+        return len(self.lit)
+
+    @property
+    def spot_light(self) -> FloatArray | None:
+        """Share of each spot's lenslet that is lit, (spots,); None where all is."""
+        return None
+
+    def light_of(self, output: int) -> float:
+        """Share of its light that the spot of an output gets."""
+        return 1.0 if self.spot_light is None else float(self.spot_light[output // self.directions])
+
+    def window_of(self, spot: int) -> tuple[slice, slice]:
+        """Where a spot's window is in a frame."""
+        height, width = (pixels // windows for pixels, windows in zip(self.shape, self.grid, strict=True))
+        row, column = divmod(int(self.lit[spot]), self.grid[1])
+        return np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
 
     @property
     def full_scale(self) -> int:
@@ -144,22 +177,17 @@ class SpotSensor(BaseSensor):
     """
 
     kind: Literal["spots"]
-    grid: tuple[int, int]
-    """Rows and columns of windows."""
+    directions = 2
+    grid: tuple[int, int] = field()  # one that has to be given, unlike a line's
     window: tuple[int, int]
     """Rows and columns of pixels in a window; a square."""
     light: tuple[float, ...] | None = None
     """Share of each window's lenslet that is lit, along the rows of the grid; 0 without a spot. None: all is."""
 
-    @property
-    def spots(self) -> int:
-        """Number of spots."""
-        return len(self.lit)
-
     @cached_property
     def lit(self) -> Indices:
         """Windows that have a spot, counted along the rows of the grid, (spots,)."""
-        return np.arange(self.grid[0] * self.grid[1]) if self.light is None else np.flatnonzero(self.light)
+        return super().lit if self.light is None else np.flatnonzero(self.light)
 
     @cached_property
     def spot_light(self) -> FloatArray | None:

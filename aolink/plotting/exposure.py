@@ -12,13 +12,13 @@ from aolink.errors import ExportError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.registry import BASELINE_ESTIMATOR
 from aolink.exporting.common import check_frame
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.kernel import exposure_density
-from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, Sensor
 from aolink.plotting.overview import limits_of, profile_density
 from aolink.plotting.style import BAND, TimeUnit, colour, extremes, figure_or_new, hides_swings
+from aolink.series import Series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,10 +102,9 @@ def draw_exposure(
 ) -> Figure | SubFigure:  # fmt: skip
     """What `plot_exposure` draws, of an exposure that has been read."""
     sensor = series.rig.sensor
-    on_plane = isinstance(sensor, SpotSensor)
-    spots = sensor.spots if isinstance(sensor, SpotSensor) else series.rig.n_outputs
-    if not 0 <= spot < spots:
-        raise ExportError(f"there is no spot {spot}: the sensor has {spots}, counted from 0")
+    on_plane = sensor.directions == 2
+    if not 0 <= spot < sensor.spots:
+        raise ExportError(f"there is no spot {spot}: the sensor has {sensor.spots}, counted from 0")
     outputs = [2 * spot, 2 * spot + 1] if on_plane else [spot]
     figure = figure_or_new(figure, (_SIZE_IN[0], _SIZE_IN[1] * (1.6 if on_plane else 1.0)))
     widths = [3.0, 1.0, 1.2, 2.0] if on_plane else [3.0, 1.0, 1.2]
@@ -120,7 +119,7 @@ def draw_exposure(
             for panel in panels:
                 panel.set_xlabel("")
         first = first or left
-    if isinstance(sensor, SpotSensor):
+    if on_plane:
         _draw_spot(figure.add_subplot(grid[:, 3]), sensor, exposure, estimates, spot)
     if first is not None and first.get_legend_handles_labels()[0]:
         figure.legend(*first.get_legend_handles_labels(), loc="outside upper left", ncols=4)
@@ -156,7 +155,7 @@ def _draw_row(
         _draw_path(over_time, times, path, sd, name)
         share = np.histogram(np.clip(path, low, high), bins, density=True)[0]
         histogram.stairs(share, bins, orientation="horizontal", color=colour(name), linewidth=0.9)
-        predicted = _light(series, output) * exposure_density(line.kernel, line.edges, path)
+        predicted = series.rig.sensor.light_of(output) * exposure_density(line.kernel, line.edges, path)
         width = 1.5 if name == "truth" else 1.0
         intensity.stairs(predicted, line.edges, orientation="horizontal", color=colour(name), linewidth=width)
     over_time.set(ylim=(low, high), xlim=(0, exposure.n_steps * scale))
@@ -182,12 +181,10 @@ def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray |
 
 
 def _draw_spot(
-    axes: Axes, sensor: SpotSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int
+    axes: Axes, sensor: BaseSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int
 ) -> None:  # fmt: skip
     """The picture of one spot with the paths over it."""
-    row, column = divmod(int(sensor.lit[spot]), sensor.grid[1])
-    height, width = sensor.window
-    window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+    window = sensor.window_of(spot)
     counts = np.where(exposure.mask[window], exposure.pixels[window].astype(float), np.nan)
     low, high = sensor.field
     picture = axes.imshow(counts, cmap="Greys", extent=(low, high, high, low), interpolation="nearest")
@@ -203,9 +200,3 @@ def _draw_spot(
         ends = np.array([limits_of(sensor.profile, [path[k] for path in paths.values()]) for k in (0, 1)])
         half, (middle_x, middle_y) = float(np.ptp(ends, axis=1).max()) / 2, ends.mean(axis=1)
         axes.set(xlim=(middle_x - half, middle_x + half), ylim=(middle_y + half, middle_y - half))
-
-
-def _light(series: Series, output: int) -> float:
-    """Share of its light that an output's lenslet gets."""
-    light = series.rig.sensor.spot_light if isinstance(series.rig.sensor, SpotSensor) else None
-    return 1.0 if light is None else float(light[output // 2])

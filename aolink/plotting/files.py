@@ -11,7 +11,6 @@ from aolink.colours import by_rank
 from aolink.errors import ExportError
 from aolink.exporting.common import Progress, no_progress
 from aolink.files import writing
-from aolink.optics.sensor import SpotSensor
 from aolink.plotting.devices import plot_latency, plot_losses
 from aolink.plotting.exposure import plot_exposure
 from aolink.plotting.overview import Overview, need_exposures, overview
@@ -116,7 +115,7 @@ def save_figure(
             if what == "scene":
                 plot_scene(recording, number, figure)
             else:
-                if isinstance(recording.rig.sensor, SpotSensor):
+                if recording.rig.sensor.directions == 2:
                     figure.set_figheight(figure.get_figheight() * 1.5)
                 plot_exposure(recording, number, figure, estimators=estimators, spot=spot, unit=unit)
         metadata = {key: None for suffix, key in _DATED.items() if suffix == path.suffix.lower()}

@@ -11,16 +11,16 @@ import numpy as np
 from aolink.colours import by_rank
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Estimate, Status
-from aolink.estimation.frames.spots import profiles
+from aolink.estimation.frames.measure import profiles_of
 from aolink.estimation.score import Score, Scorer
 from aolink.exporting.common import Progress, check_frame, no_progress
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray, IntArray
 from aolink.numerics.chi_square import chi_square_quantile
 from aolink.optics.camera import to_density
-from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, Sensor
 from aolink.plotting.style import TimeUnit, extremes, hides_swings
+from aolink.series import Series
 
 NIS_COVERAGE = 0.95
 """Probability that a consistent estimator's NIS lies inside the bounds drawn."""
@@ -284,11 +284,8 @@ class _Gathered:
 
 def profile_density(sensor: BaseSensor, exposure: Exposure, output: int) -> FloatArray:
     """Intensity density over the positions of one output, one over slope units, (pixels,); NaN: it never came."""
-    counts, mask = exposure.pixels.astype(np.float64), exposure.mask
-    if isinstance(sensor, SpotSensor):
-        found = profiles(sensor, exposure.pixels, exposure.mask)
-        counts, mask = np.asarray(found.counts[output], dtype=np.float64), found.mask[output]
-    return np.where(mask, to_density(sensor.profile, counts), np.nan).ravel()
+    found = profiles_of(sensor, exposure.pixels, exposure.mask)
+    return np.where(found.mask[output], to_density(sensor.profile, found.counts[output]), np.nan)
 
 
 def limits_of(line: Sensor, paths: Sequence[FloatArray]) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from aolink.plotting.style import colour
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from aolink.exporting.series import Series
+    from aolink.series import Series
 
 _SIZE_IN, _DPI = (16.0, 11.5), 110
 _CLOSE_UPS = 3

@@ -10,16 +10,16 @@ import numpy as np
 from aolink.colours import by_rank
 from aolink.errors import ExportError
 from aolink.estimation.estimate import Estimate
-from aolink.estimation.frames.spots import profiles
+from aolink.estimation.frames.measure import profiles_of
 from aolink.exporting.common import check_frame
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import to_density
 from aolink.optics.frame import spot_windows
-from aolink.optics.sensor import SpotSensor
+from aolink.optics.sensor import BaseSensor
 from aolink.plotting.style import colour_bar, figure_or_new
 from aolink.rig import Rig
+from aolink.series import Series
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
@@ -32,7 +32,7 @@ _LEAST_SPOTS = 4
 
 def has_pupil(series: Series) -> bool:
     """Whether the sensor has lenslets enough for a map."""
-    return isinstance(series.rig.sensor, SpotSensor) and series.rig.sensor.spots >= _LEAST_SPOTS
+    return series.rig.sensor.spots >= _LEAST_SPOTS
 
 
 def plot_pupil(
@@ -60,10 +60,10 @@ def plot_pupil(
         The sensor has fewer than four lenslets, there is no exposure, or matplotlib is missing.
     """
     sensor = series.rig.sensor
-    if not isinstance(sensor, SpotSensor) or not has_pupil(series):
+    if not has_pupil(series):
         raise ExportError(f"{series.path} has no map over the pupil: its sensor has fewer than {_LEAST_SPOTS} lenslets")
     names = by_rank(list(series.named(None if estimator is None else [estimator])))
-    maps = _maps(series, sensor, names[-1:])
+    maps = _maps(series, names[-1:])
     rows = -(-len(maps) // columns)
     figure = figure_or_new(figure, (_MAP_IN[0] * columns, _MAP_IN[1] * rows))
     for place, (title, (label, values, cmap)) in enumerate(maps.items(), 1):
@@ -90,12 +90,13 @@ MAPS = {
 """Maps by the name of their values: title, what the colours are, colour map."""
 
 
-def spot_values(rig: Rig, sensor: SpotSensor, exposure: Exposure, estimate: Estimate | None) -> dict[str, FloatArray]:
+def spot_values(rig: Rig, exposure: Exposure, estimate: Estimate | None) -> dict[str, FloatArray]:
     """A number for each lit lenslet, (spots,), by the names of `MAPS`: those that an exposure and its estimate tell.
 
     Without an estimate slopes are the spots' centroids. NIS is there where each spot has axes of its own, and NaN
     where nothing was measured.
     """
+    sensor = rig.sensor
     found: dict[str, FloatArray] = {}
     if exposure.mask.any():
         density = np.where(exposure.mask, to_density(sensor, exposure.pixels), 0.0)
@@ -113,13 +114,13 @@ def spot_values(rig: Rig, sensor: SpotSensor, exposure: Exposure, estimate: Esti
     return found
 
 
-def _maps(series: Series, sensor: SpotSensor, names: Sequence[str]) -> dict[str, tuple[str, FloatArray, str]]:
+def _maps(series: Series, names: Sequence[str]) -> dict[str, tuple[str, FloatArray, str]]:
     """Each map by its title: what its colours are, a value for each spot, a colour map."""
     seen: dict[str, list[FloatArray]] = {}
     for number in np.unique(np.linspace(0, max(len(series) - 1, 0), _EXPOSURES).astype(int)):
         for exposure, estimates in series[int(number) : int(number) + 1].with_estimates(names):
             check_frame(series, exposure)
-            for name, values in spot_values(series.rig, sensor, exposure, next(iter(estimates), None)).items():
+            for name, values in spot_values(series.rig, exposure, next(iter(estimates), None)).items():
                 seen.setdefault(name, []).append(values)
     if not seen:
         raise ExportError(f"{series.path} holds no exposure to draw; `aolink info` says what it holds")
@@ -131,9 +132,9 @@ def _maps(series: Series, sensor: SpotSensor, names: Sequence[str]) -> dict[str,
     }
 
 
-def _centroids(sensor: SpotSensor, exposure: Exposure) -> FloatArray:
+def _centroids(sensor: BaseSensor, exposure: Exposure) -> FloatArray:
     """Centre of each output's profile, slope units, (n_outputs,); NaN where no light came."""
-    line, found = sensor.profile, profiles(sensor, exposure.pixels, exposure.mask)
+    line, found = sensor.profile, profiles_of(sensor, exposure.pixels, exposure.mask)
     density = np.where(found.mask, to_density(line, np.asarray(found.counts, dtype=np.float64)), 0.0)
     light = density.sum(axis=1)
     return np.asarray(np.divide(density @ line.centres, light, out=np.full(len(light), np.nan), where=light > 0))

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 from aolink.errors import AolinkError, ExportError
 from aolink.estimation.score import Consistency, Score
 from aolink.files import writing
-from aolink.optics.sensor import SpotSensor
 from aolink.plotting.devices import incidents, plot_latency, plot_losses
 from aolink.plotting.exposure import draw_exposure, exposure_with_estimates
 from aolink.plotting.overview import Overview, overview
@@ -172,14 +171,13 @@ class _Session:
         if self.view is None:
             return _note(self.problem)
         parts = []
-        spots = isinstance(self.recording.rig.sensor, SpotSensor)
         for number, why in self.view.telling().items():
             exposure, estimates = exposure_with_estimates(self.recording, number)
             status = "; ".join(
                 f"{name}: {each.status.name.lower()} ({each.reason})" for name, each in estimates.items() if each.reason
             )
             caption = f"Exposure {number} (frame {exposure.frame_id}): {why}. {status}"
-            size = (_WIDE[0], _WIDE[1] * (1.45 if spots else 1.0))
+            size = (_WIDE[0], _WIDE[1] * (1.45 if self.recording.rig.sensor.directions == 2 else 1.0))
 
             def draw(_: Overview, figure: Figure, exposure: Any = exposure, estimates: Any = estimates) -> None:
                 draw_exposure(self.recording, exposure, estimates, figure, unit=self.unit)

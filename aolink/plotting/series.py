@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from aolink.exporting.common import needed
-from aolink.exporting.series import Series
 from aolink.plotting.overview import need_exposures, overview
 from aolink.plotting.session import plot_blur, plot_nis
+from aolink.series import Series
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -230,7 +230,7 @@ def _from_start(messages: Iterator[tuple[str, Message]], recording: Recording) -
         yield topic, message
 
 
-def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[_Key, Message, int | None]]:
+def _named(messages: Iterator[tuple[str, Any]]) -> Iterator[tuple[_Key, Message, int | None]]:
     """Each message with a name that its counterpart has too, and the exposure that it belongs to."""
     places: dict[str, int] = {}
     exposures: dict[str, int | None] = {}
@@ -240,14 +240,14 @@ def _named(messages: Iterator[tuple[str, Message]]) -> Iterator[tuple[_Key, Mess
         if row.after:
             frame_id = exposures.get(topic)
         elif row.belongs_to == "exposure":
-            frame_id = message.frame_id  # type: ignore[attr-defined] # as the table says
+            frame_id = message.frame_id
             exposures |= dict.fromkeys(topics.PICTURES.get(topic, ()), frame_id)
         if frame_id is not None:
             name = f"frame {frame_id}"
-        elif isinstance(message, wire.Applied) and message.source == wire.Applied.AWAITED:
-            name = f"report awaited from fast step {message.first_step}"
-        elif isinstance(message, wire.CommandBlock | wire.Applied):
-            name = f"block {message.block_id} at fast step {message.first_step}"
+        elif row.belongs_to == "steps":
+            awaited = getattr(message, "source", None) == wire.Applied.AWAITED
+            what = "report awaited from" if awaited else f"block {message.block_id} at"
+            name = f"{what} fast step {message.first_step}"
         else:
             places[topic] = places.get(topic, 0) + 1
             name = f"message, number {places[topic]}"

@@ -10,9 +10,9 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
-from google.protobuf.message import DecodeError, Message
+from google.protobuf.message import DecodeError
 from mcap.records import Schema
 from mcap.well_known import MessageEncoding
 
@@ -26,7 +26,6 @@ from aolink.recording.mcap_file import McapFile, WriteOptions, schema_of
 from aolink.recording.reader import RawMessage, Recording, in_time
 from aolink.recording.scan import Loss
 from aolink.recording.writer import begin_recording
-from aolink.wire import messages_pb2 as wire
 
 _ALIKE_NS = 2_000_000_000
 """Largest difference in log time at which equal messages in two files are one message."""
@@ -215,7 +214,8 @@ def _copied(
     return Edited(target, copy.messages, copy.exposures, [loss for each in recordings for loss in each.losses])
 
 
-def _decoded(message: RawMessage) -> Message | None:
+def _decoded(message: RawMessage) -> Any:
+    """A message that has what its row of the table says; None of a kind that aolink does not know."""
     kind = topics.SCHEMAS.get(message.schema)
     try:
         return kind.FromString(message.data) if kind else None
@@ -238,18 +238,18 @@ def _between(recording: Recording, low: int, high: int) -> Iterator[RawMessage]:
             if inside:
                 if not frames:
                     yield from (RawMessage.of(*each) for each in lead.messages())
-                frames.add(message.frame_id)  # type: ignore[attr-defined]
-                last_step = message.last_step  # type: ignore[attr-defined]
+                frames.add(message.frame_id)
+                last_step = message.last_step
                 yield raw
         elif row.after:
             if raw.topic in wanted:
                 yield raw
-        elif isinstance(message, wire.CommandBlock | wire.Applied):
+        elif row.belongs_to == "steps":
             # Also after the end, until all is known of the last exposure.
             if frames and (inside or message.first_step <= last_step):
                 yield raw
         elif row.belongs_to == "exposure":
-            if message.frame_id in frames:  # type: ignore[union-attr] # as the table says
+            if message.frame_id in frames:
                 yield raw
         elif inside and frames:
             yield raw
@@ -268,7 +268,7 @@ def _joined(recordings: Sequence[Recording]) -> Iterator[RawMessage]:
             recent = {each: time for each, time in recent.items() if time >= key - _ALIKE_NS}
         recent[name] = key
         if raw.topic == topics.EXPOSURE and (message := _decoded(raw)) is not None:
-            frame_id = message.frame_id  # type: ignore[attr-defined]
+            frame_id = message.frame_id
             if frame_id in frames:
                 raise RecordingError(
                     f"frame {frame_id} is in two of the recordings, but not the same: nothing to merge"

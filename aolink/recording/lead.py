@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
+from typing import Any
 
 from google.protobuf.message import Message
 
-from aolink.recording import schemas_pb2, topics
-from aolink.wire import messages_pb2 as wire
+from aolink.recording import topics
 
 
 class Lead:
     """Follows the messages of a recording, and keeps those that later exposures are made from."""
 
     def __init__(self) -> None:
-        self._kept: deque[tuple[str, wire.CommandBlock | wire.Applied, int, int]] = deque()
+        self._kept: deque[tuple[str, Any, int, int]] = deque()
 
-    def add(self, topic: str, message: Message, log_time_ns: int, sequence: int) -> None:
+    def add(self, topic: str, message: Any, log_time_ns: int, sequence: int) -> None:
         """Take the next message."""
-        if isinstance(message, wire.CommandBlock | wire.Applied):
+        row = topics.find(topic, message)
+        if row.belongs_to == "steps":
             self._kept.append((topic, message, log_time_ns, sequence))
-        elif topic == topics.EXPOSURE and isinstance(message, schemas_pb2.ExposureInfo):
+        elif row.name == topics.EXPOSURE:
             # Exposures still to come begin after the last step of this one.
             self._kept = deque(
                 each for each in self._kept if each[1].first_step + each[1].n_steps > message.last_step + 1

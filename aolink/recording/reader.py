@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from aolink.errors import RecordingError, RigError
 from aolink.estimation import Estimate, ExposureModel, exposure_model
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.limits import Budget, exceeded, limits, load_array
 from aolink.recording import convert, schemas_pb2, topics
@@ -34,6 +33,7 @@ from aolink.recording.scan import Loss, Summary, chunk_at, open_recording, read_
 from aolink.recording.slices import RecordingSlice
 from aolink.recording.sound import what_is_wrong
 from aolink.rig import Rig, parse_rig
+from aolink.series import Series
 from aolink.wire.messages_pb2 import Applied, CommandBlock
 from aolink.wire.runs_pb2 import Run
 
@@ -258,7 +258,7 @@ class Recording(Series):
 
     def decoded_run(self, raw: RawMessage) -> Run | None:
         """A command or what the mirror did with it, its inputs as bytes; None if it is neither, or not laid out so."""
-        if _RUNS.get(raw.topic) != raw.schema:
+        if topics.RUNS.get(raw.topic) != raw.schema:
             return None
         try:
             run = Run.FromString(raw.data)
@@ -386,7 +386,7 @@ class Recording(Series):
 
     def _runs_in(self, chunk: int) -> Iterator[StepRun]:
         """The commands and reports in a chunk."""
-        for raw in self._own_messages(tuple(_RUNS), chunks=slice(chunk, chunk + 1)):
+        for raw in self._own_messages(tuple(topics.RUNS), chunks=slice(chunk, chunk + 1)):
             message = self.decoded_run(raw) or self.decoded(raw)
             if isinstance(message, Run | Applied | CommandBlock):
                 yield raw.topic, message.first_step + message.n_steps
@@ -659,7 +659,5 @@ def _scene_shape(rig: Rig) -> tuple[int, int]:
     return rig.scene.shape if rig.scene else (0, 0)
 
 
-_RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in topics.TOPICS if row.belongs_to == "steps"}
-"""Where runs of steps are, and the schema that they have there."""
 _ASSEMBLED = (topics.COMMAND, topics.APPLIED, topics.EXPOSURE, topics.IMAGE)
 _BESIDE = frozenset({topics.TRUTH, topics.SCENE_EXPOSURE, topics.SCENE})

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, overload
 
 from aolink.estimation import Estimate
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
+from aolink.series import Series
 
 if TYPE_CHECKING:
     from aolink.recording.reader import Recording

@@ -10,8 +10,8 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import Message
 
-from aolink.recording import schemas_pb2
-from aolink.wire import messages_pb2
+from aolink.recording import schemas_pb2 as pb
+from aolink.wire import messages_pb2 as wire
 
 EXPOSURE = "/camera/exposure"
 IMAGE = "/camera/image"
@@ -48,34 +48,37 @@ class Topic:
     """Topic of the message that comes before a picture and says which exposure it is of: a picture does not say it."""
     repeatable: bool = False
     """Whether a rig that is given the same commands again gives the same: `aolink replay` to a rig compares these."""
-    shown_by: Literal["", "camera", "devices", "motion", "scene"] = ""
-    """The module of `aolink.viewing` that shows it; '' for none, or as what it belongs to."""
+    shown_by: str = ""
+    """The function of `aolink.viewing.devices` that shows its messages; '' for none, and for what is shown as the
+    exposures and estimates that it is read as."""
 
 
 TOPICS = (
-    Topic(name=EXPOSURE, message=schemas_pb2.ExposureInfo, belongs_to="exposure", repeatable=True, shown_by="devices"),
-    Topic(name=IMAGE, message=RawImage, belongs_to="exposure", after=EXPOSURE, repeatable=True, shown_by="camera"),
-    Topic(name=COMMAND, message=messages_pb2.CommandBlock, belongs_to="steps", repeatable=True, shown_by="devices"),
-    Topic(name=APPLIED, message=messages_pb2.Applied, belongs_to="steps", repeatable=True, shown_by="devices"),
-    Topic(name=SCENE_EXPOSURE, message=schemas_pb2.ExposureInfo, belongs_to="exposure"),
-    Topic(name=SCENE, message=RawImage, belongs_to="exposure", after=SCENE_EXPOSURE, shown_by="scene"),
-    Topic(name=TRUTH, message=messages_pb2.Truth, belongs_to="exposure", repeatable=True, shown_by="motion"),
-    Topic(name=ESTIMATE, message=schemas_pb2.Estimate, belongs_to="exposure", repeatable=True, shown_by="motion"),
-    Topic(name=ESTIMATION, message=schemas_pb2.Estimation, belongs_to="exposure", shown_by="devices"),
-    Topic(name=RESTORATION, message=schemas_pb2.Restoration, belongs_to="exposure"),
-    Topic(name=RESTORED_SCENE, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene"),
-    Topic(name=RESTORED_SPOTS, message=RawImage, belongs_to="exposure", after=RESTORATION, shown_by="scene"),
-    Topic(name=CONTROL, message=schemas_pb2.Control, belongs_to="exposure", shown_by="devices"),
-    Topic(name=LATENCY, message=schemas_pb2.Latency, belongs_to="exposure", shown_by="devices"),
-    Topic(name=LINK, message=schemas_pb2.LinkStatistics, shown_by="devices"),
-    Topic(name=CLOCK, message=schemas_pb2.ClockSample, shown_by="devices"),
-    Topic(name=LOG, message=Log, shown_by="devices"),
+    Topic(name=EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure", repeatable=True, shown_by="log_drops"),
+    Topic(name=IMAGE, message=RawImage, belongs_to="exposure", after=EXPOSURE, repeatable=True),
+    Topic(name=COMMAND, message=wire.CommandBlock, belongs_to="steps", repeatable=True, shown_by="log_commands"),
+    Topic(name=APPLIED, message=wire.Applied, belongs_to="steps", repeatable=True, shown_by="log_applied"),
+    Topic(name=SCENE_EXPOSURE, message=pb.ExposureInfo, belongs_to="exposure"),
+    Topic(name=SCENE, message=RawImage, belongs_to="exposure", after=SCENE_EXPOSURE),
+    Topic(name=TRUTH, message=wire.Truth, belongs_to="exposure", repeatable=True),
+    Topic(name=ESTIMATE, message=pb.Estimate, belongs_to="exposure", repeatable=True),
+    Topic(name=ESTIMATION, message=pb.Estimation, belongs_to="exposure", shown_by="log_estimation"),
+    Topic(name=RESTORATION, message=pb.Restoration, belongs_to="exposure"),
+    Topic(name=RESTORED_SCENE, message=RawImage, belongs_to="exposure", after=RESTORATION),
+    Topic(name=RESTORED_SPOTS, message=RawImage, belongs_to="exposure", after=RESTORATION),
+    Topic(name=CONTROL, message=pb.Control, belongs_to="exposure", shown_by="log_control"),
+    Topic(name=LATENCY, message=pb.Latency, belongs_to="exposure", shown_by="log_latency"),
+    Topic(name=LINK, message=pb.LinkStatistics, shown_by="log_link"),
+    Topic(name=CLOCK, message=pb.ClockSample, shown_by="log_clock"),
+    Topic(name=LOG, message=Log, shown_by="log_log"),
 )
 
 SCHEMAS = {row.message.DESCRIPTOR.full_name: row.message for row in TOPICS}
 """Message class by the full name of its schema."""
 PICTURES = {row.after: tuple(each.name for each in TOPICS if each.after == row.after) for row in TOPICS if row.after}
 """What is known about the pictures of an exposure, and which pictures follow it."""
+RUNS = {row.name: row.message.DESCRIPTOR.full_name for row in TOPICS if row.belongs_to == "steps"}
+"""Where runs of fast steps are, and the schema that they have there."""
 _UNKNOWN = Topic(name="", message=Message)
 
 

@@ -19,7 +19,7 @@ from aolink.exposure import Exposure, step_shares
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import is_saturated, to_density
 from aolink.optics.scene import SceneSensor, scene_motion
-from aolink.optics.sensor import Kernel, SpotSensor
+from aolink.optics.sensor import Kernel
 from aolink.restoration.method import Restored
 from aolink.restoration.psf import Psf, motion_psf_by_root
 from aolink.restoration.registry import DEFAULT_METHOD
@@ -102,14 +102,11 @@ def _restored_spots(rig: Rig, exposure: Exposure, estimate: Estimate, method: st
     sensor = rig.sensor
     share = to_density(sensor, exposure.pixels) * sensor.pixel_size
     good = exposure.mask & ~is_saturated(sensor, exposure.pixels)
-    mixes = np.eye(rig.n_outputs).reshape(-1, 2 if isinstance(sensor, SpotSensor) else 1, rig.n_outputs)
+    mixes = np.eye(rig.n_outputs).reshape(-1, sensor.directions, rig.n_outputs)
     psfs = estimated_psfs(exposure, estimate, mixes, sensor.kernel, sensor.pixel_width)
-    if not isinstance(sensor, SpotSensor):
-        return np.asarray(restore(share, next(psfs), method=method, mask=good).image)
-    out, (height, width) = np.zeros_like(share), sensor.window
-    for psf, place in zip(psfs, sensor.lit, strict=False):
-        row, column = divmod(int(place), sensor.grid[1])
-        window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
+    out = np.zeros_like(share)
+    for spot, psf in zip(range(sensor.spots), psfs, strict=False):
+        window = sensor.window_of(spot)
         out[window] = restore(share[window], psf, method=method, mask=good[window]).image
     return out
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import rerun.blueprint as rrb
 
-from aolink.optics.sensor import SpotSensor
 from aolink.plotting.overview import NIS_COVERAGE
 from aolink.plotting.pupil import MAPS
 from aolink.plotting.style import BAND
@@ -97,12 +96,12 @@ def _camera(contents: Contents) -> rrb.Container | rrb.View:
         if each is None:
             continue
         root, title = each.drawn.root, "Compared: " if each.drawn.root else "Camera: "
-        if isinstance(sensor, SpotSensor):
+        if sensor.directions == 2:
             shown = ["camera/image", *(f"camera/image/path/{name}" for name in _drawn_paths(each))]
             views.append(_picture([root + path for path in shown], f"{title}frame (pixels), paths", *sensor.shape))
         shown = ["camera/history", "camera/history/centroid", "camera/history/now"]
         shown += [f"camera/history/path/{name}" for name in _drawn_paths(each)]
-        what = "paths in their blur" if not isinstance(sensor, SpotSensor) else "one spot along x"
+        what = "paths in their blur" if sensor.directions == 1 else "one spot along x"
         count = "one exposure" if contents.alone else f"{HISTORY} exposures"
         name = f"{title}{count} (pixels), {what}"
         views.append(_picture([root + path for path in shown], name, HISTORY, sensor.profile.pixels))
@@ -221,7 +220,6 @@ def _maps(contents: Contents) -> list[rrb.Container]:
     """Maps over the lenslets, as tabs."""
     if not contents.maps:
         return []
-    assert isinstance(contents.rig.sensor, SpotSensor)
     views = []
     for name, (title, unit, colours) in MAPS.items():
         if name in contents.maps:

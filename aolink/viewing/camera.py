@@ -17,11 +17,11 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from aolink.colours import Colour, estimator_colour
-from aolink.estimation.frames.spots import profiles
+from aolink.estimation.frames.measure import profiles_of
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import pixel_noise_sd, to_density
-from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, Sensor
 from aolink.plotting.style import extremes, hides_swings
 from aolink.viewing.palette import MEASURED, MISSING, NOTHING, TRUTH
 from aolink.viewing.series import POINTS, Drawing
@@ -93,18 +93,16 @@ def log_frames(drawing: Drawing, timebase: Timebase, exposures: Sequence[Exposur
 
 def one_profile(sensor: BaseSensor, exposures: Sequence[Exposure], output: int) -> list[Exposure]:
     """The exposures as ``sensor.profile`` would have seen them: of many spots, one along x or y."""
-    if not isinstance(sensor, SpotSensor):
-        return list(exposures)
     seen = []
     for exposure in exposures:
-        found = profiles(sensor, exposure.pixels, exposure.mask)
+        found = profiles_of(sensor, exposure.pixels, exposure.mask)
         counts: NDArray[Any] = found.counts[output : output + 1]
         seen.append(replace(exposure, pixels=counts, mask=found.mask[output : output + 1]))
     return seen
 
 
 def log_spot_paths(
-    drawing: Drawing, sensor: SpotSensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
+    drawing: Drawing, sensor: BaseSensor, timebase: Timebase, exposures: Sequence[Exposure], name: str,
     by_frame: Mapping[int, FloatArray],
 ) -> None:  # fmt: skip
     """Paths of all spots over the frame, in its pixels: ``/camera/image/path/NAME``.
@@ -115,9 +113,8 @@ def log_spot_paths(
         Frame id -> (n_outputs, n_steps), slope units.
     """
     known = [e for e in exposures if e.frame_id in by_frame]
-    (rows, columns), (height, width) = sensor.grid, sensor.window
-    corner = np.stack(np.meshgrid(width * np.arange(columns), height * np.arange(rows)), axis=-1).reshape(-1, 2)
-    corner = corner[sensor.lit]
+    width = sensor.profile.pixels
+    corner = width * np.stack(np.divmod(sensor.lit, sensor.grid[1])[::-1], axis=-1)
     strips = []
     for exposure in known:
         path = by_frame[exposure.frame_id]

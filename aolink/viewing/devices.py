@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,7 +10,7 @@ import rerun as rr
 
 from aolink.colours import estimator_colour
 from aolink.plotting.devices import LATENCY_STEPS
-from aolink.recording import schemas_pb2, topics
+from aolink.recording import schemas_pb2
 from aolink.viewing.palette import APPLIED, COMMANDED, series_colour
 from aolink.viewing.series import Drawing, Style, send_axes, send_line, send_states, some_rows
 from aolink.viewing.timebase import Timebase
@@ -170,22 +170,6 @@ def log_control(drawing: Drawing, timebase: Timebase, records: Sequence[Timed]) 
         for m in changes
     ]
     send_states(drawing, "status/loop", timebase, timebase.step_of_frame([m.frame_id for m in changes]), states)
-
-
-LOGS: dict[str, Callable[[Drawing, Timebase, Sequence[Timed]], None]] = {
-    topics.COMMAND: log_commands,
-    topics.APPLIED: log_applied,
-    topics.EXPOSURE: log_drops,
-    topics.CONTROL: log_control,
-    topics.LATENCY: log_latency,
-    topics.ESTIMATION: log_estimation,
-    topics.LINK: log_link,
-    topics.CLOCK: log_clock,
-    topics.LOG: log_log,
-}
-"""What shows the messages of a topic, of which there is one at least."""
-EVERY_STEP = (topics.COMMAND, topics.APPLIED)
-"""Topics with values for every fast step: in a long session, these are many."""
 
 
 def _send_blocks(drawing: Drawing, path: str, timebase: Timebase, blocks: Sequence[Any], style: Style) -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from aolink.estimation.estimate import Estimate
 from aolink.exposure import Exposure
-from aolink.optics.sensor import SpotSensor
 from aolink.plotting.pupil import MAPS, spot_values
 from aolink.rig import Rig
 from aolink.viewing.series import Drawing
@@ -25,7 +24,7 @@ _FIRST = 64
 
 
 def log_maps(
-    drawing: Drawing, timebase: Timebase, rig: Rig, sensor: SpotSensor, exposures: Sequence[Exposure],
+    drawing: Drawing, timebase: Timebase, rig: Rig, exposures: Sequence[Exposure],
     estimates: Mapping[int, Estimate], scales: dict[str, float],
 ) -> None:  # fmt: skip
     """Maps by the names of `MAPS` with the numbers under the pointer, NaN where no light falls: ``/pupil/NAME``.
@@ -37,10 +36,10 @@ def log_maps(
     scales:
         Where the colours end, by the map's name; a map that is not in it yet gets its own from these exposures.
     """
-    rows, columns = sensor.grid
+    sensor, (rows, columns) = rig.sensor, rig.sensor.grid
     seen: dict[str, list[tuple[Exposure, NDArray[np.float32]]]] = {}
     for exposure in exposures:
-        for name, values in spot_values(rig, sensor, exposure, estimates.get(exposure.frame_id)).items():
+        for name, values in spot_values(rig, exposure, estimates.get(exposure.frame_id)).items():
             picture = np.full(rows * columns, np.nan, dtype=np.float32)
             picture[sensor.lit] = values
             seen.setdefault(name, []).append((exposure, picture))

@@ -16,7 +16,6 @@ from aolink.errors import ViewerError
 from aolink.estimation.estimate import Estimate
 from aolink.estimation.score import Scorer
 from aolink.exposure import Exposure
-from aolink.optics.sensor import SpotSensor
 from aolink.plotting.pupil import has_pupil
 from aolink.recording import topics
 from aolink.recording.reader import check_stands_alone
@@ -130,6 +129,7 @@ class Sender:
         self._skipped = {name: recording.skipped(name) for name in self._names}
         self._scorers = {name: Scorer() for name in self._names}
         self._measuring: set[str] = set()
+        self._shown = [topic for topic in recording.counts if topics.named(topic).shown_by]
         self._known: set[str] = set()
         """Entities and kinds of data that there are."""
         self._scales: dict[str, float] = {}
@@ -146,7 +146,7 @@ class Sender:
         recording = self._recording
         restored = iter(recording.restored())
         ahead = next(restored, None)
-        messages = self._messages(devices.EVERY_STEP)
+        messages = self._messages(tuple(topics.RUNS))
         waiting: Any = next(messages, None)
         for exposures, estimates, following in self._read():
             pictures: list[RestoredPictures] = []
@@ -165,9 +165,7 @@ class Sender:
             raise ViewerError(
                 f"there is no exposure in {recording.path}, so nothing to view; `aolink info` says what it holds"
             )
-        rest = [topic for topic in recording.counts if topics.named(topic).name in devices.LOGS]
-        rest = [topic for topic in rest if topic not in devices.EVERY_STEP]
-        self._send_messages(list(self._messages(rest)))
+        self._send_messages(list(self._messages([topic for topic in self._shown if topic not in topics.RUNS])))
         true_scene = recording.true_scene
         if self._rig.scene is not None and true_scene is not None:
             scene.log_true_scene(self._drawing, self._rig.scene, true_scene)
@@ -232,9 +230,9 @@ class Sender:
         before = self._last.frame_id if self._last else exposures[0].frame_id - 1
         self._lost += exposures[-1].frame_id - before - len(exposures)
         self._last = exposures[-1]
-        if isinstance(rig.sensor, SpotSensor) and has_pupil(self._recording):
+        if has_pupil(self._recording):
             best = estimates[self._names[-1]] if self._names else {}
-            log_maps(drawing, timebase, rig, rig.sensor, exposures, best, self._scales)
+            log_maps(drawing, timebase, rig, exposures, best, self._scales)
         if rig.scene is not None and scene.log_scenes(drawing, rig.scene, timebase, exposures):
             self._known.add(scene.SCENE)
         if scene.log_restored(drawing, timebase, exposures, restored):
@@ -265,7 +263,7 @@ class Sender:
         end, ended_ns = last.first_step + last.n_steps, last.host_start_ns + period
         for each in recording.messages(*there, start_ns=max(low, 0), end_ns=high):
             message: Any = each.message
-            if each.topic in devices.EVERY_STEP:
+            if each.topic in topics.RUNS:
                 inside = message.first_step < end and message.first_step + message.n_steps > first.first_step
             else:
                 frame = getattr(message, "frame_id", None)
@@ -282,10 +280,8 @@ class Sender:
         for record in messages:
             by_topic.setdefault(record.topic, []).append(record)
         assert self._timebase is not None
-        for name, log in devices.LOGS.items():
-            for topic, records in by_topic.items():
-                if topics.named(topic).name == name:
-                    log(self._drawing, self._timebase, records)
+        for topic, records in by_topic.items():
+            getattr(devices, topics.named(topic).shown_by)(self._drawing, self._timebase, records)
         self._known |= by_topic.keys()
 
     def contents(self, other: Sender | None = None) -> Contents:
@@ -298,7 +294,7 @@ class Sender:
             truth="truth" in self._known,
             scenes=list(compress(scene.SCENES, (each in self._known for each in scene.SCENES))),
             restored_spots=scene.RESTORED_SPOTS in self._known,
-            topics=frozenset(self._recording.counts.keys() & (self._known if self._finished else devices.LOGS.keys())),
+            topics=frozenset(self._known.intersection(self._shown) if self._finished else self._shown),
             drawn=self._drawing,
             maps=self._scales,
             warnings=self._warnings > 0,
@@ -375,9 +371,7 @@ def send_camera(
     outputs = {"truth": {e.frame_id: e.truth.path for e in exposures if e.truth is not None}}
     outputs |= {name: {k: e.path for k, e in by_frame.items()} for name, by_frame in estimates.items()}
     camera.log_frames(drawing, timebase, new)
-    light = 1.0
-    if isinstance(sensor, SpotSensor):
-        light = 1.0 if sensor.spot_light is None else float(sensor.spot_light[output // 2])
+    if sensor.directions == 2:
         for name, by_frame in outputs.items():
             camera.log_spot_paths(drawing, sensor, timebase, new, name, by_frame)
     # What follows is one slope over time.
@@ -397,5 +391,5 @@ def send_camera(
     camera.log_now(drawing, line, timebase, shown)
     camera.log_measured_profile(drawing, line, timebase, shown, top)
     for name, by_frame in paths.items():
-        camera.log_path_profile(drawing, line, timebase, shown, name, by_frame, top, light)
+        camera.log_path_profile(drawing, line, timebase, shown, name, by_frame, top, sensor.light_of(output))
     return top

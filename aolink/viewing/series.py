@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from aolink.colours import Colour
 from aolink.numerics.arrays import IntArray
-from aolink.optics.sensor import SpotSensor
 from aolink.rig import Rig
 from aolink.viewing.palette import STATUS_COLOURS
 from aolink.viewing.timebase import Timebase
@@ -39,10 +38,10 @@ class Chosen:
     @classmethod
     def of(cls, rig: Rig, spot: int = 0) -> Chosen:
         """x and y of a spot on a plane, or the one position of a spot on a line."""
-        if not isinstance(rig.sensor, SpotSensor):
-            return cls((spot,), (spot,))
-        outputs = (2 * spot, 2 * spot + 1)
-        return cls(outputs, tuple(dict.fromkeys(k // rig.plant.n_outputs for k in outputs)), (" x", " y"))
+        n = rig.sensor.directions
+        outputs = tuple(range(n * spot, n * spot + n))
+        axes = tuple(dict.fromkeys(k // rig.plant.n_outputs for k in outputs))
+        return cls(outputs, axes, (" x", " y") if n == 2 else ("",))
 
 
 @dataclass(kw_only=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import aolink
-from aolink.exporting.series import Series
+from aolink.series import Series
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 

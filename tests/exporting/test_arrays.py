@@ -8,10 +8,10 @@ import pytest
 import aolink
 from aolink.errors import ExportError, RecordingError
 from aolink.exporting.arrays import arrays
-from aolink.exporting.series import Series
 from aolink.recording import topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.schemas_pb2 import Estimate
+from aolink.series import Series
 from tests.recording.small import write_small
 
 

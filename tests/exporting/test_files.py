@@ -16,11 +16,11 @@ import aolink
 from aolink.errors import ExportError
 from aolink.exporting.arrays import arrays
 from aolink.exporting.files import WRITERS, export
-from aolink.exporting.series import Series
 from aolink.recording import topics
 from aolink.recording.editing import RecordingCopy
 from aolink.recording.schemas_pb2 import ExposureInfo
 from aolink.rig import load_rig, parse_rig
+from aolink.series import Series
 from aolink.wire.messages_pb2 import Truth
 from tests.needs import needed
 from tests.recording.small import write_small

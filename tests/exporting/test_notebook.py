@@ -9,7 +9,7 @@ import pytest
 
 import aolink
 from aolink.errors import ExportError, RecordingError
-from aolink.exporting.series import Series
+from aolink.series import Series
 from tests.needs import needed
 from tests.recording.small import write_small
 

@@ -11,9 +11,9 @@ import pytest
 
 import aolink
 from aolink.exporting.files import export
-from aolink.exporting.series import Series
 from aolink.optics.sensor import SpotSensor
 from aolink.rig import parse_rig
+from aolink.series import Series
 from tests.needs import needed
 from tests.recording.small import write_small
 

@@ -14,7 +14,6 @@ from scipy.signal import lfilter
 
 from aolink.estimation.estimate import Estimate, Status
 from aolink.estimation.model.exposure_model import exposure_model
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure, Truth
 from aolink.optics.kernel import exposure_density
 from aolink.plain import plain_data
@@ -22,6 +21,7 @@ from aolink.recording import schemas_pb2 as schemas
 from aolink.recording.reader import Recording
 from aolink.restoration import RestoredPictures
 from aolink.rig import Rig, load_rig
+from aolink.series import Series
 from aolink.wire import messages_pb2 as wire
 from tests.kinds import line_of
 

@@ -12,10 +12,10 @@ import pytest
 
 from aolink.estimation import run
 from aolink.estimation.estimate import Estimate, Status
-from aolink.exporting.series import Series
 from aolink.exposure import Exposure
 from aolink.restoration import deblur
 from aolink.rig import Rig, load_rig
+from aolink.series import Series
 from aolink.simulation.model import simulate
 from aolink.viewing import save_rrd
 from tests.viewing.rrd import read_rrd

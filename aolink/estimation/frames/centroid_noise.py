@@ -7,7 +7,7 @@ import numpy as np
 from aolink.estimation.frames.moments import known_flux_covariance, noise_integrals
 from aolink.numerics.arrays import FloatArray
 from aolink.optics.camera import effective_noise_density
-from aolink.optics.sensor import BaseSensor, SpotSensor
+from aolink.optics.sensor import BaseSensor
 from aolink.rig import Rig
 
 
@@ -23,7 +23,7 @@ def centroid_covariance(rig: Rig) -> FloatArray:
     own = _of_whole_spot(sensor, plant.n_outputs)
     size = len(own)
     blocks = np.tile(own, (plant.n_outputs // size, 1, 1))
-    light = sensor.spot_light if isinstance(sensor, SpotSensor) else None
+    light = sensor.spot_light
     if light is None:
         light = np.ones((1, len(blocks)))
     else:  # an axis with one slope shares its spot with the next

@@ -11,11 +11,11 @@ from aolink.errors import EstimatorError
 from aolink.estimation.frames.centroid_noise import centroid_covariance
 from aolink.estimation.frames.frame_data import FrameData, Measurement, Needs, Profile
 from aolink.estimation.frames.moments import least_significance, measure_moments, spot_significance
-from aolink.estimation.frames.spots import measure_spots, moments_of_frames
+from aolink.estimation.frames.spots import Profiles, measure_spots, moments_of_frames, profiles
 from aolink.exposure import Exposure
 from aolink.numerics.arrays import BoolArray, FloatArray, Indices
 from aolink.optics.camera import is_saturated, to_density
-from aolink.optics.sensor import Sensor, SpotSensor
+from aolink.optics.sensor import BaseSensor, Sensor, SpotSensor
 from aolink.rig import Rig
 
 Measured = tuple[FrameData | None, str]
@@ -35,7 +35,7 @@ class Measurements:
         """Row of each exposure in ``moments``, -1 where it has none."""
         self.moments: Measurement | None = None
         sensor = rig.sensor
-        self._axes = rig.plant.axes if isinstance(sensor, SpotSensor) else 1
+        self._axes = rig.plant.axes
         if needs is None or needs.what != "moments" or rig.plant.n_outputs > 1:
             return
         shape = sensor.shape
@@ -74,6 +74,13 @@ class Measurements:
         assert self.moments is not None
         some = slice(row * self._axes, end * self._axes)
         return Measurement(value=self.moments.value[some], covariance=self.moments.covariance[some])
+
+
+def profiles_of(sensor: BaseSensor, pixels: NDArray[np.uint16], usable: BoolArray) -> Profiles:
+    """A profile for each output, as counts of ``sensor.profile``; the frame of a line is one."""
+    if isinstance(sensor, SpotSensor):
+        return profiles(sensor, pixels, usable)
+    return Profiles(counts=pixels.astype(np.float64), mask=usable)
 
 
 def _moments_of_lines(sensor: Sensor, pixels: NDArray[np.uint16], needs: Needs) -> tuple[Indices, Measurement | None]:

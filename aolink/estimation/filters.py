@@ -1,0 +1,141 @@
+"""The filters of aolink's own estimators, made for a rig: what the rows of the registry build."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from aolink.errors import EstimatorError
+from aolink.estimation.compiled import make_ready
+from aolink.estimation.frames.centroid_noise import centroid_covariance
+from aolink.estimation.frames.frame_data import SpotWindows
+from aolink.estimation.kalman.filter import BlurFilter, Filter, TwoStateFilter
+from aolink.estimation.kalman.filterpy_engine import FilterpyMoments
+from aolink.estimation.kalman.path_moments import Observation, PathMoments, SecondOrderMoments
+from aolink.estimation.kalman.predict import added_noise
+from aolink.estimation.kalman.steady_gain import steady_gain
+from aolink.estimation.model.exposure_model import exposure_model
+from aolink.estimation.moments.joint_moments import JointMoments
+from aolink.estimation.moments.spots import WindowedSpots
+from aolink.estimation.moments.windowed import WindowedMoments
+from aolink.estimation.options import Options
+from aolink.estimation.pixels.joint_pixels import JointProfile
+from aolink.numerics.arrays import FloatArray
+from aolink.optics.sensor import SpotSensor
+from aolink.plant.alike import alike_systems
+from aolink.rig import Rig
+
+
+def _blur_filter(rig: Rig, options: Options, observation: Observation[Any] | None) -> BlurFilter:
+    return BlurFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
+
+
+def open_loop(rig: Rig, options: Options) -> Filter:
+    return _blur_filter(rig, options, None)
+
+
+def paper(rig: Rig, options: Options, *orders: int) -> Filter:
+    """The filters of Mishra & Wen with these moments."""
+    gain = _steady_gain(rig, options) if orders == (1,) and options.gain == "steady-state" else None
+    if options.engine == "filterpy":
+        theirs = FilterpyMoments(rig.plant, orders, gain, flux=options.flux)
+        return BlurFilter(
+            rig.plant, theirs, process_noise=options.process_noise, gate=options.gate, predictor=theirs.predict
+        )
+    if options.second_order and 2 in orders:
+        if rig.plant.n_outputs > 2:
+            raise EstimatorError(
+                f"second_order is for plants of one spot, {rig.name} has {rig.plant.n_outputs // 2}: use moments"
+            )
+        return _blur_filter(rig, options, SecondOrderMoments(rig.plant, orders, flux=options.flux))
+    observation = PathMoments(rig.plant, orders, gain, flux=options.flux)
+    if orders == (1, 2) and TwoStateFilter.suits(rig.plant):
+        two = TwoStateFilter(rig.plant, observation, process_noise=options.process_noise, gate=options.gate)
+        two.warm_up(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset))
+        return two
+    return _blur_filter(rig, options, observation)
+
+
+@lru_cache(maxsize=4)
+def _steady_gain(rig: Rig, options: Options) -> FloatArray | None:
+    """The steady-state gain of o1 by the noise in the rig file, one for all axes or one each; None if there is none."""
+    model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
+    Q = added_noise(model, options.process_noise)
+    # Axes whose spots have the same light share a gain.
+    noises, of_axis = np.unique(centroid_covariance(rig), axis=0, return_inverse=True)
+    gains = [steady_gain(model, Q, noise) for noise in noises]
+    if len(gains) == 1:
+        return gains[0]
+    known = [gain for gain in gains if gain is not None]
+    return np.array(known)[of_axis] if len(known) == len(gains) else None
+
+
+def moments(rig: Rig, options: Options) -> Filter:
+    if alike_systems(rig.plant) is not None:
+        _warm_up(rig)
+    return _blur_filter(rig, options, _windowed(rig, options))
+
+
+def _windowed(rig: Rig, options: Options) -> Observation[Any]:
+    """Windowed moments of a line sensor, of spots, or of all spots of a plant with hundreds of states."""
+    orders, basis, flux, n_outputs = options.orders, options.basis, options.flux, rig.plant.n_outputs
+    if n_outputs == 1:
+        return WindowedMoments(rig.sensor.profile, orders, basis=basis, flux=flux)
+    sensor = _spots(rig)
+    if alike_systems(rig.plant) is not None:
+        return JointMoments(sensor, n_outputs, orders, basis=basis, flux=flux)
+    return WindowedSpots(sensor, n_outputs // 2, orders, basis=basis, flux=flux)
+
+
+def _spots(rig: Rig) -> SpotSensor:
+    """The sensor of a rig whose plant moves whole spots: `parse_rig` refuses a line there."""
+    assert isinstance(rig.sensor, SpotSensor)
+    return rig.sensor
+
+
+def _warm_up(rig: Rig) -> None:
+    """Estimate a dark exposure of many spots, so that what this loads is loaded before the session."""
+    sensor, steps = _spots(rig), rig.timing.exposure_steps
+    model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
+    shape = (rig.plant.axes, rig.plant.n_outputs // 2, *sensor.window)
+    dark = SpotWindows(density=np.zeros(shape), mask=np.ones(shape, dtype=bool))
+    make_ready()
+    for each in (JointMoments, JointProfile):
+        blur_filter = BlurFilter(rig.plant, each(sensor, rig.plant.n_outputs))
+        blur_filter.step(model, model.response(np.zeros((steps, rig.n_inputs))), dark)
+
+
+def profile(rig: Rig, options: Options) -> Filter:
+    if alike_systems(rig.plant) is None:
+        from aolink.estimation.pixels.updates import PROFILE
+
+        return _of_pixels(rig, options, PROFILE.within(options.tempered))
+    _warm_up(rig)
+    return _blur_filter(rig, options, JointProfile(_spots(rig), rig.plant.n_outputs))
+
+
+def mixture(rig: Rig, options: Options) -> Filter:
+    from aolink.estimation.pixels.updates import MIXTURE
+
+    return _of_pixels(rig, options, MIXTURE.within(options.tempered))
+
+
+def sampled(rig: Rig, options: Options) -> Filter:
+    from aolink.estimation.pixels.sampled import TemperedUpdater
+
+    return _of_pixels(rig, options, TemperedUpdater(options.particles, options.seed))
+
+
+def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
+    """The filters that use every pixel; their compiled code is loaded when the first one is made."""
+    from aolink.estimation.pixels.filter import MixtureFilter
+    from aolink.estimation.pixels.updates import MIXTURE
+
+    pixels = MixtureFilter(rig.plant, rig.sensor, updates, gate=options.gate)
+    # mixture compiles at once what profile would compile at the first posterior of several modes.
+    make_ready()
+    pixels.warm_up(MIXTURE)
+    updates.reduction(exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset), rig.sensor)
+    return pixels
