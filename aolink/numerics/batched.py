@@ -98,6 +98,11 @@ def inverse(a: FloatArray) -> FloatArray:
     return out
 
 
+def solve(a: FloatArray, x: FloatArray) -> FloatArray:
+    """a^-1 x, (..., n, n) and (..., n)."""
+    return np.asarray(np.linalg.solve(a, x[..., None])[..., 0])
+
+
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
     """A P A', (..., m, n) and (..., n, n) -> (..., m, m)."""
     return matmul(matmul(a, p), transpose(a))

@@ -60,7 +60,7 @@ def pack_one(x: Entry, axes: int) -> FloatArray:
     return x if isinstance(x, np.ndarray) else np.full(axes, x)
 
 
-def dot(x: Sequence[Entry], y: Sequence[Entry]) -> Entry:
+def dot_of_entries(x: Sequence[Entry], y: Sequence[Entry]) -> Entry:
     """x[0] * y[0] + x[1] * y[1] + ..., in this order."""
     total = x[0] * y[0]
     if len(x) > 1:
@@ -72,7 +72,7 @@ def dot(x: Sequence[Entry], y: Sequence[Entry]) -> Entry:
 
 def times_vector(a: Matrix, x: Sequence[Entry]) -> list[Entry]:
     """A x"""
-    return [dot(row, x) for row in a]
+    return [dot_of_entries(row, x) for row in a]
 
 
 def add(x: Sequence[Entry], y: Sequence[Entry]) -> list[Entry]:
@@ -80,39 +80,34 @@ def add(x: Sequence[Entry], y: Sequence[Entry]) -> list[Entry]:
     return [x[k] + y[k] for k in range(len(x))]
 
 
-def transpose(a: Matrix) -> Matrix:
+def transpose_of_entries(a: Matrix) -> Matrix:
     """A'"""
     return [[row[j] for row in a] for j in range(len(a[0]))]
 
 
 def times_transposed(a: Matrix, b: Matrix) -> Matrix:
     """A B'"""
-    return [[dot(row, other) for other in b] for row in a]
+    return [[dot_of_entries(row, other) for other in b] for row in a]
 
 
 def symmetric_times_transposed(a: Matrix, b: Matrix, plus: Matrix | None = None) -> Matrix:
     """A B' + plus where that is symmetric: one half of it is the other."""
     out: Matrix = []
     for i, row in enumerate(a):
-        upper = [dot(row, other) for other in b[i:]]
+        upper = [dot_of_entries(row, other) for other in b[i:]]
         out.append([*(above[i] for above in out), *(add(upper, plus[i][i:]) if plus else upper)])
     return out
 
 
-def congruence(a: Matrix, p: Matrix, plus: Matrix) -> Matrix:
-    """A P A' + plus, P and plus symmetric."""
-    return symmetric_times_transposed(times_transposed(a, p), a, plus)
-
-
 def congruence_by_numbers(a: Sequence[Sequence[float]], p: Matrix, plus: Matrix) -> Matrix:
-    """`congruence` with one matrix of numbers for all axes: the products of its entries are numbers, too."""
+    """A P A' + plus, P and plus symmetric, A of numbers for all axes: the products of its entries are numbers, too."""
     n = len(p)
     upper = [p[k][m] for k in range(n) for m in range(k, n)]
     out: Matrix = [[0.0] * len(a) for _ in a]
     for i, row in enumerate(a):
         for j, other in enumerate(a[: i + 1]):
             share = [row[k] * other[m] + (row[m] * other[k] if m > k else 0.0) for k in range(n) for m in range(k, n)]
-            out[i][j] = out[j][i] = dot(share, upper) + plus[i][j]
+            out[i][j] = out[j][i] = dot_of_entries(share, upper) + plus[i][j]
     return out
 
 
@@ -126,7 +121,7 @@ def reciprocal(x: Entry) -> Entry:
     return 1.0 / x if not isinstance(x, float) or x else math.inf
 
 
-def inverse(a: Matrix) -> Matrix:
+def inverse_of_entries(a: Matrix) -> Matrix:
     """Inverse of symmetric positive definite matrices."""
     if len(a) == 1:
         return [[reciprocal(a[0][0])]]

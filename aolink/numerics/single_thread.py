@@ -1,7 +1,7 @@
 """Linear algebra of large matrices by one thread of BLAS.
 
 So no bit depends on the number of cores, and nothing waits for a second core that is busy elsewhere: on a loaded
-machine OpenBLAS's threads take a second over what takes 10 ms alone.
+machine OpenBLAS's threads take a second over what takes 10 ms alone (row `membrane_in_real_time` of tools/bench).
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import scipy
 from threadpoolctl import ThreadpoolController
 
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.covariance import JITTER
 
 # A matrix with a smaller share of nonzero entries than this is multiplied as a sparse one.
 _SPARSE = 0.05
@@ -54,7 +55,7 @@ by_one_thread = _ByOneThread()
 
 
 @by_one_thread
-def matmul(a: FloatArray, b: FloatArray) -> FloatArray:
+def matmul_one_thread(a: FloatArray, b: FloatArray) -> FloatArray:
     """(n, k) @ (k, m), or @ (k,)"""
     return np.asarray(a @ b)
 
@@ -66,7 +67,7 @@ def gram(a: FloatArray) -> FloatArray:
 
 
 @by_one_thread
-def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
+def congruence_one_thread(a: FloatArray, p: FloatArray) -> FloatArray:
     """a p a' for a symmetric p, (m, n) and (n, n) -> (m, m); ``a`` is taken as sparse where few entries are not zero.
 
     Rows of ``p`` at its end that are those of the identity cost next to nothing.
@@ -84,36 +85,58 @@ def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
 
 
 @by_one_thread
-def inverse_root(a: FloatArray) -> FloatArray:
-    """L^-1 of a symmetric positive definite a = L L', so that a^-1 = L^-1' L^-1, (n, n), lower triangular.
+def inverse_by_cholesky(a: FloatArray) -> FloatArray:
+    """Inverse of a symmetric positive definite matrix, symmetric to the last bit.
 
     Raises
     ------
     numpy.linalg.LinAlgError
         It is not positive definite.
     """
-    W, _ = scipy.linalg.lapack.dtrtri(_root(a), lower=1, overwrite_c=1)
-    return np.asarray(W)
-
-
-@by_one_thread
-def inverse(a: FloatArray) -> FloatArray:
-    """Inverse of a symmetric positive definite matrix, symmetric to the last bit; raises as `inverse_root`."""
-    lower, _ = scipy.linalg.lapack.dpotri(_root(a), lower=1, overwrite_c=1)
+    lower, _ = scipy.linalg.lapack.dpotri(_cholesky_factor(a), lower=1, overwrite_c=1)
     whole = lower + lower.T
     np.fill_diagonal(whole, np.diagonal(lower))
     return np.asarray(whole)
 
 
+def information_matrix(covariance: FloatArray) -> FloatArray:
+    """Inverse of a covariance that may be singular, (n, n)."""
+    sd = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    sd = np.where(sd > 0, sd, 1.0)
+    scaled = covariance / sd / sd[:, None]
+    np.fill_diagonal(scaled, np.diagonal(scaled) + JITTER)
+    return np.asarray(inverse_by_cholesky(scaled) / sd / sd[:, None])
+
+
+def covariance_of_information(precision: FloatArray) -> FloatArray:
+    """Inverse of an information matrix, (n, n), which is scaled to a diagonal of one before."""
+    scaled, scale = _scaled(precision)
+    return np.asarray(inverse_by_cholesky(scaled) * scale * scale[:, None])
+
+
 @by_one_thread
-def solve(a: FloatArray, x: FloatArray) -> FloatArray:
-    """a^-1 x of a symmetric positive definite matrix, (n,); raises as `inverse_root`."""
-    found, _ = scipy.linalg.lapack.dpotrs(_root(a), x, lower=1)
-    return np.asarray(found)
+def root_of_information(precision: FloatArray) -> FloatArray:
+    """W with W' W the covariance of an information matrix, (n, n); scaled and raises as `covariance_of_information`."""
+    scaled, scale = _scaled(precision)
+    W, _ = scipy.linalg.lapack.dtrtri(_cholesky_factor(scaled), lower=1, overwrite_c=1)
+    return np.asarray(W * scale)
 
 
-def _root(a: FloatArray) -> FloatArray:
-    """L, zero above its diagonal, in Fortran's order."""
+@by_one_thread
+def solve_information(precision: FloatArray, score: FloatArray) -> FloatArray:
+    """precision^-1 score, (n,), scaled and raises as `covariance_of_information`."""
+    scaled, scale = _scaled(precision)
+    found, _ = scipy.linalg.lapack.dpotrs(_cholesky_factor(scaled), score * scale, lower=1)
+    return np.asarray(found * scale)
+
+
+def _scaled(precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    scale = 1 / np.sqrt(np.diagonal(precision))
+    return precision * scale * scale[:, None], scale
+
+
+def _cholesky_factor(a: FloatArray) -> FloatArray:
+    """L with a = L L', zero above its diagonal, in Fortran's order."""
     L, flaw = scipy.linalg.lapack.dpotrf(a.T, lower=1, clean=1)
     if flaw:
         raise np.linalg.LinAlgError(f"not positive definite: the leading {flaw} rows have no root")

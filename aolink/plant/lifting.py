@@ -9,10 +9,10 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from aolink.numerics import single_thread
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.batched import SMALL_PRODUCT
 from aolink.numerics.block_diagonal import blockwise, components
+from aolink.numerics.single_thread import matmul_one_thread
 from aolink.plant.alike import alike_systems
 from aolink.rig import Plant
 
@@ -96,7 +96,7 @@ def input_response(plant: Plant, u: FloatArray) -> tuple[FloatArray, FloatArray]
     systems = alike_systems(plant)
     if systems is not None:
         own, ends = input_response(systems.one, u.transpose(0, 2, 1).reshape(axes * n_u, k, 1))
-        paths = [single_thread.matmul(systems.gains, each) for each in own.reshape(axes, n_u, k)]
+        paths = [matmul_one_thread(systems.gains, each) for each in own.reshape(axes, n_u, k)]
         end = np.empty((axes, plant.n_states))
         end[:, systems.order] = ends.reshape(axes, n_u, -1)
         return np.stack(paths), end

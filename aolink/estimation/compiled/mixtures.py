@@ -9,7 +9,7 @@ import numpy as np
 from aolink.estimation.compiled.likelihoods import log_likelihoods_of_row
 from aolink.estimation.compiled.line import Line
 from aolink.estimation.compiled.plane import Plane
-from aolink.estimation.compiled.small import cholesky, compiled, compiled_sums, decay, lower_inverse
+from aolink.estimation.compiled.small import cholesky_into, compiled, compiled_sums, decay, lower_inverse_into
 from aolink.numerics.arrays import FloatArray
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -121,7 +121,7 @@ def merge(log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, most
 
 @compiled
 def _log_determinant(P: FloatArray, root: FloatArray) -> float:
-    cholesky(P, root)
+    cholesky_into(P, root)
     total = 0.0
     for i in range(len(P)):
         total += 2 * math.log(root[i, i])
@@ -162,8 +162,8 @@ def _roots(
     for c in range(len(log_weight)):
         if log_weight[c] == -math.inf:
             continue
-        cholesky(covariance[c], root[c])
-        lower_inverse(root[c], inverse[c])
+        cholesky_into(covariance[c], root[c])
+        lower_inverse_into(root[c], inverse[c])
         constant[c] = log_weight[c] - 0.5 * n * _LOG_2PI
         for i in range(n):
             constant[c] -= math.log(root[c, i, i])
@@ -230,7 +230,7 @@ def log_densities(
 
 
 @compiled
-def importance_corrected(
+def correct_by_importance(
     seen: Line | Plane, prior_weight: FloatArray, prior_mean: FloatArray, prior_covariance: FloatArray,
     log_weight: FloatArray, mean: FloatArray, covariance: FloatArray, uniform: FloatArray, normal: FloatArray,
     enough: FloatArray, least_effective: float, halvings: int, prior_points: float, last_prior_points: float,

@@ -7,7 +7,16 @@ import math
 import numpy as np
 
 from aolink.estimation.compiled.line import Line, fisher_information, linearised_light, path_of
-from aolink.estimation.compiled.small import cholesky, compiled, eigh, inlined, lower_inverse, lower_solve, solve, times
+from aolink.estimation.compiled.small import (
+    cholesky_into,
+    cholesky_solve,
+    compiled,
+    eigh,
+    inlined,
+    lower_inverse_into,
+    lower_solve,
+    times,
+)
 from aolink.numerics.arrays import FloatArray, Indices
 
 # A search ends where its squared distance from a known mode, in that mode's standard deviations, is below this.
@@ -15,7 +24,7 @@ _NEXT_TO = 0.25
 
 
 @compiled
-def spread_starts(
+def spread_starts_of_lines(
     mean: FloatArray, covariance: FloatArray, broad_mean: FloatArray, broad_covariance: FloatArray, gram: FloatArray,
     reach: float, starts: FloatArray, squares: FloatArray,
 ) -> None:  # fmt: skip
@@ -27,8 +36,8 @@ def spread_starts(
     root, wide, product, turned = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     vectors, along = np.empty((n, n)), np.empty(n)
     for row in range(rows):
-        cholesky(covariance[row], root)
-        cholesky(broad_covariance[row], wide)
+        cholesky_into(covariance[row], root)
+        cholesky_into(broad_covariance[row], wide)
         times(gram, wide, product)
         times(wide.T, product, turned)
         eigh(turned, squares[row], vectors)
@@ -48,7 +57,7 @@ def spread_starts(
 
 
 @compiled
-def innovations(
+def innovations_of_lines(
     line: Line, mean: FloatArray, covariance: FloatArray, t: FloatArray, tells_nothing: float, value: FloatArray,
     information: FloatArray, nis: FloatArray, square: FloatArray,
 ) -> None:  # fmt: skip
@@ -63,7 +72,7 @@ def innovations(
     f, J, scores = np.empty(width), np.empty((n, width)), np.empty((3, line.y.shape[1]))
     H, pull, values, vectors = np.empty((n, n)), np.empty(n), np.empty(n), np.empty((n, n))
     for row in range(rows):
-        cholesky(covariance[row], root)
+        cholesky_into(covariance[row], root)
         times(root.T, line.basis, B)
         path_of(line.inputs[row], line.basis, t[row], path)
         linearised_light(line, path, B, f, J)
@@ -89,7 +98,7 @@ def innovations(
 
 
 @compiled
-def find_modes(
+def find_modes_of_lines(
     line: Line, mean: FloatArray, covariance: FloatArray, starts: FloatArray, of_row: Indices, whole: int,
     reversed_precision: float, passes: int, first_damping: float, largest_damping: float, free_damping: float,
     converged: float, out_mean: FloatArray, out_covariance: FloatArray, out_evidence: FloatArray,
@@ -111,7 +120,7 @@ def find_modes(
     root, damped, lower, inverse = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     begins, ends, their_H = np.empty((room, n)), np.empty((room, n)), np.empty((room, n, n))
     for row in range(rows):
-        cholesky(covariance[row], root)
+        cholesky_into(covariance[row], root)
         times(root.T, line.basis, B)
         path_of(line.inputs[row], line.basis, mean[row], rest)
         count = of_row[row]
@@ -132,8 +141,8 @@ def find_modes(
                             damped[i, j] = H[i, j]
                         damped[i, i] += damping * H[i, i]
                         step[i] = pull[i]
-                    cholesky(damped, lower)
-                    solve(lower, step)
+                    cholesky_into(damped, lower)
+                    cholesky_solve(lower, step)
                     decrement = 0.0
                     for i in range(n):
                         there[i] = s[i] + step[i]
@@ -162,12 +171,12 @@ def find_modes(
                     for j in range(i + 1):
                         their_H[found, i, j] = H[i, j]
                 found += 1
-                cholesky(H, lower)
+                cholesky_into(H, lower)
                 log_H = distance = 0.0
                 for i in range(n):
                     log_H += 2 * math.log(lower[i, i])
                     distance += s[i] * s[i]
-                lower_inverse(lower, inverse)
+                lower_inverse_into(lower, inverse)
                 # Covariance L H^-1 L' = W W' with W = L R^-T.
                 for i in range(n):
                     place = mean[row, i]
@@ -211,7 +220,7 @@ def _reversals(
             H[i, j] = 1.0 if i == j else 0.0
             for k in range(whole):
                 H[i, j] += precision * weights[k] / total * B[i, k] * B[j, k]
-    cholesky(H, root)
+    cholesky_into(H, root)
     for d in range(3):
         for i in range(n):
             out[d, i] = 0.0
@@ -221,7 +230,7 @@ def _reversals(
             x = precision * weights[k] / total * (to - rest[k])
             for i in range(n):
                 out[d, i] += B[i, k] * x
-        solve(root, out[d])
+        cholesky_solve(root, out[d])
 
 
 @inlined
@@ -275,8 +284,8 @@ def drop_repeats(
         for j in range(count):
             if evidence[row, j] == -math.inf:
                 continue
-            cholesky(covariance[row, j], root)
-            lower_inverse(root, inverse)
+            cholesky_into(covariance[row, j], root)
+            lower_inverse_into(root, inverse)
             repeats = False
             for other in range(kept):
                 square = 0.0

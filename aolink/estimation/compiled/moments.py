@@ -7,14 +7,14 @@ import math
 import numpy as np
 
 from aolink.estimation.compiled.line import Line, path_of
-from aolink.estimation.compiled.small import cholesky, compiled, solve, times
+from aolink.estimation.compiled.small import cholesky_into, cholesky_solve, compiled, times
 from aolink.numerics.arrays import FloatArray
 
 _ORDERS = 4  # of `WindowedMoments` as `broad` uses them: u^0 to u^3
 
 
 @compiled
-def broad(
+def broad_of_lines(
     line: Line, mean: FloatArray, covariance: FloatArray, passes: int, no_noise: float, path_reach: float,
     kernel_reach: float, out_mean: FloatArray, out_covariance: FloatArray,
 ) -> None:  # fmt: skip
@@ -184,13 +184,13 @@ def _corrected(
             for i in range(n):
                 total += H[a, i] * PH[i, b]
             S[a, b] = total
-    cholesky(S, root)
+    cholesky_into(S, root)
     K, keep, kept = np.empty((n, m)), np.empty((n, n)), np.empty((n, n))
     for i in range(n):
         out_mean[i] = mean[i]
         for a in range(m):
             K[i, a] = PH[i, a]
-        solve(root, K[i])
+        cholesky_solve(root, K[i])
         for a in range(m):
             out_mean[i] += K[i, a] * innovation[a]
     for i in range(n):

@@ -1,4 +1,7 @@
-"""Matrices of a dozen rows, one at a time, in compiled code."""
+"""Matrices of a dozen rows, one at a time, in compiled code.
+
+The rows `profile_of_many_axes` and `mixture_of_many_axes` of tools/bench need it beside `aolink.numerics`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ from typing import Any
 import numba
 
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.covariance import JITTER
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -38,17 +42,16 @@ def _compiled(function: Callable[..., Any], freedom: set[str]) -> Any:
         return numba.njit(**options)(function)
 
 
-_JITTER = 1e-10
 # Most sweeps of Jacobi's method, which ends where the squares off the diagonal are this share of those on it.
 _SWEEPS = 30
 _ROUNDING = 1e-28
 
 
 @compiled
-def cholesky(a: FloatArray, root: FloatArray) -> None:
+def cholesky_into(a: FloatArray, root: FloatArray) -> None:
     """Lower triangular root, (n, n), of a covariance that may be singular, from its lower half.
 
-    As `aolink.estimation.pixels.gaussian_mixture.cholesky`.
+    As `aolink.numerics.covariance.cholesky`.
     """
     n = len(a)
     largest = 0.0
@@ -57,7 +60,7 @@ def cholesky(a: FloatArray, root: FloatArray) -> None:
     for j in range(n):
         for i in range(j):
             root[i, j] = 0.0
-        total = a[j, j] * (1.0 + _JITTER) + 1e-14 * largest + 1e-300
+        total = a[j, j] * (1.0 + JITTER) + 1e-14 * largest + 1e-300
         for k in range(j):
             total -= root[j, k] * root[j, k]
         pivot = math.sqrt(total) if total > 0.0 else math.nan
@@ -70,7 +73,7 @@ def cholesky(a: FloatArray, root: FloatArray) -> None:
 
 
 @compiled
-def lower_inverse(root: FloatArray, out: FloatArray) -> None:
+def lower_inverse_into(root: FloatArray, out: FloatArray) -> None:
     """Inverse of a lower triangular matrix."""
     n = len(root)
     for j in range(n):
@@ -85,7 +88,7 @@ def lower_inverse(root: FloatArray, out: FloatArray) -> None:
 
 
 @compiled
-def solve(root: FloatArray, x: FloatArray) -> None:
+def cholesky_solve(root: FloatArray, x: FloatArray) -> None:
     """(R R')^-1 x in the place of x, (n,)."""
     n = len(root)
     for i in range(n):

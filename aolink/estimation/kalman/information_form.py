@@ -1,26 +1,45 @@
 """Updates of a plant with hundreds of states, in information form: posterior = (P^-1 + H' R^-1 H)^-1.
 
 The information that frames add is a sum over spots, of which each knows its own noise; nothing is as large as
-measurements times measurements. All products are those of `aolink.numerics.single_thread`.
+measurements times measurements (row `membrane_in_real_time` of tools/bench).
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from aolink.numerics import single_thread
+from aolink.estimation.kalman.gaussian import Gaussian, Update
 from aolink.numerics.arrays import FloatArray
-from aolink.numerics.information import information, inverse_root
+from aolink.numerics.batched import symmetric
+from aolink.numerics.single_thread import (
+    congruence_one_thread,
+    gram,
+    information_matrix,
+    inverse_by_cholesky,
+    matmul_one_thread,
+    root_of_information,
+)
 
 # A gain settles within this many exposures, or there is none; relative changes of a covariance below this are rounding.
 _MOST_EXPOSURES = 1000
 _SETTLED = 1e-11
 
 
-def update(
+def information_update(
+    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
+) -> Update:
+    """`blocked_update` for many states, axis by axis; only the innovation covariance's diagonal is computed."""
+    axes = len(innovation)
+    gains = [None] * axes if gain is None else np.broadcast_to(gain, (axes, *gain.shape[-2:]))
+    every = map(_updated, prior.mean, prior.covariance, innovation, H, R, gains)
+    mean, covariance, S, nis = (np.stack(each) for each in zip(*every, strict=True))
+    return Update(Gaussian(mean, covariance), innovation, S, nis)
+
+
+def _updated(
     mean: FloatArray, P: FloatArray, y: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """One step of a Kalman filter for one axis, y the innovation, with the optimal gain or another one.
+    """One axis, y its innovation, with the optimal gain or another one.
 
     Parameters
     ----------
@@ -36,22 +55,22 @@ def update(
     white = np.linalg.inv(np.linalg.cholesky(R))
     H_white = (white @ H.reshape(blocks, size, n)).reshape(m, n)
     y_white = (white @ y.reshape(blocks, size, 1)).ravel()
-    W = inverse_root(information(P) + single_thread.gram(H_white))
-    score = single_thread.matmul(H_white.T, y_white)
-    covariance = single_thread.gram(W)
-    moved = single_thread.matmul(covariance, score)
+    W = root_of_information(information_matrix(P) + gram(H_white))
+    score = matmul_one_thread(H_white.T, y_white)
+    covariance = gram(W)
+    moved = matmul_one_thread(covariance, score)
     nis = np.asarray(y_white @ y_white - score @ moved)
-    S = (single_thread.matmul(H, P) * H).sum(axis=1) + np.einsum("bss->bs", R).ravel()
+    S = (matmul_one_thread(H, P) * H).sum(axis=1) + np.einsum("bss->bs", R).ravel()
     if gain is not None:
-        moved = single_thread.matmul(gain, y)
-        keep = np.eye(n) - single_thread.matmul(gain, H)
+        moved = matmul_one_thread(gain, y)
+        keep = np.eye(n) - matmul_one_thread(gain, H)
         told = (gain.reshape(n, blocks, size).swapaxes(0, 1) @ R).swapaxes(0, 1).reshape(n, m)
-        covariance = single_thread.congruence(keep, P) + single_thread.matmul(told, np.ascontiguousarray(gain.T))
-        covariance = (covariance + covariance.T) / 2
+        covariance = congruence_one_thread(keep, P) + matmul_one_thread(told, np.ascontiguousarray(gain.T))
+        covariance = symmetric(covariance)
     return mean + moved, covariance, S, nis
 
 
-def steady_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:
+def stepped_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> FloatArray | None:
     """The gain that a Kalman filter settles at, (n_states, m); None where it does not settle.
 
     The Riccati equation stepped from exposure to exposure: a second for 288 states of a plant that forgets within a few
@@ -64,12 +83,11 @@ def steady_gain(A: FloatArray, H: FloatArray, Q: FloatArray, R: FloatArray) -> F
     """
     blocks, size, _ = R.shape
     weighted = np.asarray(np.linalg.solve(R, H.reshape(blocks, size, -1)), dtype=np.float64).reshape(len(H), -1)
-    told = single_thread.matmul(np.ascontiguousarray(H.T), weighted)
-    told, P = (told + told.T) / 2, Q
+    told = matmul_one_thread(np.ascontiguousarray(H.T), weighted)
+    told, P = symmetric(told), Q
     for _ in range(_MOST_EXPOSURES):
-        before, after = P, single_thread.inverse(information(P) + told)
-        P = single_thread.congruence(A, after) + Q
-        P = (P + P.T) / 2
+        before, after = P, inverse_by_cholesky(information_matrix(P) + told)
+        P = symmetric(congruence_one_thread(A, after) + Q)
         if np.abs(P - before).max() <= _SETTLED * np.abs(P).max():
-            return single_thread.matmul(after, np.ascontiguousarray(weighted.T))
+            return matmul_one_thread(after, np.ascontiguousarray(weighted.T))
     return None

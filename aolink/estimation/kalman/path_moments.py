@@ -10,13 +10,8 @@ import numpy as np
 
 from aolink.estimation.frames.frame_data import Flux, Measurement, Needs
 from aolink.estimation.kalman.gaussian import Gaussian, Update
-from aolink.estimation.kalman.update import (
-    blocked_update,
-    information_update,
-    joseph_update,
-    small_update,
-    two_state_update,
-)
+from aolink.estimation.kalman.information_form import information_update
+from aolink.estimation.kalman.update import blocked_update, joseph_update, small_update, two_state_update
 from aolink.estimation.model.base import ExposureModel, InputResponse
 from aolink.numerics import batched, entrywise
 from aolink.numerics.arrays import FloatArray
@@ -166,12 +161,12 @@ def _moment_entries(
     for o in range(model.plant.n_outputs):
         if 1 in orders:
             mean_row = model.mean_row[o].tolist()
-            moments.append(entrywise.dot(mean_row, x) + entrywise.columns(response.mean)[o])
+            moments.append(entrywise.dot_of_entries(mean_row, x) + entrywise.columns(response.mean)[o])
             slopes.append(mean_row)
         if 2 in orders:
-            slope = entrywise.columns(response.slope[:, o])
+            slope, square = entrywise.columns(response.slope[:, o]), entrywise.columns(response.square)[o]
             half = entrywise.add(_times_state(model.quadratic[o], state), slope)
-            moments.append(entrywise.dot(x, entrywise.add(half, slope)) + entrywise.columns(response.square)[o])
+            moments.append(entrywise.dot_of_entries(x, entrywise.add(half, slope)) + square)
             slopes.append([2 * each for each in half])
     return moments, slopes
 

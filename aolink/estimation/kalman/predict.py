@@ -9,8 +9,9 @@ import numpy as np
 
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.base import ExposureModel
-from aolink.numerics import batched, entrywise, single_thread
+from aolink.numerics import batched, entrywise
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.single_thread import congruence_one_thread
 from aolink.plant.alike import MANY_STATES
 
 Noise = Literal["lifted", "printed"]
@@ -35,7 +36,7 @@ def predict(state: Gaussian, transition: FloatArray, noise: FloatArray, kick: Fl
     """
     mean = predicted_mean(state.mean, transition, kick)
     if max(transition.shape) > MANY_STATES:
-        each = [single_thread.congruence(transition, P) for P in state.covariance]
+        each = [congruence_one_thread(transition, P) for P in state.covariance]
         return Gaussian(mean, batched.symmetric(np.stack(each) + noise))
     if max(transition.shape) > entrywise.MOST_ROWS:
         return Gaussian(mean, batched.symmetric(batched.congruence(transition, state.covariance) + noise))

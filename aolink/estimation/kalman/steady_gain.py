@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg
 
-from aolink.estimation.kalman import information_form
+from aolink.estimation.kalman.information_form import stepped_gain
 from aolink.estimation.model.base import ExposureModel
 from aolink.numerics.arrays import FloatArray
 from aolink.plant.alike import MANY_STATES
@@ -24,7 +24,7 @@ def steady_gain(model: ExposureModel, Q: FloatArray, R: FloatArray) -> FloatArra
     """
     H = model.mean_row
     if R.ndim == 3 and H.shape[1] > MANY_STATES:
-        return information_form.steady_gain(model.transition, H, Q, R)
+        return stepped_gain(model.transition, H, Q, R)
     if R.ndim == 3 and len(H) > H.shape[1]:
         return _compressed_gain(model, Q, R)
     R = linalg.block_diag(*R) if R.ndim == 3 else R

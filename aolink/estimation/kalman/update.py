@@ -1,7 +1,8 @@
 """The update of a Kalman filter, in the forms that it is computed in. They are one update, to rounding.
 
 `aolink.estimation.kalman.path_moments` chooses between them when an observation is made. Rows of tools/bench that need
-each: entry by entry `o3_step`, in blocks `spots_under_turbulence`, in information form `membrane_in_real_time`.
+each: entry by entry `o3_step`, in blocks `spots_under_turbulence`, in information form
+(`aolink.estimation.kalman.information_form`) `membrane_in_real_time`.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 
 from aolink.estimation.compiled import two_states
-from aolink.estimation.kalman import information_form
 from aolink.estimation.kalman.gaussian import MOST_COVARIANCES, Gaussian, Update
 from aolink.numerics import batched, entrywise
 from aolink.numerics.arrays import FloatArray
@@ -88,19 +88,6 @@ def blocked_update(
     return Update(Gaussian(prior.mean + moved, covariance), innovation, S, nis)
 
 
-def information_update(
-    prior: Gaussian, innovation: FloatArray, H: FloatArray, R: FloatArray, gain: FloatArray | None
-) -> Update:
-    """`blocked_update` for many states, in information form; only the innovation covariance's diagonal is computed."""
-    axes = len(innovation)
-    gains = [None] * axes if gain is None else np.broadcast_to(gain, (axes, *gain.shape[-2:]))
-    every = zip(prior.mean, prior.covariance, innovation, H, R, gains, strict=True)
-    mean, covariance, S, nis = (
-        np.stack(each) for each in zip(*(information_form.update(*one) for one in every), strict=True)
-    )
-    return Update(Gaussian(mean, covariance), innovation, S, nis)
-
-
 def small_update(
     prior: Gaussian, innovation: list[Entry], H: entrywise.Matrix, R: FloatArray, gain: FloatArray | None
 ) -> Update:
@@ -108,13 +95,14 @@ def small_update(
     axes, P, noise = len(prior.mean), entrywise.unpack(prior.covariance), entrywise.unpack(R)
     HP = entrywise.times_transposed(H, P)
     S = entrywise.symmetric_times_transposed(HP, H, noise)
-    S_inverse = entrywise.inverse(S)
-    K = entrywise.unpack(gain) if gain is not None else entrywise.times_transposed(entrywise.transpose(HP), S_inverse)
+    S_inverse = entrywise.inverse_of_entries(S)
+    PH = entrywise.transpose_of_entries(HP)
+    K = entrywise.times_transposed(PH, S_inverse) if gain is None else entrywise.unpack(gain)
     mean = entrywise.add(entrywise.columns(prior.mean), entrywise.times_vector(K, innovation))
-    keep = entrywise.one_minus(entrywise.times_transposed(K, entrywise.transpose(H)))
+    keep = entrywise.one_minus(entrywise.times_transposed(K, entrywise.transpose_of_entries(H)))
     from_noise = entrywise.symmetric_times_transposed(entrywise.times_transposed(K, noise), K)
-    covariance = entrywise.congruence(keep, P, from_noise)
-    nis = entrywise.dot(innovation, entrywise.times_vector(S_inverse, innovation))
+    covariance = entrywise.symmetric_times_transposed(entrywise.times_transposed(keep, P), keep, from_noise)
+    nis = entrywise.dot_of_entries(innovation, entrywise.times_vector(S_inverse, innovation))
     after = Gaussian(entrywise.pack_vector(mean, axes), entrywise.pack(covariance, axes))
     return Update(
         after, entrywise.pack_vector(innovation, axes), entrywise.pack(S, axes), entrywise.pack_one(nis, axes)

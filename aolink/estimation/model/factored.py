@@ -20,8 +20,10 @@ from functools import cached_property
 import numpy as np
 
 from aolink.estimation.model.base import ExposureModel, InputResponse, by_axis
-from aolink.numerics import batched, single_thread
+from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.covariance import psd_root
+from aolink.numerics.single_thread import gram, matmul_one_thread
 from aolink.plant.alike import AlikeSystems
 from aolink.plant.lifting import input_response, lift, output_rows
 from aolink.rig import Plant
@@ -81,14 +83,13 @@ def noise_factors(systems: AlikeSystems, n_steps: int) -> NoiseFactors:
     # Direction by direction of the systems: what a small covariance leaves out has no rounding below zero.
     rest = np.repeat(lift(one, n_steps)[1][None], len(along), axis=0)
     np.subtract.at(rest, space, pushed[time, :, None] * pushed[time, None, :])
-    sizes_of_rest, vectors = np.linalg.eigh(rest)
-    roots = vectors * np.sqrt(np.maximum(sizes_of_rest, 0.0))[:, None]
+    roots = psd_root(rest)
     root = np.empty((systems.order.size, roots.shape[0] * roots.shape[2]))
     root[systems.order] = np.einsum("ia,ise->asie", along * sd, roots).reshape(*systems.order.shape, -1)
     noise = ((systems.gains * sd) ** 2).sum(axis=1) * energy / n_steps
     return NoiseFactors(
         patterns=patterns, course_of=time, courses=courses[:, :distinct] * values[:distinct],
-        after=pushed[:distinct] @ one.C[0], ends=rows, end_remainder=single_thread.gram(np.ascontiguousarray(root.T)),
+        after=pushed[:distinct] @ one.C[0], ends=rows, end_remainder=gram(np.ascontiguousarray(root.T)),
         left_out=np.maximum(noise - patterns**2 @ values[time] ** 2 / n_steps, 0.0),
     )  # fmt: skip
 
@@ -198,9 +199,7 @@ class FactoredModel(ExposureModel):
 
     def _mean_slopes(self, path: FloatArray) -> FloatArray:
         """Mean of each output times the rows of its states over the fast steps, (axes, n_outputs, n_states)."""
-        return np.stack(
-            [self._of_states(single_thread.matmul(each, self.state_courses) / self.n_steps) for each in path]
-        )
+        return np.stack([self._of_states(matmul_one_thread(each, self.state_courses) / self.n_steps) for each in path])
 
     def times_quadratic(self, state: FloatArray) -> FloatArray:
         path = self.path(state, np.zeros((len(state), self.plant.n_outputs, self.n_steps)))
@@ -214,7 +213,7 @@ class FactoredModel(ExposureModel):
     def path(self, coefficients: FloatArray, input_path: FloatArray) -> FloatArray:
         count = coefficients.shape[1]
         patterns, courses = self.patterns[:, :count], self.courses[:, :count]
-        return input_path + np.stack([single_thread.matmul(patterns * z, courses.T) for z in coefficients])
+        return input_path + np.stack([matmul_one_thread(patterns * z, courses.T) for z in coefficients])
 
     def path_sd(self, covariance: FloatArray) -> FloatArray:
         # With process noise in it, also what is left out.
@@ -231,6 +230,6 @@ class FactoredModel(ExposureModel):
             columns = self.columns(count)
             for c, own in enumerate(columns):
                 for d, other in enumerate(columns[: c + 1]):
-                    block = single_thread.matmul(self.patterns[:, own], P[np.ix_(own, other)])
+                    block = matmul_one_thread(self.patterns[:, own], P[np.ix_(own, other)])
                     out[axis, :, c, d] = out[axis, :, d, c] = (block * self.patterns[:, other]).sum(axis=1)
         return out

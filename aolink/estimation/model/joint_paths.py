@@ -22,9 +22,9 @@ from aolink.estimation.model.base import InputResponse
 from aolink.estimation.model.exposure_model import exposure_model
 from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.quadrature import QuadraturePaths, QuadratureRule, Resolution, resolution
-from aolink.numerics import information, single_thread
 from aolink.numerics.arrays import FloatArray
 from aolink.numerics.covariance import psd_root
+from aolink.numerics.single_thread import gram, information_matrix, matmul_one_thread
 from aolink.optics.sensor import SpotSensor
 
 # Rms of the noise path that is left out, in standard deviations of the kernel: half of what one spot alone may leave
@@ -62,7 +62,7 @@ class JointPaths:
         """Coefficients of each course."""
         self.patterns = np.ascontiguousarray(model.patterns[:, : self.size])
         """(n_outputs, size)"""
-        self._gram = single_thread.gram(self.patterns)
+        self._gram = gram(self.patterns)
         # In the order of courses.
         self._patterns, self._course_of = np.ascontiguousarray(self.patterns[:, self.order]), course_of[self.order]
         self._starts = np.cumsum([0] + [len(own) for own in self.groups])
@@ -128,7 +128,7 @@ class JointPaths:
 
     def positions(self, t: FloatArray) -> FloatArray:
         """Where the spots are at the nodes, (spots, 2, nodes)."""
-        path = single_thread.matmul(self.shares(t), np.ascontiguousarray(self.functions.T)) + self.inputs
+        path = matmul_one_thread(self.shares(t), np.ascontiguousarray(self.functions.T)) + self.inputs
         return path.reshape(self.spots, 2, -1)
 
     def score(self, of_shares: FloatArray) -> FloatArray:
@@ -142,7 +142,7 @@ class JointPaths:
         for c, own in enumerate(self._slices):
             told = np.empty((len(self.patterns), own.stop))
             compiled_loops().informed(of_shares, self._patterns, self._course_of, c, told)
-            lower[own, : own.stop] = single_thread.matmul(self._patterns[:, own].T, told)
+            lower[own, : own.stop] = matmul_one_thread(self._patterns[:, own].T, told)
         compiled_loops().spread_out(lower, self.order, out)
         return out
 
@@ -152,7 +152,7 @@ class JointPaths:
         out = np.empty((self.spots, 2, m, 2, m))
         by_course = self._sorted(covariance)
         for c, own in enumerate(self._slices):
-            left = single_thread.matmul(self._patterns[:, own], by_course[own, : own.stop])
+            left = matmul_one_thread(self._patterns[:, own], by_course[own, : own.stop])
             compiled_loops().spread_of(left, self._patterns, self._starts, c, out)
         return out.reshape(self.spots, 2 * m, 2 * m)
 
@@ -189,7 +189,7 @@ class JointPaths:
 
     def prior_information(self, state_covariance: FloatArray) -> FloatArray:
         """Inverse of the coefficients' covariance before the exposure, (size, size)."""
-        return self.prior_covariance(information.information(state_covariance))
+        return self.prior_covariance(information_matrix(state_covariance))
 
 
 @lru_cache(maxsize=1)

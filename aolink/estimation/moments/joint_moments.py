@@ -22,8 +22,9 @@ from aolink.estimation.model.factored import FactoredModel
 from aolink.estimation.model.joint_paths import JointPaths, joint_paths
 from aolink.estimation.moments.spots import WindowedSpots
 from aolink.estimation.moments.windowed import NOT_BELIEVED, PASSES, Basis, Regression, error_memory, slowest
-from aolink.numerics import batched, information, single_thread
+from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.single_thread import by_one_thread, covariance_of_information, matmul_one_thread, solve_information
 from aolink.optics.sensor import SpotSensor
 
 # A window without a pixel that can be used has neither moments nor noise.
@@ -39,7 +40,7 @@ class JointObservation(ABC):
     def __init__(self, sensor: SpotSensor, n_measurements: int) -> None:
         self.sensor, self.n_measurements = sensor, n_measurements
 
-    @single_thread.by_one_thread
+    @by_one_thread
     def update(self, model: ExposureModel, response: InputResponse, prior: Gaussian, measured: SpotWindows) -> Update:
         """The prior updated with the pixels; coefficients that move no spot visibly keep theirs."""
         assert isinstance(model, FactoredModel)
@@ -106,15 +107,15 @@ class JointMoments(JointObservation):
                 y, noise, fit = self._spot.ratios(y, noise, fit)
             new = y - fit.expected - batched.matvec(fit.slope, of_spots(prior.mean - t))
             H, score = _told(paths, fit, noise + memory * fit.remainder, new)
-            P = information.covariance(precision + H)
-            t = prior.mean + single_thread.matmul(P, score)
+            P = covariance_of_information(precision + H)
+            t = prior.mean + matmul_one_thread(P, score)
             if to_come:
                 spread = paths.spread(P)
         # The covariance of this one innovation is without the memory.
         own = noise + fit.remainder
         H, score = _told(paths, fit, own, new)
-        weighted = np.linalg.solve(own, new[..., None])[..., 0]
-        nis = np.asarray((new * weighted).sum() - score @ information.solve(precision + H, score))
+        weighted = batched.solve(own, new)
+        nis = np.asarray((new * weighted).sum() - score @ solve_information(precision + H, score))
         if light is not None and light < LEAST_FLUX:
             nis = np.asarray(NOT_BELIEVED)
         S = np.einsum("skk->sk", batched.congruence(fit.slope, first) + own)

@@ -24,9 +24,10 @@ import numpy as np
 
 from aolink.estimation.estimate import Components, Estimate
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, log_sum, lower_inverse, single
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, single
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray
+from aolink.numerics.covariance import cholesky, lower_inverse, psd_root
 
 _DRAWS = 400
 _DOUBT = 1e-3
@@ -107,7 +108,7 @@ def _of_axis(
     spread = batched.symmetric(spread)
     total = np.cumsum(weight, axis=0)
     chosen = np.minimum((total < rng.random(count) * total[-1]).sum(axis=0), len(total) - 1)
-    root = _roots(given[:, :n, :n])[chosen]
+    root = psd_root(given[:, :n, :n])[chosen]
     start = mean[chosen, :n] + batched.matvec(G[chosen, :n], away[chosen, np.arange(count)])
     start += batched.matvec(root, rng.standard_normal((count, n)))
     return whole, spread, np.tensordot(share, G, axes=1), _with_moments(start, whole[:n], spread[:n, :n])
@@ -129,12 +130,6 @@ def _joint(estimate: Estimate, components: Components, axis: int) -> tuple[Float
     mean[:, -n:] += estimate.end_state[axis] - model.end_rows @ estimate.coefficients[axis]  # response to the inputs
     covariance[:, -n:, -n:] += model.end_remainder
     return log_weight, mean, covariance
-
-
-def _roots(covariances: FloatArray) -> FloatArray:
-    """Roots of covariances that rounding may have made negative."""
-    values, vectors = np.linalg.eigh(batched.symmetric(covariances))
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[:, None])
 
 
 def _with_moments(points: FloatArray, mean: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -12,9 +12,7 @@ from aolink.estimation.compiled import mixtures as compiled_mixtures
 from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
-
-# Relative to each variance; what a prior knows for certain stays certain to this.
-_JITTER = 1e-10
+from aolink.numerics.covariance import cholesky, lower_inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,16 +166,3 @@ def log_sum(values: FloatArray, axis: int) -> FloatArray:
         # One after the other, so that terms of weight zero change no bit.
         total = np.take(np.add.accumulate(np.exp(values - top), axis=axis), -1, axis=axis)
         return np.asarray(np.log(total) + np.squeeze(top, axis=axis))
-
-
-def cholesky(covariance: FloatArray) -> FloatArray:
-    """Lower triangular root of covariances (..., n, n) that may be singular."""
-    diagonal = np.einsum("...ii->...i", covariance)
-    largest = np.maximum.reduce(diagonal, axis=-1, keepdims=True)
-    lifted = covariance + (_JITTER * diagonal + 1e-14 * largest + 1e-300)[..., None] * np.eye(covariance.shape[-1])
-    return np.asarray(np.linalg.cholesky(lifted))
-
-
-def lower_inverse(root: FloatArray) -> FloatArray:
-    """Inverse of lower triangular matrices."""
-    return np.asarray(np.linalg.solve(root, np.broadcast_to(np.eye(root.shape[-1]), root.shape)))

@@ -122,7 +122,7 @@ def importance_corrected(
     numbers = [quasi_random(points_of_round(n, share), n, k) for k in range(ROUNDS)]
     fit = proposal.copy()
     effective = np.empty(len(prior.mean))
-    compiled_mixtures.importance_corrected(
+    compiled_mixtures.correct_by_importance(
         view.seen, *prior.contiguous, *fit.contiguous, np.stack([u for u, _ in numbers]),
         np.stack([e for _, e in numbers]), enough, LEAST_EFFECTIVE, HALVINGS, n * PRIOR_POINTS,
         n * LAST_PRIOR_POINTS, LOOSENED, NEGLIGIBLE, effective,

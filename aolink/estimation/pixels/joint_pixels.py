@@ -27,8 +27,9 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.model.joint_paths import JointPaths, compiled_loops
 from aolink.estimation.moments.joint_moments import JointMoments, JointObservation
 from aolink.estimation.pixels.levenberg_marquardt import Points, minimise
-from aolink.numerics import information, single_thread
 from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.batched import symmetric
+from aolink.numerics.single_thread import covariance_of_information, gram, matmul_one_thread, solve_information
 from aolink.optics.camera import effective_noise_density, shot_gain
 from aolink.optics.kernel import pixel_masses
 from aolink.optics.plane import mehler_series
@@ -130,7 +131,7 @@ def find_mode(
 
     def at(t: FloatArray, _: Indices) -> Points:
         near = view.at(t[0])
-        pull = single_thread.matmul(precision, t[0] - mean)
+        pull = matmul_one_thread(precision, t[0] - mean)
         objective = 0.5 * float((t[0] - mean) @ pull) - near.log_likelihood
         kept = np.empty(1, dtype=object)
         kept[0] = near
@@ -144,7 +145,7 @@ def find_mode(
 
 
 def _solve(a: FloatArray, x: FloatArray) -> FloatArray:
-    return np.stack([information.solve(*each) for each in zip(a, x, strict=True)])
+    return np.stack([solve_information(*each) for each in zip(a, x, strict=True)])
 
 
 class JointProfile(JointObservation):
@@ -164,14 +165,14 @@ class JointProfile(JointObservation):
         before, P, view = prior.mean, prior.covariance, JointPixels(self.sensor, paths, windows)
         if paths.rms_spread(P) <= LARGEST_SPREAD * np.sqrt(view.kernel_variance):
             mode = find_mode(view, before, paths.prior_information(P), before)
-            t, after, at = mode.t, information.covariance(mode.precision), mode.at
+            t, after, at = mode.t, covariance_of_information(mode.precision), mode.at
         else:
             t, after, *_ = self._moments.corrected(paths, prior, windows)
             at = view.at(t)
-        return t, after, *innovation(paths, before, P, t, at)
+        return t, after, *displacements(paths, before, P, t, at)
 
 
-def innovation(
+def displacements(
     paths: JointPaths, mean: FloatArray, state_covariance: FloatArray, t: FloatArray, at: Linearised
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Displacement of each spot from its prediction, as the pixels linearised at a point give it.
@@ -191,10 +192,10 @@ def innovation(
     patterns = paths.patterns.reshape(spots, 1, 2, -1)
     H = by_share[:, :, 0, paths.course_of] * patterns[:, :, 0] + by_share[:, :, 1, paths.course_of] * patterns[:, :, 1]
     H = H.reshape(2 * spots, -1)
-    new = (noise @ at.displacement_score[..., None]).ravel() + single_thread.matmul(H, t - mean)
-    S = single_thread.matmul(single_thread.matmul(H[:, :n], state_covariance), H[:, :n].T)
-    S += single_thread.gram(H[:, n:].T)
+    new = (noise @ at.displacement_score[..., None]).ravel() + matmul_one_thread(H, t - mean)
+    S = matmul_one_thread(matmul_one_thread(H[:, :n], state_covariance), H[:, :n].T)
+    S += gram(H[:, n:].T)
     for s in range(spots):
         S[2 * s : 2 * s + 2, 2 * s : 2 * s + 2] += noise[s]
-    S = (S + S.T) / 2
-    return new, np.diagonal(S).copy(), np.asarray(new @ information.solve(S, new))
+    S = symmetric(S)
+    return new, np.diagonal(S).copy(), np.asarray(new @ solve_information(S, new))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
 
 FIRST_DAMPING = 0.01
@@ -37,14 +38,9 @@ class Points:
     """What the caller wants to keep of each point, (points,)."""
 
 
-def solve(a: FloatArray, x: FloatArray) -> FloatArray:
-    """a^-1 x of small matrices, (points, n, n) and (points, n)."""
-    return np.asarray(np.linalg.solve(a, x[..., None])[..., 0])
-
-
 def minimise(
     at: Callable[[FloatArray, Indices], Points], starts: FloatArray, passes: int, converged: float, *,
-    foreseen: float = 0.0, solve: Callable[[FloatArray, FloatArray], FloatArray] = solve,
+    foreseen: float = 0.0, solve: Callable[[FloatArray, FloatArray], FloatArray] = batched.solve,
 ) -> tuple[FloatArray, Points]:  # fmt: skip
     """Where each of many starts leads; each one's way does not depend on the others.
 

@@ -25,7 +25,7 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.kalman.update import joseph_update
 from aolink.estimation.moments.windowed import KERNEL_REACH, PATH_REACH
 from aolink.estimation.pixels.filter import Innovation
-from aolink.estimation.pixels.gaussian_mixture import cholesky, log_sum, lower_inverse
+from aolink.estimation.pixels.gaussian_mixture import log_sum
 from aolink.estimation.pixels.levenberg_marquardt import (
     FIRST_DAMPING,
     FREE_DAMPING,
@@ -36,6 +36,7 @@ from aolink.estimation.pixels.levenberg_marquardt import (
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.covariance import cholesky, lower_inverse
 
 _PASSES = 16
 _BROAD_PASSES = 2
@@ -137,7 +138,7 @@ def found_compiled(
     axes, count, n = starts.shape
     count += 3 if reversed_precision else 0
     found = Modes.none(axes, count, n)
-    compiled_modes.find_modes(
+    compiled_modes.find_modes_of_lines(
         line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), np.ascontiguousarray(starts),
         of_axis, whole, reversed_precision, passes, FIRST_DAMPING, LARGEST_DAMPING, FREE_DAMPING, converged,
         *found.arrays,
@@ -184,7 +185,7 @@ def broad(view: PixelView, prior: Gaussian) -> Gaussian:
     """The prior of t updated with windowed moments: wide where the posterior has several modes."""
     if (line := view.line) is not None:
         after = Gaussian(np.empty_like(prior.mean), np.empty_like(prior.covariance))
-        compiled_moments.broad(
+        compiled_moments.broad_of_lines(
             line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), _BROAD_PASSES, _NO_NOISE,
             PATH_REACH, KERNEL_REACH, after.mean, after.covariance,
         )  # fmt: skip
@@ -211,7 +212,7 @@ def spread_starts(view: PixelView, prior: Gaussian, wide: Gaussian) -> tuple[Flo
     axes, n = wide.mean.shape
     if view.on_line:
         starts, squares = np.empty((axes, 1 + 2 * min(_DIRECTIONS, n), n)), np.empty((axes, n))
-        compiled_modes.spread_starts(
+        compiled_modes.spread_starts_of_lines(
             *(np.ascontiguousarray(each) for each in (prior.mean, prior.covariance, wide.mean, wide.covariance)),
             view.gram, _START_REACH, starts, squares,
         )  # fmt: skip
@@ -278,7 +279,7 @@ def innovation(view: PixelView, prior: Gaussian, modes: Modes) -> Innovation:
     k = min(_NEW_DIRECTIONS * view.outputs, n)
     if (line := view.line) is not None:
         u, values, nis, square = np.empty((axes, k)), np.empty((axes, k)), np.empty(axes), np.empty(axes)
-        compiled_modes.innovations(
+        compiled_modes.innovations_of_lines(
             line, np.ascontiguousarray(prior.mean), np.ascontiguousarray(prior.covariance), t, _TELLS_NOTHING, u,
             values, nis, square,
         )  # fmt: skip

@@ -16,9 +16,10 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import optimize
 
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, log_sum, with_noise
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics.arrays import FloatArray, Indices
+from aolink.numerics.covariance import cholesky
 
 _MOVES = 16
 _EFFECTIVE = 0.5

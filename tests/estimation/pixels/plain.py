@@ -8,9 +8,10 @@ import numpy as np
 from aolink.estimation import Profile
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import importance
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, log_sum, with_noise
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, log_sum, with_noise
 from aolink.estimation.pixels.likelihood import PixelView
 from aolink.numerics import batched
+from aolink.numerics.covariance import cholesky
 from aolink.optics.kernel import pixel_masses
 from aolink.optics.plane import mehler_series
 from tests.kinds import must_be

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 from aolink.estimation.kalman.gaussian import Gaussian
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, joined, log_sum, single
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, joined, log_sum, single
+from aolink.numerics.covariance import cholesky
 
 
 def mixture(seed, axes=3, components=5, n=3):

@@ -240,7 +240,7 @@ def test_the_gain_of_o1_solves_the_riccati_equation(small_membrane):
     np.testing.assert_allclose(gain, P @ H.T @ np.linalg.inv(H @ P @ H.T + noise), atol=1e-6 * np.abs(gain).max())
     # A plant that keeps what it is never shown: two actuators in the place of each, of which only sums are seen.
     sums = np.repeat(np.eye(40), 2, axis=1)
-    assert information_form.steady_gain(np.eye(80), sums, np.eye(80), np.tile(np.eye(2), (20, 1, 1))) is None
+    assert information_form.stepped_gain(np.eye(80), sums, np.eye(80), np.tile(np.eye(2), (20, 1, 1))) is None
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,11 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.estimation.moments.windowed import WindowedMoments
 from aolink.estimation.pixels import likelihood
 from aolink.estimation.pixels.filter import MixtureFilter
-from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, cholesky, single
+from aolink.estimation.pixels.gaussian_mixture import GaussianMixture, single
 from aolink.estimation.pixels.importance import importance_corrected
 from aolink.estimation.pixels.modes import broad, find_modes, whitened
 from aolink.estimation.pixels.updates import MIXTURE, PROFILE, explored
+from aolink.numerics.covariance import cholesky
 from aolink.optics.camera import to_counts
 from aolink.optics.kernel import exposure_density
 from aolink.rig import load_rig
