@@ -23,7 +23,7 @@ def export(
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Write exposures, inputs, estimates and truth of a recording as other programs read them.
+    """Write exposures, inputs, estimates and truth of a recording in formats that other programs read.
 
     NumPy, NetCDF and AOT telemetry hold the frames and the paths; a table has a row for each exposure and axis.
     """

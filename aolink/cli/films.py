@@ -43,7 +43,7 @@ TopicOption = Annotated[
 def film_settings(
     rate: float | None, frames: int, track: int, at: list[str] | None, invert: bool, gamma: float, **more: object
 ) -> "Settings":
-    """The options of a command as settings. Raises ImportingError for a place that is none."""
+    """The options of a command as settings. Raises ImportingError for an invalid place."""
     from aolink.importing.frames import Settings
 
     if rate is not None and rate <= 0:

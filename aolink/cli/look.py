@@ -62,7 +62,7 @@ def view(
 ) -> None:
     """Open a recording in Rerun, or a Rerun file that was saved from one.
 
-    Of five exposures or fewer, paths are shown at every fast step; of more, at 32 places of each exposure.
+    For five exposures or fewer, paths are shown at every fast step; for more, at 32 places of each exposure.
     """
     import tempfile
 
@@ -112,7 +112,8 @@ def view(
 
 
 class _WithoutPandas:
-    """Lets nobody load pandas: pyarrow would, for 0.3 s, to ask whether the first array that it makes is of pandas."""
+    """Prevents pandas from being loaded: pyarrow would load it, in 0.3 s, to check whether the first array that it
+    makes is one of pandas."""
 
     def find_spec(self, name: str, *_: object) -> None:
         if name == "pandas":
@@ -124,7 +125,7 @@ def _address(address: str) -> None:
 
 
 def _numbers(recording: "Recording", exposure: int | None, start: float | None, end: float | None) -> range | None:
-    """Which exposures are asked for; None for all. Raises ViewerError where there are none."""
+    """The numbers of the exposures that are asked for; None for all. Raises ViewerError where there are none."""
     count = recording.n_frames
     if exposure is not None:
         if start is not None or end is not None:
@@ -146,7 +147,7 @@ def _numbers(recording: "Recording", exposure: int | None, start: float | None, 
 
 
 def _first_steps(recording: "Recording") -> list[int]:
-    """The fast steps at which the exposures begin, by the messages that tell of them."""
+    """The fast steps at which the exposures begin, from the messages that have them."""
     from aolink.recording import topics
     from aolink.recording.schemas_pb2 import ExposureInfo
 

@@ -223,7 +223,7 @@ def _print_session(report: "Report", output: Path, as_json: bool) -> None:
 def _live_view(
     rig: "Rig", estimators: Sequence[str], true_scene: "NDArray[np.uint16] | None" = None, *, shown: bool
 ) -> "AbstractContextManager[LiveView | None]":
-    """What shows exposures in the viewer, or None."""
+    """The function that shows exposures in the viewer, or None."""
     if not shown:
         return nullcontext()
     from aolink import viewing
@@ -331,7 +331,7 @@ def _replay_control(recording: "Recording", controller: str, estimator: str, *, 
 
 
 def _are_driven(rig: "Rig", camera: str | None, mirror: str | None) -> bool:
-    """Whether a port or the rig file says what drives each of the devices."""
+    """Whether a port or the rig file names the driver of each device."""
     return all(port or kind in rig.devices for kind, port in (("camera", camera), ("mirror", mirror)))
 
 

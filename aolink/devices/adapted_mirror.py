@@ -92,7 +92,7 @@ class AdaptedMirror(Adapted):
         clock_ns, driver_ns = self.clock.device_ns(host_ns)[1], self._driver_sigma_ns()
         if Lacks.QUEUE in self.lacks:
             return math.hypot(clock_ns, self._delay_sd_ns, driver_ns)
-        return math.hypot(max(clock_ns, driver_ns), self._delay_sd_ns)    # the first has part of the second
+        return math.hypot(max(clock_ns, driver_ns), self._delay_sd_ns)  # the first has part of the second
 
     def _driver_sigma_ns(self) -> float:
         """The driver's own standard deviation of the inputs' times, ns.

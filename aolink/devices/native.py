@@ -95,7 +95,7 @@ class _NativeDevice:
         self.identity = message
         self._queries.clear()
         self.steps = StepClock(self.clock, message.step_zero_ns, message.fast_step_ns)
-        self.clock.suspect(MOST_RATE_ERROR * (ANSWER_S + returned.away_s) * 1e9, now_ns)    # until a query
+        self.clock.suspect(MOST_RATE_ERROR * (ANSWER_S + returned.away_s) * 1e9, now_ns)  # until a query
         self._begin_anew(now_ns)
         return [returned]
 

@@ -144,7 +144,7 @@ class Hub:
         before = self._memory_bytes()
         sequences: list[int] = []
         for attempt in range(tries):
-            if attempt and (self._hurried or self._stop() or link.refusal):    # it will be refused again
+            if attempt and (self._hurried or self._stop() or link.refusal):  # it will be refused again
                 break
             sequences.append(link.send(request))
             deadline_ns = self.now_ns() + round(answer_s * 1e9)
