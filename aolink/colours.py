@@ -24,7 +24,7 @@ def estimator_colour(name: str) -> Colour:
 
 
 def by_rank(names: list[str]) -> list[str]:
-    """Estimators from the plainest to the one to look at first; those that are not installed here come last."""
+    """Estimators by their rank, the highest last; after them come those that are not installed here."""
 
     def rank(name: str) -> float:
         try:
@@ -36,5 +36,6 @@ def by_rank(names: list[str]) -> list[str]:
 
 
 def _look(name: str) -> Look | estimation.EstimatorRow:
-    """Place and colour of an estimator, whose name may have its options; aolink's own need not be loaded for that."""
+    """Rank and colour of an estimator, whose name may have its options; aolink's own estimators need not be loaded for
+    that."""
     return LOOKS.get(name.partition(":")[0]) or estimation.estimator_row(name)

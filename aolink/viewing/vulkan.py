@@ -10,7 +10,7 @@ import subprocess
 import sys
 
 _INSTANCE_CREATE_INFO = 1
-"""VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO"""
+"""The value of VK_STRUCTURE_TYPE_INSTANCE_CREATE_INFO."""
 _TIMEOUT_S = 20.0
 
 
