@@ -24,7 +24,7 @@ def estimator_colour(name: str) -> Colour:
 
 
 def by_rank(names: list[str]) -> list[str]:
-    """Estimators by their rank, the highest last; after them come those that are not installed here."""
+    """Estimators in the order of their ranks; those that are not installed here come last."""
 
     def rank(name: str) -> float:
         try:

@@ -1,4 +1,4 @@
-"""Information matrices, the inverses of covariances, which may be singular. By one thread of BLAS."""
+"""Information matrices, the inverses of covariances, which may be singular. BLAS uses one thread."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import numpy as np
 from aolink.numerics import single_thread
 from aolink.numerics.arrays import FloatArray
 
-# Added to the diagonal, relative to each variance: a state that the prior knows for certain stays certain to this.
+# Added to the diagonal, relative to each variance: a state that the prior determines exactly stays exact to this
+# accuracy.
 _JITTER = 1e-10
 
 
@@ -21,7 +22,8 @@ def information(covariance: FloatArray) -> FloatArray:
 
 
 def inverse_root(precision: FloatArray) -> FloatArray:
-    """W with W' W the covariance of an information matrix, (n, n); it is scaled to a diagonal of one before."""
+    """Matrix W with W' W the covariance of an information matrix, (n, n); the information matrix is first scaled to a
+    diagonal of one."""
     scale = 1 / np.sqrt(np.diagonal(precision))
     return np.asarray(single_thread.inverse_root(precision * scale * scale[:, None]) * scale)
 
@@ -33,6 +35,6 @@ def covariance(precision: FloatArray) -> FloatArray:
 
 
 def solve(precision: FloatArray, score: FloatArray) -> FloatArray:
-    """precision^-1 score, scaled as in `inverse_root`."""
+    """The vector precision^-1 score, scaled as in `inverse_root`."""
     scale = 1 / np.sqrt(np.diagonal(precision))
     return single_thread.solve(precision * scale * scale[:, None], score * scale) * scale

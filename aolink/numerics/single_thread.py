@@ -27,7 +27,8 @@ def _libraries() -> ThreadpoolController:
 
 
 class _ByOneThread(ContextDecorator):
-    """BLAS has one thread while anybody is inside. One at a time, for that number is the process's."""
+    """A context in which BLAS has one thread. One thread at a time may be inside, because that number is the
+    process's."""
 
     def __init__(self) -> None:
         self._lock = RLock()
@@ -67,7 +68,7 @@ def gram(a: FloatArray) -> FloatArray:
 
 @by_one_thread
 def congruence(a: FloatArray, p: FloatArray) -> FloatArray:
-    """a p a' for a symmetric p, (m, n) and (n, n) -> (m, m); ``a`` is taken as sparse where few entries are not zero.
+    """a p a' for a symmetric p, (m, n) and (n, n) -> (m, m); ``a`` is treated as sparse where few entries are not zero.
 
     Rows of ``p`` at its end that are those of the identity cost next to nothing.
     """
@@ -90,7 +91,7 @@ def inverse_root(a: FloatArray) -> FloatArray:
     Raises
     ------
     numpy.linalg.LinAlgError
-        It is not positive definite.
+        The matrix is not positive definite.
     """
     W, _ = scipy.linalg.lapack.dtrtri(_root(a), lower=1, overwrite_c=1)
     return np.asarray(W)

@@ -1,4 +1,4 @@
-"""The figure that explains the method: one exposure's path, how long it was where, and the blur that it left."""
+"""The figure that explains the method: one exposure's path, its histogram, and the blur that it left."""
 
 from __future__ import annotations
 
@@ -34,9 +34,8 @@ _SEGMENTS = 120
 def exposure_with_estimates(
     series: Series, number: int, estimators: Sequence[str] | None = None
 ) -> tuple[Exposure, dict[str, Estimate]]:
-    """An exposure by its number, counted from 0, and what there is of its estimates.
-
-    Without names those of the baseline and of the estimator to look at first.
+    """An exposure by its number, counted from 0, and its estimates. Without names they are those of the baseline and of
+    the estimator with the highest rank.
 
     Raises
     ------
@@ -69,19 +68,19 @@ def plot_exposure(
     """Draw one exposure: the path over its blur, the path's histogram, and the intensity profile beside them.
 
     The three panels of a row share the axis of the spot's position. The path's histogram, blurred by the kernel, is
-    the intensity that the path predicts; grey is what was measured. A spot on a plane has a row for x and one for y,
-    and its picture.
+    the intensity that the path predicts; grey is the measured intensity. A spot on a plane has a row for x and one for
+    y, and its picture.
 
     Parameters
     ----------
     number:
         Number of the exposure in the series, counted from 0.
     figure:
-        Where to draw; by default a new figure.
+        The figure to draw on; by default a new one.
     estimators:
-        Whose paths; by default those of the baseline `o1` and of the estimator to look at first.
+        Estimators whose paths are drawn; by default the baseline `o1` and the estimator with the highest rank.
     spot:
-        Which spot of a sensor with many.
+        Number of the spot, on a sensor with many.
     unit:
         Whether the time axis counts milliseconds of the exposure or its fast steps.
 
@@ -100,7 +99,7 @@ def draw_exposure(
     series: Series, exposure: Exposure, estimates: dict[str, Estimate], figure: Figure | SubFigure | None = None, *,
     spot: int = 0, unit: TimeUnit = "s",
 ) -> Figure | SubFigure:  # fmt: skip
-    """What `plot_exposure` draws, of an exposure that has been read."""
+    """Draw the figure of `plot_exposure` for an exposure that has been read."""
     sensor = series.rig.sensor
     on_plane = isinstance(sensor, SpotSensor)
     spots = sensor.spots if isinstance(sensor, SpotSensor) else series.rig.n_outputs
@@ -131,7 +130,7 @@ def _draw_row(
     panels: Sequence[Axes], series: Series, exposure: Exposure, estimates: dict[str, Estimate], output: int,
     unit: TimeUnit,
 ) -> None:  # fmt: skip
-    """Path, histogram and intensity profile of one output."""
+    """Draw path, histogram and intensity profile of one output."""
     over_time, histogram, intensity = panels
     line: Sensor = series.rig.sensor.profile
     seen = profile_density(series.rig.sensor, exposure, output)
@@ -169,7 +168,7 @@ def _draw_row(
 
 
 def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray | None, name: str) -> None:
-    """A path with the band of its estimate; one that swings too fast to be seen as a line, as its range."""
+    """Draw a path with the band of its estimate; one that swings too fast for a line is drawn as its range."""
     low, high = extremes(path, _SEGMENTS)
     if hides_swings(path, _SEGMENTS):
         edges = np.linspace(times[0], times[-1], len(low))
@@ -184,7 +183,7 @@ def _draw_path(axes: Axes, times: FloatArray, path: FloatArray, sd: FloatArray |
 def _draw_spot(
     axes: Axes, sensor: SpotSensor, exposure: Exposure, estimates: dict[str, Estimate], spot: int
 ) -> None:  # fmt: skip
-    """The picture of one spot with the paths over it."""
+    """Draw the picture of one spot with the paths over it."""
     row, column = divmod(int(sensor.lit[spot]), sensor.grid[1])
     height, width = sensor.window
     window = np.s_[row * height : (row + 1) * height, column * width : (column + 1) * width]
@@ -206,6 +205,6 @@ def _draw_spot(
 
 
 def _light(series: Series, output: int) -> float:
-    """Share of its light that an output's lenslet gets."""
+    """Share of full light that an output's lenslet gets."""
     light = series.rig.sensor.spot_light if isinstance(series.rig.sensor, SpotSensor) else None
     return 1.0 if light is None else float(light[output // 2])

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 FORMATS = (".png", ".svg", ".pdf")
 _DATED = {".svg": "Date", ".pdf": "CreationDate"}
-"""What matplotlib would write the time of day into: the same recording is to give the same file."""
+"""Metadata into which matplotlib would write the time of day: the same recording must give the same file."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class _Figure:
     """A figure that has a name."""
 
     what: str
-    """What it shows, in words."""
+    """The content of the figure, in words."""
     height: float
-    """Over its width."""
+    """Height of the figure as a share of its width."""
     draw: Callable[..., Axes] | None = None
-    """Draws it of an overview, on axes; None for those of one exposure, or of the pupil."""
+    """Function that draws it from an overview, on axes; None for figures of one exposure, or of the pupil."""
 
 
 FIGURES = {
@@ -67,21 +67,21 @@ def save_figure(
     what:
         Name of the figure.
     path:
-        The file to write; its ending says the format.
+        The file to write; its suffix sets the format.
     estimators:
-        Whose paths and NIS; by default what the figure's own function takes.
+        Estimators whose paths and NIS are drawn; the default is that of the figure's own function.
     exposure:
         Number of the exposure, for ``exposure`` and ``scene``; by default the one with the largest blur.
     output, spot:
         Output whose blur is drawn, and spot of the exposure that is drawn.
     unit:
-        What time axes count.
+        The unit of time axes.
     width_mm:
         Width on paper.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
-        Is told how many exposures have been read.
+        Called with the number of exposures read.
 
     Raises
     ------

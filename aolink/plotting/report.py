@@ -31,9 +31,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SIDE_BY_SIDE = 3
-"""So many recordings have all their figures, beside each other; of more there is a table, and one figure of each."""
+"""Up to this many recordings stand beside each other with all their figures; for more there is a table, and one figure
+of each."""
 _DPI = 150
-"""Resolution of what is no line in a figure, dots per inch."""
+"""Resolution of the pictures in a figure, dots per inch."""
 _WIDE, _NARROW = (160.0, 66.0), (110.0, 66.0)
 """Width and height of figures, mm."""
 _STYLE = """
@@ -62,20 +63,20 @@ def write_report(
     recordings: Sequence[Recording], path: str | Path, *, unit: TimeUnit = "s", overwrite: bool = False,
     progress: Callable[[str, int], None] | None = None,
 ) -> Path:  # fmt: skip
-    """Write a page of HTML that says what recordings hold and how good their estimates are.
+    """Write a page of HTML about the content of recordings and the quality of their estimates.
 
-    Figures, style and all else are in the one file; it has no scripts and loads nothing. What a recording does not
-    have, or what cannot be read of it, is said in its place. Up to three recordings stand side by side with all their
-    figures; of more there is a table, and for each one figure of the session.
+    Figures, style and all else are in the one file; it has no scripts and loads nothing. Where a recording lacks data,
+    or cannot be read, a sentence says so. Up to three recordings stand side by side with all their figures; for more
+    there is a table, and for each one figure of the session.
 
     Parameters
     ----------
     unit:
-        What time axes count.
+        The unit of time axes.
     overwrite:
         Whether a file of that name may be replaced.
     progress:
-        Is told the name of the recording that is read, and how many of its exposures have been.
+        Called with the name of the recording that is read, and the number of its exposures read so far.
 
     Raises
     ------
@@ -107,7 +108,7 @@ class _Session:
             self.view = overview(recording, progress=lambda done: progress(self.name, done))
         except (AolinkError, ValueError, ArithmeticError) as error:
             self.problem = str(error)
-        self.facts = recording_facts(recording)  # after all of it was read: damage is known then
+        self.facts = recording_facts(recording)  # damage is known after all of it was read
 
     def title(self) -> str:
         return f"<h3>{escape(self.name)}</h3>"
@@ -115,7 +116,7 @@ class _Session:
     def drawn(
         self, size: tuple[float, float], caption: str, draw: Callable[[Overview, Figure], object]
     ) -> str:  # fmt: skip
-        """A figure with its caption; where it cannot be drawn, why."""
+        """A figure with its caption; where it cannot be drawn, the reason."""
         if self.view is None:
             return _note(self.problem)
         try:
@@ -143,7 +144,7 @@ class _Session:
         return _facts(rows)
 
     def lacks(self) -> list[str]:
-        """What is not in the recording, in sentences."""
+        """Sentences about the data that the recording lacks."""
         recording, said = self.recording, []
         if self.view is not None and not len(self.view):
             said.append("It holds no exposure: there is nothing to draw.")
@@ -168,7 +169,7 @@ class _Session:
         return _score_table(self.view.scores)
 
     def exposures(self) -> str:
-        """The exposures that tell most."""
+        """The most telling exposures."""
         if self.view is None:
             return _note(self.problem)
         parts = []
@@ -271,7 +272,7 @@ def _page(sessions: Sequence[_Session]) -> str:
 
 
 def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
-    """All that there is of a few sessions, each section side by side."""
+    """All sections of a few sessions, each section side by side."""
     one = len(sessions) == 1
 
     def beside(title: str, give: Callable[[_Session], str]) -> str:

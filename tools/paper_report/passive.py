@@ -81,7 +81,7 @@ def passive_output(model: ExposureModel, inputs: FloatArray, state: FloatArray, 
     constant = gain[0] / (gain[0] @ gain[0])
     across = np.array([-constant[1], constant[0]])
     # Largest r with constant + (p - q) across at least r everywhere: a linear program in (p, q, r). The small cost
-        # of p and q leaves them at zero where they change nothing.
+    # of p and q leaves them at zero where they change nothing.
     program = optimize.linprog(
         [_PRICE, _PRICE, -1.0],
         A_ub=np.column_stack([-gain @ across, gain @ across, np.ones(len(gain))]),
