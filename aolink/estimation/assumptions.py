@@ -1,6 +1,6 @@
-"""What estimators of the blur assume of a rig: the ranges of the family of scenes that they are judged on.
+"""The assumptions of the estimators about a rig: the ranges of the family of scenes that they are judged on.
 
-`tools/family` draws its scenes from these ranges. A rig outside may work as well; nobody has measured how well.
+`tools/family` draws its scenes from these ranges. A rig outside may work as well, but how well has not been measured.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from aolink.rig import Rig
 
 MOST_MODES = 3
 MOST_SWINGS = 8.0
-"""Swings of a mode in one exposure, at most."""
+"""Most swings of an eigenmode in one exposure."""
 STEPS_IN_SWING = 8
-"""Fast steps in one swing of a mode, at least."""
+"""Fewest fast steps in one swing of an eigenmode."""
 MOST_PATH_WIDTHS = 8.0
-"""Standard deviation of the spot's motion, in standard deviations of the kernel."""
+"""Largest standard deviation of the spot's motion, in standard deviations of the kernel."""
 LEAST_KERNEL_PIXELS = 0.8
-"""The kernel's sigma."""
+"""Least sigma of the kernel, pixels."""
 LEAST_PEAK_SNR = 1.0
-"""Signal to noise in the brightest pixel of a resting spot."""
+"""Least signal to noise in the brightest pixel of a resting spot."""
 
-# A mode that makes less than this share of the motion's variance does not count.
+# An eigenmode that makes less than this share of the motion's variance does not count.
 _LEAST_SHARE = 0.01
-# Plants whose eigenvectors are closer to each other than this have no modes of their own.
+# Plants whose eigenvectors are closer to each other than this have no separate eigenmodes.
 _MOST_CONDITION = 1e8
 _MOST_OUTPUTS = 2
 _ROUNDING = 1e-9
@@ -44,7 +44,7 @@ def peak_snr(rig: Rig) -> float:
 def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
     """The rig file's key and a sentence for each assumption that a rig does not meet.
 
-    What moves the spot is judged for plants that move one spot each, along one axis or both.
+    The spot's motion is judged for plants that move one spot each, along one axis or both.
     """
     sensor, plant, timing = rig.sensor, rig.plant, rig.timing
     kernel = math.sqrt(2 * float(np.linalg.eigvalsh(sensor.kernel.covariance)[0])) / sensor.pixel_width
@@ -103,7 +103,8 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
 
 
 def _modes(rig: Rig) -> tuple[int, FloatArray]:
-    """How many modes move the spot along one axis, an oscillation being one; and the swings of each in an exposure."""
+    """The number of eigenmodes that move the spot along one axis, an oscillation counting as one; and the swings of
+    each in an exposure."""
     plant = rig.plant
     values, vectors = np.linalg.eig(plant.A)
     share = np.ones((plant.n_outputs, len(values)))

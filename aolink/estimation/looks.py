@@ -1,4 +1,5 @@
-"""How aolink's own estimators look in tables and plots, which nobody has to load an estimator for."""
+"""Rank and colour of aolink's own estimators in tables and plots, kept here so that no estimator has to be loaded for
+them."""
 
 from __future__ import annotations
 
@@ -6,10 +7,10 @@ from typing import NamedTuple
 
 
 class Look(NamedTuple):
-    """An estimator's place and colour."""
+    """An estimator's rank and colour."""
 
     rank: int
-    """From the plainest to the one that a user wants to see first; ours are tens."""
+    """Rank, from the simplest estimator to the one that is shown first; aolink's own ranks are multiples of ten."""
     colour: tuple[int, int, int]
     """Red, green and blue, 0 to 255."""
 

@@ -45,24 +45,25 @@ GROUP = "aolink.estimators"
 """The entry points by which other packages add estimators."""
 DEFAULT_ESTIMATOR = "o3"
 BASELINE_ESTIMATOR = "o1"
-"""What the others are compared with: it takes the centroid of a blurred spot alone."""
+"""The estimator that others are compared with: it takes the centroid of a blurred spot alone."""
 # Spots of one copy of the plant, by `moments`.
 _MOST_SPOTS = 128
 
 
 @dataclass(frozen=True, kw_only=True)
 class EstimatorRow:
-    """All that aolink knows of an estimator."""
+    """All that aolink needs to know about an estimator."""
 
     name: str
     rank: int
-    """Place in tables and plots, from the plainest to the one that a user wants to see first; ours are tens."""
+    """Rank in tables and plots, from the simplest estimator to the one that is shown first; aolink's own ranks are
+    multiples of ten."""
     colour: tuple[int, int, int]
     """Red, green and blue, 0 to 255."""
     build: Callable[[Rig, Options], Filter]
-    """Makes the filter for a rig, which says what it needs of a frame and updates with that."""
+    """A function that makes the filter for a rig; the filter states its needs of a frame and updates with them."""
     refusal: Callable[[Rig], str | None] = lambda rig: None
-    """Why it cannot work on a rig, and what to use instead; None where it can."""
+    """A function that gives the reason why it cannot work on a rig, and what to use instead; None where it can."""
     engines: tuple[Engine, ...] = ("aolink",)
     """Engines that it can run on."""
     wanders: bool = False
@@ -72,8 +73,8 @@ class EstimatorRow:
 
 
 def estimator_row(name: str) -> EstimatorRow:
-    """The row of an estimator, whose name may have its options. Raises EstimatorError: there is none, or the package
-    that has it is broken."""
+    """The row of an estimator, whose name may have its options. Raises EstimatorError if there is none, or if the
+    package that has it is broken."""
     return row_named(name.partition(":")[0], _OURS, GROUP, "estimator", EstimatorError)
 
 
@@ -115,7 +116,7 @@ def make_estimator(rig: Rig, name: str, **options: Any) -> Estimator:
         )
 
     def made(rig: Rig) -> Estimator:
-        # What the first exposure would load or compile is ready before the session.
+        # Code that the first exposure would load or compile is ready before the session.
         steps = rig.timing.exposure_steps
         exposure_model(rig.plant, steps, rig.timing.exposure_offset).response(np.ones((steps, rig.n_inputs)))
         return Estimator(rig, name, row.build(rig, chosen))
@@ -202,7 +203,7 @@ def _moments_refusal(rig: Rig) -> str | None:
 
 
 def _warm_up(rig: Rig) -> None:
-    """Estimate a dark exposure of many spots, so that what this loads is loaded before the session."""
+    """Estimate a dark exposure of many spots, so that the code for this is loaded before the session."""
     assert isinstance(rig.sensor, SpotSensor)
     steps = rig.timing.exposure_steps
     model = exposure_model(rig.plant, steps, rig.timing.exposure_offset)
@@ -250,7 +251,7 @@ def _of_pixels(rig: Rig, options: Options, updates: Any) -> Filter:
 
 
 def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
-    """Why a filter that uses every pixel cannot work on a rig; profile has another form for many alike systems."""
+    """Why a filter that uses every pixel cannot work on a rig; profile has another form for many equal systems."""
 
     def refusal(rig: Rig) -> str | None:
         if name == "profile" and alike_systems(rig.plant) is not None:

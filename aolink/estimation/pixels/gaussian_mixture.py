@@ -13,7 +13,7 @@ from aolink.estimation.kalman.gaussian import Gaussian
 from aolink.numerics import batched
 from aolink.numerics.arrays import FloatArray, Indices
 
-# Relative to each variance; what a prior knows for certain stays certain to this.
+# Relative to each variance; a value that a prior determines exactly stays exact to this accuracy.
 _JITTER = 1e-10
 
 
@@ -42,7 +42,7 @@ class GaussianMixture:
         return GaussianMixture(*(np.array(each, order="C") for each in (self.log_weight, self.mean, self.covariance)))
 
     def weighted(self, share: float) -> GaussianMixture:
-        """The same as that share of a mixture."""
+        """The mixture with its weights multiplied by a share."""
         return replace(self, log_weight=self.log_weight + math.log(share))
 
     @property
@@ -88,18 +88,17 @@ class GaussianMixture:
         )
 
     def reduced(self, most: int, free: float = 0.0) -> GaussianMixture:
-        """The same with ``most`` components, or fewer if mergers cost less than ``free``.
-
-        Again and again, the two components are merged that cost least. The cost is Runnalls' bound on the
-        Kullback-Leibler divergence, in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach
-        to Gaussian mixture reduction, IEEE Trans. AES 43 (2007), (21).
+        """The mixture reduced to ``most`` components, or fewer if mergers cost less than ``free``. Repeatedly, the two
+        components whose merger costs least are merged. The cost is Runnalls' bound on the Kullback-Leibler divergence,
+        in nats; a merger keeps mean and covariance. Runnalls, Kullback-Leibler approach to Gaussian mixture reduction,
+        IEEE Trans. AES 43 (2007), (21).
         """
         merged = self.copy()
         compiled_mixtures.merge(*merged.contiguous, most, free)
         return merged.ordered(most)
 
     def with_components(self, count: int) -> GaussianMixture:
-        """The same with ``count`` components, those after its own of weight zero."""
+        """The mixture with ``count`` components, those after its own with weight zero."""
         more = count - self.mean.shape[1]
         if more <= 0:
             return self
@@ -111,7 +110,7 @@ class GaussianMixture:
         return GaussianMixture(log_weight, mean, covariance)
 
     def replaced(self, axes: Indices, by: GaussianMixture) -> GaussianMixture:
-        """The same with these axes' mixtures replaced."""
+        """The mixtures with those of these axes replaced."""
         count = max(self.mean.shape[1], by.mean.shape[1])
         old, new = self.with_components(count), by.with_components(count)
         out = old.copy()
@@ -119,7 +118,7 @@ class GaussianMixture:
         return out
 
     def ordered(self, most: int | None = None) -> GaussianMixture:
-        """The same with the heaviest components first, and without columns in which all weights are zero."""
+        """The mixture with the heaviest components first, and without columns in which all weights are zero."""
         order = np.argsort(-self.log_weight, axis=1, kind="stable")[:, :most]
         rows = np.arange(len(order))[:, None]
         kept = self.log_weight[rows, order]
