@@ -93,8 +93,8 @@ def _ramp(rig: Rig, begin: FloatArray, end: FloatArray) -> FloatArray:
     needed_s = float(np.abs(end - begin).max()) / slew
     if needed_s > _LONGEST_RAMP_S:
         raise CalibrationError(
-            f"mirror.slew_max_per_s = {slew:g} makes the way from one poke to the next {needed_s:.3g} s long, more than"
-            f" {_LONGEST_RAMP_S:g} s: take a smaller amplitude, or correct the rig file"
+            f"mirror.slew_max_per_s = {slew:g} makes the ramp from one poke to the next {needed_s:.3g} s long, more"
+            f" than {_LONGEST_RAMP_S:g} s: take a smaller amplitude, or correct the rig file"
         )
     n_steps = math.ceil(needed_s / (timing.frame_period_steps * timing.fast_step_s)) * timing.frame_period_steps
     return begin + (end - begin) * np.arange(1, n_steps + 1)[:, None] / max(n_steps, 1)
@@ -143,7 +143,7 @@ def measure_interaction(
     design = np.column_stack([u, np.ones(len(u))])
     if np.linalg.matrix_rank(design) < design.shape[1]:
         raise CalibrationError(
-            f"{len(u)} exposures at rest do not tell {rig.n_inputs} inputs apart: poke each of them alone"
+            f"{len(u)} exposures at rest do not determine {rig.n_inputs} inputs: poke each of them alone"
         )
     solution, *_ = np.linalg.lstsq(design, y, rcond=None)
     matrix, residual = solution[:-1].T, y - design @ solution

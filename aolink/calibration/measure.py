@@ -141,8 +141,8 @@ def line_sensor(rig: Rig) -> Sensor:
     """The rig's sensor. Raises CalibrationError where it is not a line: nothing else can be calibrated."""
     if not isinstance(rig.sensor, Sensor):
         raise CalibrationError(
-            f"{rig.name} has no line sensor, and only that can be calibrated: put what is known of this one into the"
-            " rig file by hand"
+            f"{rig.name} has no line sensor, and only that can be calibrated: put the known values of this one into"
+            " the rig file by hand"
         )
     return rig.sensor
 
@@ -172,7 +172,7 @@ def calibrate(rig: Rig, recordings: Sequence[Frames]) -> Calibration:
     darks, flats, stills = ([each for each in recordings if each.kind == kind] for kind in KINDS)
     if not darks:
         raise CalibrationError(
-            "there are no dark frames, and without the black level nothing else can be known: cover the camera and"
+            "there are no dark frames, and without the black level nothing else can be measured: cover the camera and"
             " record some with --calibration dark"
         )
     notes: list[str] = []
@@ -328,7 +328,7 @@ def _photon_transfer(
     misfit = float((weight * (target - design @ [intercept, slope]) ** 2).sum())
     if stats.chi2.sf(misfit, len(x) - 1) < _SURE:
         notes.append(
-            f"variance does not grow in a line with the mean (chi-square {misfit:.0f} for {len(x) - 1}): the light"
+            f"variance does not grow linearly with the mean (chi-square {misfit:.0f} for {len(x) - 1}): the light"
             " flickers, the spot trembles or the camera is not linear, and photoelectrons is doubtful"
         )
     return Measured(float(slope), math.sqrt(covariance[1, 1]))
@@ -394,8 +394,8 @@ def _photoelectrons(rig: Rig, gain: Measured | None, scale: Measured, notes: lis
     told = rig.sensor.photoelectrons
     contradicted = 0 < told < least
     notes.append(
-        f"no shot noise is seen, so there are more than {least:.3g} photo-electrons; photoelectrons"
+        f"no shot noise is measurable, so there are more than {least:.3g} photo-electrons; photoelectrons"
         + (" becomes 0 (shot noise negligible)" if contradicted else " stays as the file has it")
-        + "; brighter flats would tell"
+        + "; brighter flats would show how many"
     )
     return Measured(0.0, math.nan) if contradicted else None

@@ -19,7 +19,11 @@ def export(
     ],
     estimator: Annotated[
         list[str] | None,
-        typer.Option("--estimator", "-e", help="Whose estimates; may be given several times. All by default."),
+        typer.Option(
+            "--estimator",
+            "-e",
+            help="Estimators whose estimates are written; may be given several times; all by default.",
+        ),
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:

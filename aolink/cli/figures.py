@@ -47,7 +47,9 @@ def plot(
     estimator: EstimatorOption = None,
     exposure: Annotated[
         int | None,
-        typer.Option(min=0, metavar="N", help="Exposure to draw, counted from 0; else the one with the largest blur."),
+        typer.Option(
+            min=0, metavar="N", help="Exposure to draw, counted from 0; by default the one with the largest blur."
+        ),
     ] = None,
     lenslet: LensletOption = None,
     side: Annotated[
@@ -60,7 +62,7 @@ def plot(
 ) -> None:
     """Draw one figure of a recording in a paper's size.
 
-    blur: what the camera saw over the session, and the paths. exposure: one exposure's path over its blur, the path's
+    blur: the camera's blur over the session, and the paths. exposure: one exposure's path over its blur, the path's
     histogram and the intensity profile. nis, errors, losses, latency: along the session. pupil: maps over the
     lenslets. scene: a picture as it came, restored, and at rest.
     """

@@ -44,8 +44,9 @@ def identify(
         typer.Option(
             "--model",
             metavar="KIND+KIND...",
-            help="What disturbs: random-walk, ornstein-uhlenbeck, second-order, resonance, ar3, ar4, or a sum of them."
-            " Given several times, cross-validation chooses; without it, from nine; with --follow, the rig file's own.",
+            help="Model of the disturbance: random-walk, ornstein-uhlenbeck, second-order, resonance, ar3, ar4, or a"
+            " sum of them. Given several times, cross-validation chooses; without it, from nine; with --follow, the"
+            " rig file's own.",
         ),
     ] = None,
     plant: Annotated[

@@ -48,7 +48,7 @@ def view(
         bool, typer.Option("--web", help="Serve the web viewer on this machine (127.0.0.1) until Ctrl-C.")
     ] = False,
     exposure: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Look into one exposure, counted from 0.")
+        int | None, typer.Option(min=0, metavar="N", help="Show one exposure alone, counted from 0.")
     ] = None,
     start: Annotated[
         float | None, typer.Option(metavar="S", help="Begin at this time, s from the first exposure.")
@@ -78,7 +78,7 @@ def view(
     recording = None if file.suffix == ".rrd" else open_recording(file, side=sides)
     choices = (exposure, start, end, lenslet, compare)
     if recording is None and (save is not None or side or any(each is not None for each in choices)):
-        raise typer.BadParameter(f"{file} is a Rerun file already: --save, side files and choices are for a recording")
+        raise typer.BadParameter(f"{file} is a Rerun file already: --save, side files and choices need a recording")
     if not (web or save or screenshot):
         viewing.check_display()
     if recording is None:
@@ -117,7 +117,7 @@ class _WithoutPandas:
 
     def find_spec(self, name: str, *_: object) -> None:
         if name == "pandas":
-            raise ModuleNotFoundError("looking at a recording needs no pandas", name=name)
+            raise ModuleNotFoundError("viewing a recording needs no pandas", name=name)
 
 
 def _address(address: str) -> None:

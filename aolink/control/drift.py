@@ -33,9 +33,8 @@ class Fit:
     """Whether both are within what chance and an inexact model explain."""
 
     def text(self) -> str:
-        return (
-            f"NIS {self.nis_ratio:.2f} of what is expected, neighbouring innovations correlate by {self.whiteness:+.2f}"
-        )
+        correlation = f"correlation of neighbouring innovations {self.whiteness:+.2f}"
+        return f"NIS {self.nis_ratio:.2f} times its expectation, {correlation}"
 
 
 class _Sums(NamedTuple):

@@ -237,7 +237,7 @@ class ControlLoop:
         status = Status.OK if estimate is None else estimate.status
         if status in (Status.DIVERGED, Status.REINITIALISED):
             self._trusted = 0
-            self.lose(f"the estimator says {status.name.lower()} of frame {estimate.frame_id}" if estimate else "")
+            self.lose(f"the estimator is {status.name.lower()} at frame {estimate.frame_id}" if estimate else "")
             return
         if not np.isfinite(slopes).any() or status is Status.GATED:
             self._blind, self._trusted = self._blind + 1, 0

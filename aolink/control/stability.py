@@ -97,9 +97,7 @@ def _observer_gain(rig: Rig) -> FloatArray:
     model = exposure_model(rig.plant, rig.timing.exposure_steps, rig.timing.exposure_offset)
     gain = steady_gain(model, added_noise(model, "lifted"), centroid_covariance(rig)[0])
     if gain is None:
-        raise ControlError(
-            f"the loop on {rig.name} cannot be checked: its centroids lose a state that does not die out"
-        )
+        raise ControlError(f"the loop on {rig.name} cannot be checked: its centroids lose a state that does not decay")
     return np.asarray(model.transition @ gain)
 
 

@@ -92,7 +92,7 @@ class AdaptedCamera(Adapted):
         # An exposure that seems to begin before its session does not count, so the camera starts rather a little late
         # than too early.
         margin_ns = _START_SIGMA * math.hypot(sigma_ns, self._mirror.clock.device_ns(now_ns)[1])
-        with calling(self.name, "when it was told to start"):
+        with calling(self.name, "when it was asked to start"):
             self._driver.start(start_ns + round(min(margin_ns, self._step_ns)), exposures)
         self._first_step, self._end_step, self._running = first_step, 0, True
         return True
@@ -102,7 +102,7 @@ class AdaptedCamera(Adapted):
             self._events = self.poll()  # with those that were waiting
         finally:
             self._running = False
-            with calling(self.name, "when it was told to stop"):
+            with calling(self.name, "when it was asked to stop"):
                 self._driver.stop()
 
     def flush(self) -> list[Frame]:
@@ -245,8 +245,8 @@ class AdaptedCamera(Adapted):
             return raw.start_ns, 0.0
         if self._tells_time:
             raise DeviceError(
-                f"the driver of {self.description} gives a frame without start_ns although its time_ns() tells the"
-                " camera's time: it must say when the exposure started, or tell no time (None)"
+                f"the driver of {self.description} gives a frame without start_ns although its time_ns() gives the"
+                " camera's time: it must say when the exposure started, or give no time (None)"
             )
         # Ids begin anew with each frame from before the session: the camera's own count goes on.
         count = frame_id if raw.number is None else raw.number

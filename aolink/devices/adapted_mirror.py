@@ -214,7 +214,7 @@ class AdaptedMirror(Adapted):
 
     def park(self) -> int:
         self._guarding = False
-        with self._call("when it was told to park"):
+        with self._call("when it was asked to park"):
             step = int(self._driver.park())
         self._parked_from = step
         return step
@@ -231,7 +231,7 @@ class AdaptedMirror(Adapted):
         self._guarding = False
         self._closed.set()
         if self._next is not None and self._parked_from == math.inf:  # parking it failed, or was interrupted
-            with suppress(AolinkError), self._call("when it was told to park"):
+            with suppress(AolinkError), self._call("when it was asked to park"):
                 self._driver.park()
         with self._call("when it was closed"):
             self._driver.close()

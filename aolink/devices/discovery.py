@@ -67,7 +67,7 @@ def find_drivers() -> list[DriverFound]:
 
 def _find(kind: Kind, name: str) -> DriverFound:
     if name == NATIVE:
-        return DriverFound(kind=kind, name=name, search="`aolink devices PORT...` asks who answers at a port")
+        return DriverFound(kind=kind, name=name, search="`aolink devices PORT...` identifies the device at a port")
     try:
         driver = load_driver(kind, name)
         with calling(kind, "when it was asked what its devices lack"):

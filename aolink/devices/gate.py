@@ -123,7 +123,7 @@ class Gate:
         """Whether to use a message; False for one that is to be dropped. Raises DeviceError naming the field."""
         device = link.name
         if not isinstance(message, _KINDS[device]):
-            raise lie(device, "a message", type(message).__name__, f"what a {device} has to say")
+            raise lie(device, "a message", type(message).__name__, f"a message that a {device} may send")
         if isinstance(message, pb.FrameChunk):
             self._check_chunk(device, message, receive_ns)
         elif isinstance(message, pb.Applied):

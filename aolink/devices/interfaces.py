@@ -67,9 +67,9 @@ Event = Frame | pb.Truth | pb.Applied | pb.Event | ClockSampled | CommandAnswere
 class Lacks(StrEnum):
     """What a device cannot do. A driver lists it as ``lacks``; `aolink devices` shows it, and a recording keeps it."""
 
-    TIME = "tells no time: the arrival of its frames stands for it"
+    TIME = "reports no time: the arrival times of its frames are used"
     COUNT = "does not count its frames: lost ones show by their time only"
-    TRIGGER = "starts when it likes: its exposures begin anywhere in a fast step"
+    TRIGGER = "has no trigger: its exposures begin anywhere in a fast step"
     QUEUE = "queues no inputs: the host sends each when its fast step begins"
     ANSWER = "acknowledges nothing: what was sent counts as taken"
     READ_BACK = "does not say what it holds: what was sent counts as held"

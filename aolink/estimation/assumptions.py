@@ -58,7 +58,7 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
         yield (
             "sensor.noise_density",
             f"signal to noise is {snr:.2g} in the brightest pixel of a resting spot, estimators were judged from"
-            f" {LEAST_PEAK_SNR:g} on: below, frames tell little more than the plant's model does",
+            f" {LEAST_PEAK_SNR:g} on: below, frames add little to the plant's model",
         )
     if plant.n_outputs > _MOST_OUTPUTS:
         return
@@ -68,27 +68,28 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
         yield (
             "plant.process_noise",
             f"the plant moves the spot by {widths:.3g} sds of the kernel (sd), estimators were judged up to"
-            f" {MOST_PATH_WIDTHS:g}: beyond, a blur is thin and long, and has more readings than they follow",
+            f" {MOST_PATH_WIDTHS:g}: beyond, a blur is thin and long, and more paths explain it than they follow",
         )
     count, swings = _modes(rig)
     fastest = float(swings.max(initial=0.0))
     if count > MOST_MODES:
         yield (
             "plant.A",
-            f"{count} modes of the plant move the spot along one axis, estimators were judged with up to {MOST_MODES}:"
-            " with more, intervals of profile and mixture may be too narrow; compare them with those of moments",
+            f"{count} eigenmodes of the plant move the spot along one axis, estimators were judged with up to"
+            f" {MOST_MODES}: with more, intervals of profile and mixture may be too narrow; compare them with those of"
+            " moments",
         )
     if fastest > MOST_SWINGS + _ROUNDING:
         yield (
             "timing.exposure_steps",
-            f"the plant's fastest mode swings {fastest:.3g} times in an exposure, estimators were judged up to"
+            f"the plant's fastest eigenmode swings {fastest:.3g} times in an exposure, estimators were judged up to"
             f" {MOST_SWINGS:g}: beyond, the blur shows its amplitude and not its phase; shorten the exposure",
         )
     if fastest * STEPS_IN_SWING > timing.exposure_steps * (1 + _ROUNDING):
         yield (
             "timing.fast_step_s",
-            f"the plant's fastest mode has {timing.exposure_steps / fastest:.2g} fast steps in one swing, estimators"
-            f" were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
+            f"the plant's fastest eigenmode has {timing.exposure_steps / fastest:.2g} fast steps in one swing,"
+            f" estimators were judged from {STEPS_IN_SWING} on: the model has no motion inside a step; make it shorter",
         )
 
     if plant.wandering is not None and plant.wandering.parameter == "frequency":
@@ -97,8 +98,9 @@ def broken_assumptions(rig: Rig) -> Iterator[tuple[str, str]]:
         for each in between[np.abs(between - np.round(2 * between) / 2) < reach]:
             yield (
                 "plant.wandering",
-                f"a mode of the plant swings {each:.3g} times from frame to frame, nearly a whole or half number: a"
-                " faster plant looks like a slower one there, and the frequency may be lost; leave the table out",
+                f"an eigenmode of the plant swings {each:.3g} times from frame to frame, nearly a whole or half"
+                " number: a faster plant looks like a slower one there, and the frequency may be lost; leave the table"
+                " out",
             )
 
 

@@ -223,7 +223,7 @@ def _status_reasons(posterior: Posterior) -> list[str]:
             reasons.append(f"{nis}, {text}" if axes == 1 else f"{counts[status]} of {axes} axes: {nis}, {text}")
     if posterior.several is not None and posterior.several.any():
         of = "" if axes == 1 else f"{int(posterior.several.sum())} of {axes} axes: "
-        reasons.append(f"{of}the blur has more than one reading")
+        reasons.append(f"{of}more than one path explains the blur")
     if posterior.remark:
         reasons.append(posterior.remark)
     return reasons

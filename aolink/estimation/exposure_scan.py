@@ -107,8 +107,8 @@ def _expected_of(rig: Rig, R: FloatArray) -> ExpectedError:
     K = steady_gain(model, added_noise(model, "lifted"), R)
     if K is None:
         raise EstimatorError(
-            f"exposures of {n} fast steps lose a mode that does not die out: o1 has no steady state;"
-            " `aolink rig --check` says which mode"
+            f"exposures of {n} fast steps do not observe an eigenmode that does not decay: o1 has no steady state;"
+            " `aolink rig --check` says which eigenmode"
         )
     # Effect of a unit of noise in one step on the outputs k steps later, on the centroid and on the end state.
     root = plant.B_w @ psd_root(plant.process_noise)

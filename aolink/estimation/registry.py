@@ -257,7 +257,7 @@ def _pixels_refusal(name: str) -> Callable[[Rig], str | None]:
         if name == "profile" and alike_systems(rig.plant) is not None:
             return None
         if rig.plant.n_states > MANY_STATES:
-            alike = " that is not of alike systems side by side" if name == "profile" else ""
+            alike = " that does not consist of equal systems side by side" if name == "profile" else ""
             return (
                 f"{name} follows the posterior's modes for at most {MANY_STATES} states of one plant, {rig.name} has"
                 f" {rig.plant.n_states}{alike}: use {'o3' if alike else 'profile or moments'}"

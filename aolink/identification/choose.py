@@ -56,7 +56,7 @@ def tried(name: str, space: Callable[[Sequence[str]], Space], seen: Sequence[Rea
     if all(each.slots < 2 * FEWEST for each in seen):
         raise IdentificationError(
             f"{max(each.slots for each in seen)} exposures are too short a recording to choose a model with, which is"
-            f" fitted to one half and scored on the other: {2 * FEWEST} or more are needed, or --model says which"
+            f" fitted to one half and scored on the other: {2 * FEWEST} or more are needed, or one --model"
         )
     of = space(kinds_of(name))
     long = [each for each in seen if each.slots >= 2 * FEWEST]

@@ -87,8 +87,8 @@ def rig_model(rig: Rig, output: int) -> RigModel:
     driven = np.abs(np.diagonal(Q)) * np.abs(seen) ** 2 > 0
     if (driven & ~walks & (np.abs(mu) >= 1)).any():
         raise IdentificationError(
-            "the rig file's disturbance grows or rings without end: it has no variance to be judged by; give what"
-            " rings a damping"
+            "the rig file's disturbance grows or rings without end: it has no stationary variance; give a"
+            " resonance a damping"
         )
     processes: list[Covariance] = []
     held = np.flatnonzero(driven & ~walks)
@@ -104,5 +104,5 @@ def rig_model(rig: Rig, output: int) -> RigModel:
         gained = (seen[free] @ Q[np.ix_(free, free)] @ seen[free].conj()).real
         processes.append(Process("random-walk", (float(gained) / step,)))
     if not processes:
-        raise IdentificationError("the rig file says that nothing disturbs this output: plant.process_noise is zero")
+        raise IdentificationError("by the rig file nothing disturbs this output: plant.process_noise is zero")
     return RigModel(tuple(processes))

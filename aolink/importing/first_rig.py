@@ -154,7 +154,7 @@ def first_rig(film: Film, settings: Settings, name: str, progress: Callable[[int
     if rate is None and film.times_ns is not None and film.count > 1:
         rate = 1e9 / float(np.median(np.diff(film.times_ns)))
     if rate is None:
-        raise ImportingError(f"nothing says how many frames a second {film.name} has: give --rate")
+        raise ImportingError(f"it is not known how many frames a second {film.name} has: give --rate")
     places = known.places.reshape(len(known.places), -1)
     motion = fit_motion(places)
     K = settings.frames_per_exposure

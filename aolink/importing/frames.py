@@ -140,7 +140,7 @@ def frame_times(film: Film, rig: Rig, settings: Settings) -> tuple[NDArray[np.in
         rate = 1 / period
     own = K / (timing.frame_period_steps * timing.fast_step_s)
     if rate is None:
-        notes.append(f"nothing says the frame rate: that of the rig file is assumed, {own:.6g} frames/s")
+        notes.append(f"the film does not state its frame rate: that of the rig file is assumed, {own:.6g} frames/s")
     elif abs(rate / own - 1) > _CLOSE:
         each = f"{K} frames" if K > 1 else "a frame"
         whole = round(rate / own)

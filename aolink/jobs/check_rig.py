@@ -135,13 +135,13 @@ def _check_timing(rig: Rig) -> Iterator[Finding]:
     if dead > _MOST_DEAD:
         yield _warning(
             "timing.frame_period_steps",
-            f"the camera looks for {1 - dead:.2g} of the time only, {timing.exposure_steps} of"
+            f"the camera exposes for {1 - dead:.2g} of the time only, {timing.exposure_steps} of"
             f" {timing.frame_period_steps} fast steps",
         )
     if timing.exposure_steps < _FEWEST_STEPS:
         yield _warning(
             "timing.exposure_steps",
-            f"{timing.exposure_steps} fast step(s) in an exposure hold no motion that its blur could tell:"
+            f"{timing.exposure_steps} fast step(s) in an exposure hold no motion that the blur could show:"
             " the mirror should be many times as fast as the camera",
         )
 
@@ -263,7 +263,7 @@ def _check_motion(rig: Rig, path: FloatArray) -> Iterator[Finding]:
     if not (plant.process_noise.any() or plant.initial_covariance.any()):
         yield _warning(
             "plant.process_noise",
-            "neither process noise nor doubt about the start: estimators are sure of their prediction and never look",
+            "neither process noise nor doubt about the start: estimators trust their prediction and use no frame",
         )
     drive = rig.drive
     if drive.kind == "sine" and drive.amplitude.any() and drive.period_s < _STEPS_IN_PERIOD * rig.timing.fast_step_s:
@@ -368,7 +368,7 @@ def _check_observability(rig: Rig) -> Iterator[Finding]:
         yield _error("plant.C", "the camera sees no state of the plant")
         return
     for mode in report.unseen:
-        harm = "it dies out by itself" if abs(mode.eigenvalue) < 1 - 1e-9 else "its estimate will never converge"
+        harm = "it decays by itself" if abs(mode.eigenvalue) < 1 - 1e-9 else "its estimate will never converge"
         yield _warning("plant.C", f"the outputs do not see all of {mode}; {harm}")
     for mode in report.lost_by_centroid:
         yield _warning(

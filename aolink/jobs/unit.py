@@ -184,7 +184,7 @@ def _estimates(recording: Recording, settings: Settings) -> Iterator[tuple[int, 
         if settings.model == Model():
             raise
         raise EstimatorError(
-            f"{recording.path} cannot be estimated with this model: {error!r}; are its numbers meant?"
+            f"{recording.path} cannot be estimated with this model: {error!r}; are its numbers intended?"
         ) from None
 
 

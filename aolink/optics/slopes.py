@@ -155,7 +155,7 @@ def _zernikes(
         coefficients = matrix @ slopes.ravel()
         values = np.tensordot(coefficients, [zernike(i, positions / (radius * scale)) for i in indices], axes=1)
         return indices, coefficients, np.asarray(values), (centre, radius)
-    raise AssertionError("two tilts are always told apart")
+    raise AssertionError("two tilts can always be distinguished")
 
 
 def _circle(points: FloatArray) -> tuple[FloatArray, float]:

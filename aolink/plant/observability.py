@@ -42,7 +42,7 @@ class Mode:
 
     def __str__(self) -> str:
         lasts = "undamped" if math.isinf(self.time_constant_s) else f"time constant {self.time_constant_s:.3g} s"
-        return f"the mode at {self.frequency_hz:.4g} Hz ({lasts})"
+        return f"the eigenmode at {self.frequency_hz:.4g} Hz ({lasts})"
 
 
 @dataclass(frozen=True, kw_only=True)

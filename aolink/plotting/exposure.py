@@ -160,7 +160,7 @@ def _draw_row(
         intensity.stairs(predicted, line.edges, orientation="horizontal", color=colour(name), linewidth=width)
     over_time.set(ylim=(low, high), xlim=(0, exposure.n_steps * scale))
     over_time.set_xlabel("time in the exposure (ms)" if unit == "s" else "fast step in the exposure")
-    histogram.set_xlabel("time at a place\n(1 / slope unit)")
+    histogram.set_xlabel("time at a position\n(1 / slope unit)")
     intensity.set_xlabel("intensity\n(1 / slope unit)")
     for panel in (histogram, intensity):
         panel.tick_params(labelleft=False)

@@ -43,11 +43,11 @@ class _Figure:
 
 
 FIGURES = {
-    "blur": _Figure("what the camera saw over the session, and the paths", 0.42, plot_blur),
+    "blur": _Figure("the camera's blur over the session, and the paths", 0.42, plot_blur),
     "exposure": _Figure("one exposure: path over blur, its histogram, the intensity profile", 0.40),
     "nis": _Figure("the NIS of each estimator with its bounds", 0.55, plot_nis),
     "errors": _Figure("the error of each estimator's path along the session", 0.55, plot_errors),
-    "losses": _Figure("what was lost, late, gated or skipped, and when", 0.45, plot_losses),
+    "losses": _Figure("frames and exposures lost, late, gated or skipped, and when", 0.45, plot_losses),
     "latency": _Figure("when each step of the loop was done", 0.55, plot_latency),
     "pupil": _Figure("maps over the lenslets: light, slopes, blur, NIS", 0.62),
     "scene": _Figure("the picture of one exposure as it came, restored, and at rest", 0.36),

@@ -135,7 +135,7 @@ class _Session:
             "size": with_unit(facts["bytes"], "B"),
             **self.recording.facts(),
             "gaps": f"{facts['gaps']['count']}, the longest {facts['gaps']['longest_steps']} fast steps",
-            "steps": _counts(facts["commands"]) or "no account of commanded steps",
+            "steps": _counts(facts["commands"]) or "no counts of commanded steps",
             "losses": _counts(facts["losses"]) or "none counted",
             "damage": facts["damage"],
         }
@@ -155,7 +155,7 @@ class _Session:
         if topics.COMMAND not in recording.counts:
             said.append("It holds no commands.")
         if topics.APPLIED not in recording.counts:
-            said.append("It holds no reports of what the mirror did; inputs are those commanded, or zero.")
+            said.append("It holds no reports of the mirror; inputs are those commanded, or zero.")
         if recording.rig.scene is not None and topics.RESTORED_SCENE not in recording.counts:
             said.append("Its pictures were not restored; `aolink deblur` does that.")
         if recording.damage:
@@ -201,7 +201,7 @@ class _Session:
 
     def blur(self) -> str:
         return self.drawn(
-            _NARROW, "What the camera saw, and where the spot was.",
+            _NARROW, "The camera's blur, and the positions of the spot.",
             lambda view, figure: plot_blur(view, figure.subplots(), unit=self.unit),
         )  # fmt: skip
 
@@ -280,7 +280,7 @@ def _sections(sessions: Sequence[_Session]) -> Iterable[str]:
 
     yield beside("The session", lambda each: each.what_it_was() + "".join(map(_note, each.lacks())))
     yield beside("The estimates", _Session.scores)
-    yield beside("Inside the exposures that tell most", _Session.exposures)
+    yield beside("Inside the most telling exposures", _Session.exposures)
     if one:
         figures = [draw(sessions[0]) for draw in _OVER_SESSION.values()]
         yield "<h2>Over the session</h2>" + _row(figures, "row pairs")

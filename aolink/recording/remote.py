@@ -146,7 +146,7 @@ class Url:
                 why = "no right to read it; give the credentials that its server wants, as AWS_PROFILE for s3"
             elif isinstance(error, FileNotFoundError):
                 what = "" if cause is error else f" ({_first_line(cause)})"
-                why = f"there is no such file, or nobody may know of it{what}"
+                why = f"there is no such file, or it may not be listed{what}"
             else:
                 why = _first_line(error)
             raise RecordingError(f"cannot read {self}: {why}") from None

@@ -160,7 +160,7 @@ def _check_dies_out(table: Table, name: str, A: FloatArray) -> None:
     radius = float(np.abs(np.linalg.eigvals(A)).max())
     if radius > 1 - 1e-9:
         raise RigError(
-            f"{table.key(name)} makes a disturbance that does not die out (an eigenvalue has modulus {radius:.6g}, it"
+            f"{table.key(name)} makes a disturbance that does not decay (an eigenvalue has modulus {radius:.6g}, it"
             " must be below 1): for one that wanders off use kind = 'random-walk'"
         )
 

@@ -51,8 +51,8 @@ def named_file(folder: Path | None, name: str | Path, key: str) -> Path:
     """
     if folder is None:
         raise RigError(
-            f"{key}: the rig file comes out of a recording, and such a one may not name files ({name}): save it as a"
-            " file of your own, look at it, and give that"
+            f"{key}: the rig file comes out of a recording, and may not name files then ({name}): save it as a file of"
+            " your own, check it, and give that"
         )
     return folder / name
 

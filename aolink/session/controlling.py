@@ -95,7 +95,7 @@ class Controlling:
             news.append(f"the loop is closed again from frame {frame} on" if act.state is State.CLOSED else lost)
         if act.fit is not None and act.fit.fits != self._fits:
             self._fits = act.fit.fits
-            fits = "fits again" if act.fit.fits else "no longer fits what is seen"
+            fits = "fits again" if act.fit.fits else "no longer fits the measurements"
             news.append(f"the rig file's model {fits} (frame {frame}): {act.fit.text()}")
         if act.acting != self._acting:
             pays = f"{act.acting} would have left {100 * act.gained:.0f} % less of the slopes (rms) than {self._acting}"

@@ -321,7 +321,7 @@ class SessionLoop:
         if device in self._returned:
             self._returned.remove(device)
         self.report.ports_vanished += 1
-        self._log(Log.WARNING, f"the port of the {device.name} has vanished, and is waited for: {why}")
+        self._log(Log.WARNING, f"the port of the {device.name} has vanished; the session waits for it: {why}")
 
     def _has_returned(self, device: Device, away_s: float) -> None:
         self._returned.append(device)
@@ -508,9 +508,10 @@ class SessionLoop:
         if self._aligned and self._mirror.commanded and frame.alignment_sigma_ns > _ALIGNED * exposure_ns:
             self._aligned = False
             self.report.warnings.append(
-                f"it is known to {frame.alignment_sigma_ns / exposure_ns:.2g} of an exposure only (sd, frame"
-                f" {frame.frame_id}) which of the mirror's fast steps an exposure is of: intervals of estimates hold up"
-                f" to {_ALIGNED:g}; give delay_s and delay_sd_s of the devices as well as they are known"
+                "which of the mirror's fast steps an exposure covers is known only to"
+                f" {frame.alignment_sigma_ns / exposure_ns:.2g} of an exposure (sd, frame {frame.frame_id}): intervals"
+                f" of estimates are reliable up to {_ALIGNED:g}; give delay_s and delay_sd_s of the devices as well as"
+                " they are known"
             )
 
     def _take_scene(self, frame: Frame, receive_ns: int) -> None:
@@ -669,7 +670,7 @@ class SessionLoop:
             size_s, period_s = sampled.step.size_ns / 1e9, (sampled.step.before_ns - sampled.step.after_ns) / 1e9
             direction = "forward" if size_s > 0 else "back"
             warning = (
-                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of what it stamped"
+                f"the {device.name}'s clock was set {direction} by {abs(size_s):.6f} s: host times of its stamps"
                 f" in the {period_s:.3f} s from {sampled.step.after_ns} ns on may be off by as much"
             )
             report.warnings.append(warning)

@@ -142,7 +142,7 @@ def _profile(contents: Contents) -> rrb.Container | rrb.View:
         views.append(
             rrb.Spatial2DView(
                 origin=f"{each.drawn.root}profile",
-                name=f"{title}; time at a place; intensity (1/slope unit) over slope",
+                name=f"{title}; time at a position; intensity (1/slope unit) over slope",
                 visual_bounds=rrb.VisualBounds2D(x_range=x_range, y_range=y_range),
             )
         )
@@ -244,7 +244,7 @@ def _devices(contents: Contents) -> list[rrb.Container | rrb.View]:
         views.append(_lines(contents, "Mirror input (mirror's units)", _with_axes(shown), legend=True))
     if topics.CONTROL in contents.topics:
         loop = [
-            ("Loop: what is left (slope units)", ["control/slope_rms", "control/path_rms"]),
+            ("Loop: residual (slope units)", ["control/slope_rms", "control/path_rms"]),
             ("Loop: delay (ms)", ["control/delay"]),
             ("Loop: steps clipped (count)", ["control/clipped"]),
         ]

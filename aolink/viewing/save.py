@@ -344,7 +344,7 @@ class Sender:
             other = self._look.compared.path.name
             lines += ["", f"Fainter lines are of {other}, from its own first exposure on."]
         if missing := self._missing():
-            lines += ["", "What it has not: " + "; ".join(missing) + "."]
+            lines += ["", "It lacks: " + "; ".join(missing) + "."]
         if recording.damage:
             lines += ["", f"Damaged: {recording.damage}"]
         return "\n".join([*lines, "", rig.summary])

@@ -209,7 +209,7 @@ class Hub:
             if (silence := now - last_heard) > (_LAST_PATIENCE_S if ended else _VIRTUAL_SILENCE_S):
                 raise DeviceError(f"the rig on virtual time has said nothing for {silence:.1f} s: is it stopped?")
             if ended:
-                raise DeviceError("the rig on virtual time talks without dealing with what it was sent")
+                raise DeviceError("the rig on virtual time sends messages without handling those it was sent")
             wait_readable(waiting, _SLICE_S)
 
     def _memory_bytes(self) -> int:

@@ -158,7 +158,7 @@ class MessageDecoder:
             part = pb.Part.FromString(payload)
             if not self._append(part, packet.sequence):
                 self._data = bytearray()
-                raise DecodeError("a part that does not follow the one before, or of a message that cannot be")
+                raise DecodeError("a part that does not follow the one before, or of an impossible message")
             if len(self._data) < part.total:
                 return None
             type_, payload = part.type, bytes(self._data)

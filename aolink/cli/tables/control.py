@@ -29,7 +29,7 @@ def replayed(result: Replayed) -> Table:
         f" {result.input_rms:.4g} rms, which differ by {result.difference_rms:.4g} rms from what the mirror held",
     )
     if result.seed is None:
-        table.add_row("residual", "what would have come of it is not known: the recording is not of a simulated rig")
+        table.add_row("residual", "the slopes that it would have left are unknown: the rig is not simulated")
     else:
         table.add_row(
             "residual",

@@ -47,7 +47,7 @@ def _number(value: float | None, form: str) -> str:
 def _calibration_facts(result: Calibrated) -> list[str]:
     found = result.calibration
     lines = [
-        "pull: what the file says less what was measured, in standard deviations",
+        "pull: the file's value less the measured one, in standard deviations",
         f"read noise {found.read_noise.value:.4g} counts (sd {found.read_noise.sd:.2g})",
     ]
     if found.gain is not None:

@@ -178,7 +178,7 @@ class AravisCamera:
             try:
                 stopping.result(_RELEASE_S)
             except TimeoutError:
-                raise DeviceError(f"the camera {self._address} does not answer when it is told to stop") from None
+                raise DeviceError(f"the camera {self._address} does not answer when it is asked to stop") from None
 
     def statistics(self) -> dict[str, int]:
         """Counts of its packets by the fields of ``LinkStatistics``, empty for a camera that is not on a network.

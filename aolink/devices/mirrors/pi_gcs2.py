@@ -138,8 +138,8 @@ class PiMirror:
         identity = self._answer("*IDN?")
         if "physik instrumente" not in identity.lower():
             raise DeviceError(
-                f"what is at {self._line.url} says that it is {identity!r}, not a controller of Physik Instrumente:"
-                " `aolink devices` lists the ports of this machine"
+                f"the device at {self._line.url} identifies itself as {identity!r}, not as a controller of Physik"
+                " Instrumente: `aolink devices` lists the ports of this machine"
             )
         self._answer("ERR?")  # errors that other programs have left
         version = self._answer("CSV?")

@@ -310,7 +310,7 @@ class PlayzerX:
         elif slip:
             raise DeviceError(
                 f"the PlayzerX's count of samples is off by {slip:.1f}: its line loses bytes, or it does not play"
-                f" {1e9 / self._step_ns:g} samples a second as it was told to"
+                f" {1e9 / self._step_ns:g} samples a second as it was asked to"
             )
         self._taken = max(self._taken, taken - 1 + self._offset)
 
